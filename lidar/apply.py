@@ -41,6 +41,7 @@ from lidar.signal.recorded import altered_recording, recorded_echoes
 from lidar.signal.registry import NamedStage, Stages
 from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
 from lidar.signal.situation import Situation
+from lidar.signal.stage import POSES
 
 _KITTI, _NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
 _SENSORS = {"kitti": "hdl64e_s3", "nuscenes": "hdl32e"}
@@ -110,7 +111,7 @@ def _apply_to_dataset(
         rig = _rig(recipe["rig"])
         sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
         chosen = Stages(stages, seed)
-        chosen.check(sensor_kinds(rig))
+        chosen.check(sensor_kinds(rig), known=(POSES,))
         _check_images(chosen, rig)
         recorded = [(name, text) for name, text in recipe["settings"]]
         settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
@@ -85,9 +85,15 @@ class Stages:
         """Nanoseconds before a frame whose clouds the stages ask for."""
         return max((math.ceil(named.stage.lookback * 1e9) for named in self.stages), default=0)
 
-    def check(self, sensors: Mapping[str, str]) -> None:
-        """Raise InputError for a stage that acts on none of the sensors; ``sensors``: kind by name."""
+    def check(self, sensors: Mapping[str, str], *, known: Collection[str] = ()) -> None:
+        """Raise InputError for a stage that acts on none of the sensors, or needs what is not known.
+
+        sensors : kind by name
+        known   : of `POSES` and `ROAD_USERS`
+        """
         for named in self.stages:
+            if missing := [need for need in named.stage.requires if need not in known]:
+                raise InputError(f"stage {named.name} needs {missing[0]}, of which nothing is known here")
             if named.sensor and named.sensor not in sensors:
                 raise InputError(
                     f"stage {named.name}: no sensor {named.sensor!r}; there are {', '.join(sensors)}"

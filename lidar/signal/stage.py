@@ -26,6 +26,9 @@ if TYPE_CHECKING:
     from lidar.navigation.gnss import Fixes
     from lidar.navigation.imu import Inertial
 
+POSES, ROAD_USERS = "poses and time", "road users"
+"""What some drives and recorded data know, and others do not."""
+
 T = TypeVar("T", bool, int, float, str)
 
 
@@ -62,6 +65,11 @@ class Stage:
     @property
     def image_kinds(self) -> tuple[str, ...]:
         """Kinds of image, besides colours, that the stage needs of a recorded camera."""
+        return ()
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """What the stage must know of a drive: `POSES`, `ROAD_USERS`."""
         return ()
 
     @property

@@ -10,10 +10,12 @@ import numpy as np
 from lidar.camera.render import Frame
 from lidar.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
-from lidar.weather.air import through_even_air
+from lidar.signal.stage import POSES, ROAD_USERS, Pulses, parameter
+from lidar.weather.air import through_air
 from lidar.weather.camera import weathered
-from lidar.weather.media import medium_of
+from lidar.weather.fields import field_of, spray_extinction
+from lidar.weather.glass import dazzled, through_glass
+from lidar.weather.media import Medium, medium_of, spray
 from lidar.weather.setting import WeatherSetting
 
 
@@ -29,12 +31,32 @@ class Weather(WeatherSetting):
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
     ) -> TracedEchoes:
         """The echoes that reach the receiver."""
-        amount = self.amount_at(at.start_ns / 1e9)
+        sensor, amount = pulses.sensor, self.amount_at(at.start_ns / 1e9)
         if amount is None:
             return echoes
-        medium = medium_of(self.kind, amount, wavelength_nm=pulses.sensor.wavelength_nm, medium=self.medium)
-        return through_even_air(pulses, echoes, medium=medium, rng=rng)
+        medium = self._medium(sensor.wavelength_nm, amount=amount)
+        if medium.extinction > 0:
+            field = field_of(self, sensor, at=at)
+            echoes = through_air(pulses, echoes, medium=medium, field=field, at=at, rng=rng)
+        if self.drops or self.dirt:
+            echoes = through_glass(pulses, echoes, drops=self.drops, dirt=self.dirt, at=at)
+        if self.sunlight:
+            echoes = dazzled(pulses, echoes, sunlight=self.sunlight, at=at, rng=rng)
+        return echoes
 
     def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
         """The image that the camera takes."""
         return weathered(frame, self, at=at, rng=rng)
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Road users for spray, poses and time for places, plumes and the sun."""
+        if self.kind == "spray":
+            return (ROAD_USERS, POSES)
+        placed = self.radius or self.polygon or self.sunlight or self.medium == "plumes"
+        return (POSES,) if placed else ()
+
+    def _medium(self, wavelength_nm: float, *, amount: float) -> Medium:
+        if self.kind == "spray":
+            return spray(spray_extinction(amount), wavelength_nm)
+        return medium_of(self.kind, amount, wavelength_nm=wavelength_nm, medium=self.medium)

@@ -1,0 +1,281 @@
+"""Weather that differs from place to place: banks of fog and rain, plumes of dust, spray behind vehicles."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from math import inf, pi, radians
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from geoscene.frames import Frame
+from geoscene.typing import Float
+from lidar.errors import InputError
+from lidar.random_streams import generator
+from lidar.rig.scanner import Sensor
+from lidar.signal.situation import Situation
+from lidar.weather.setting import WeatherSetting
+
+_STEP = 2.0  # metres between samples of a field
+_TILE = 64.0  # metres that a sensor moves until its field is sampled anew
+_ABOVE = 2.0  # metres of a sensor above the ground, assumed
+_PLUME_HEIGHT = 5.0  # metres over which dust thins out, assumed
+_PLUME_SIZES = (8.0, 60.0)  # metres, wavelengths of the pattern of dust, assumed
+_PLUME_WAVES = 40
+_PLUME_SHARE = 0.4  # of the ground under dust, assumed
+_SPRAY_FAST = 50 / 3.6  # m/s, from which on tyres throw up spray behind a vehicle, typical value
+_SPRAY_TIME, _SPRAY_LENGTH = 1.0, 4.0  # s, decay of spray, and after which it is gone; typical values
+_SPRAY_HEIGHT = 0.5  # metres over which spray thins out, typical value
+_SPRAY_AXLE = 1.5  # metres from a vehicle's middle to its rear axle, typical value
+_SPRAY_HALF_WIDTH = 1.0  # metres, of the plume at the axle, typical value
+_SPRAY_EXTINCTION = 0.3
+"""Extinction (1/m) of spray at the ground behind an axle, at 100 km/h on 1 mm of water; assumed so that the
+visibility in it is 50 m at a height of 0.7 m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """How much of a medium there is, from place to place.
+
+    corner : (2,) scene metres of the first sample
+    share  : (ny, nx) of the medium in the sample's surroundings; none beyond
+    ground : height above which it thins out, scene metres
+    height : metres over which it falls to 1/e; infinite for none
+    """
+
+    corner: tuple[float, float]
+    share: Float
+    ground: float
+    height: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """Beams in a scene: where they start (n, 3) and where they go (n, 3), scene metres per metre of range."""
+
+    start: Float
+    way: Float
+
+
+def _around(position: Float, sensor: Sensor) -> tuple[tuple[float, float], int]:
+    """The corner of a sensor's field, the same for nearby positions, and the number of samples on a side."""
+    reach = min(sensor.max_range, 300.0) + _TILE
+    x, y = (np.floor(position[:2] / _TILE) + 0.5) * _TILE - reach
+    return (float(x), float(y)), int(2 * reach / _STEP) + 1
+
+
+def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field | None:
+    """Where the weather of a setting is around a sensor; None for everywhere.
+
+    Raises InputError if the setting has a place or road users, and the situation knows none.
+    """
+    if setting.kind == "spray":
+        return spray_field(sensor, at=at)
+    has_place = bool(setting.radius or setting.polygon)
+    plumes = setting.medium == "plumes"
+    if not (has_place or plumes):
+        return None
+    if at.poses is None or at.geo is None:
+        raise InputError("weather with a place or plumes needs poses, which these clouds do not have")
+    position = at.poses(np.array([at.start_ns])).position[0]
+    corner, count = _around(position, sensor)
+    share = np.ones((count, count))
+    if has_place:
+        share = _place_share(setting, at.geo, corner=corner, count=count)
+    if not plumes:
+        return None if np.all(share == 1) else Field(corner, share, 0.0, inf)
+    share = share * plume_pattern(setting, at.start_ns / 1e9, seed=at.seed, corner=corner, count=count)
+    return Field(corner, share, float(position[2]) - _ABOVE, _PLUME_HEIGHT)
+
+
+@functools.lru_cache(maxsize=8)
+def _place_share(setting: WeatherSetting, geo: Frame, *, corner: tuple[float, float], count: int) -> Float:
+    """The share (count, count) of a place at samples: 1 within, falling to 0 over the edge around it."""
+    import shapely  # noqa: PLC0415  (0.1 s)
+
+    x, y = (c + _STEP * np.arange(count) for c in corner)
+    points = shapely.points(*np.meshgrid(x, y))
+    if setting.radius:
+        place = shapely.Point(*geo.from_geographic(setting.longitude, setting.latitude)).buffer(
+            setting.radius
+        )
+    else:
+        lon, lat = np.array(setting.corners()).T
+        place = shapely.Polygon(np.transpose(geo.from_geographic(lon, lat)))
+    away = shapely.distance(points, place)
+    share: Float = np.clip(1 - away / setting.edge, 0, 1) if setting.edge else (away <= 0).astype(float)
+    return share
+
+
+def plume_pattern(
+    setting: WeatherSetting, seconds: float, *, seed: int, corner: tuple[float, float], count: int
+) -> Float:
+    """Dust (count, count) that the wind carries along: the crests of a field of waves, 1 on average there.
+
+    The pattern drifts with the wind and depends on the seed alone, so that it passes from frame to frame.
+    """
+    rng = generator(seed, "weather", "dust plumes")
+    length = _PLUME_SIZES[0] * (_PLUME_SIZES[1] / _PLUME_SIZES[0]) ** rng.random(_PLUME_WAVES)
+    angle, phase = rng.uniform(0, 2 * pi, (2, _PLUME_WAVES))
+    wave = 2 * pi / length * np.array([np.cos(angle), np.sin(angle)])
+    bearing = radians(setting.wind_from)
+    drift = -setting.wind * seconds * np.array([np.sin(bearing), np.cos(bearing)])
+    x, y = (c + _STEP * np.arange(count) - d for c, d in zip(corner, drift, strict=True))
+    # The sum over waves of cos(kx x + ky y + phase), by the cosine of sums.
+    along, across = np.outer(x, wave[0]), np.outer(y, wave[1]) + phase
+    height = np.cos(across) @ np.cos(along).T - np.sin(across) @ np.sin(along).T
+    height *= np.sqrt(2 / _PLUME_WAVES)
+    level = 0.2533  # exceeded by the standard normal share _PLUME_SHARE
+    share: Float = np.clip(height - level, 0, 2) / 0.71  # mean of the excess over that level
+    return share
+
+
+def spray_field(sensor: Sensor, *, at: Situation) -> Field | None:
+    """The spray behind the vehicles around a sensor, as shares of the spray at 100 km/h; zero without any.
+
+    Raises InputError if the road users are unknown.
+    """
+    if at.world is None or at.poses is None:
+        raise InputError(
+            "spray needs road users, which recorded data do not have: use lidar drive --traffic on"
+        )
+    position = at.poses(np.array([at.start_ns])).position[0]
+    corner, count = _around(position, sensor)
+    share = np.zeros((count, count))
+    frame = at.frame if isinstance(at.frame, int) else 0
+    start_ns, end_ns = sensor.window_ns(frame)
+    ground = []
+    for group in at.world.caster.instances:
+        if group.transform.ndim != 4:
+            continue
+        place = group.transform[:, :, :, 3]
+        speed = (place[:, -1] - place[:, 0]) / ((end_ns - start_ns) / 1e9)
+        fast = np.linalg.norm(speed[:, :2], axis=1) > _SPRAY_FAST
+        for here, velocity in zip(place[fast, 0], speed[fast], strict=True):
+            _add_spray(share, corner=corner, place=here[:2], velocity=velocity[:2])
+            ground.append(float(here[2]))
+    return Field(corner, share, float(np.median(ground)) if ground else 0.0, _SPRAY_HEIGHT)
+
+
+def _add_spray(share: Float, *, corner: tuple[float, float], place: Float, velocity: Float) -> None:
+    """Add the plume of a vehicle to a field: thinning with the time since it passed, and wider with it."""
+    speed = float(np.hypot(*velocity))
+    ahead = velocity / speed
+    y, x = np.indices(share.shape) * _STEP
+    x, y = x + corner[0] - place[0], y + corner[1] - place[1]
+    behind = -(x * ahead[0] + y * ahead[1]) - _SPRAY_AXLE
+    beside = x * -ahead[1] + y * ahead[0]
+    age = behind / speed
+    wide = np.hypot(_SPRAY_HALF_WIDTH + 0.25 * np.maximum(age, 0), _STEP / 2)
+    plume = np.exp(-age / _SPRAY_TIME - (beside / wide) ** 2) * (_SPRAY_HALF_WIDTH / wide)
+    plume *= (speed * 3.6 / 100) ** 2
+    share += np.where((behind >= 0) & (age <= _SPRAY_LENGTH), plume, 0.0)
+
+
+def spray_extinction(water_mm: float) -> float:
+    """Extinction (1/m) of spray where the share of its field is 1; water on the road in mm."""
+    return _SPRAY_EXTINCTION * min(water_mm, 3.0)
+
+
+def amounts(field: Field, rays: Rays, *, pulse: NDArray[np.integer], distance: Float) -> tuple[Float, Float]:
+    """The share (m,) of the medium at ranges along pulses, and its integral from the beam's start, metres."""
+    here, column = np.empty(len(pulse)), np.empty(len(pulse))
+    _amounts(_packed(field), (rays.start, rays.way), (pulse.astype(np.int64), distance), here, column)
+    return here, column
+
+
+def _packed(field: Field) -> tuple[Any, ...]:
+    return (field.corner[0], field.corner[1], field.share, field.ground, field.height)
+
+
+@njit(cache=True, nogil=True)
+def _share(field: Any, start: Any, way: Any, pulse: Any, distance: Any) -> Any:
+    """The share of the medium at a range along a pulse."""
+    x0, y0, grid, ground, height = field
+    x, y = start[pulse, 0] + distance * way[pulse, 0], start[pulse, 1] + distance * way[pulse, 1]
+    column, row = int(np.floor((x - x0) / _STEP + 0.5)), int(np.floor((y - y0) / _STEP + 0.5))
+    if row < 0 or column < 0 or row >= grid.shape[0] or column >= grid.shape[1]:
+        return 0.0
+    above = max(start[pulse, 2] + distance * way[pulse, 2] - ground, 0.0)
+    share = grid[row, column]
+    return share * np.exp(-above / height) if share > 0.0 else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _amounts(field: Any, rays: Any, places: Any, here: Any, column: Any) -> None:
+    """Fill the share at places and its integral up to them, by the midpoint rule."""
+    start, way = rays
+    pulse, distance = places
+    for i in range(len(pulse)):
+        steps = max(1, int(np.ceil(distance[i])))
+        step = distance[i] / steps
+        total = 0.0
+        for k in range(steps):
+            total += _share(field, start, way, pulse[i], (k + 0.5) * step)
+        column[i] = total * step
+        here[i] = _share(field, start, way, pulse[i], distance[i])
+
+
+def strongest_response(
+    field: Field,
+    rays: Rays,
+    *,
+    end: Float,
+    white: Float,
+    extinction: float,
+    shape: Float,
+    step: float,
+    near: float,
+) -> tuple[Float, Float]:
+    """Range and power (n,) of the maximum of the response of a medium in beams that end at ranges (n,).
+
+    white : (k,) what a share of 1 sends back over a step at ranges (0.5, 1.5, ...) steps, if nothing dims it
+    shape : (s,) power of the pulse at steps of range
+    near  : metres from which on the maximum is looked for
+    """
+    place, power = np.empty(len(end)), np.zeros(len(end))
+    air = end, white, extinction, shape, step, near
+    _strongest(_packed(field), (rays.start, rays.way), air, place, power)
+    return place, power
+
+
+@njit(cache=True, nogil=True)
+def _strongest(field: Any, rays: Any, air: Any, place: Any, power: Any) -> None:
+    """Fill range and power of the strongest response of each pulse."""
+    start, way = rays
+    end, white, extinction, shape, step, near = air
+    recent = np.zeros(len(shape))
+    for i in range(len(end)):
+        recent[:] = 0.0
+        best, where, column, live = 0.0, 0.0, 0.0, 0
+        for k in range(len(white) + len(shape)):
+            r = (k + 0.5) * step
+            new = 0.0
+            if k < len(white) and r < end[i]:
+                share = _share(field, start, way, i, r)
+                new = share * white[k] * np.exp(-2 * extinction * (column + 0.5 * share * step))
+                column += share * step
+            elif live == 0:
+                break
+            live = len(shape) if new > 0.0 else live - 1
+            recent[k % len(shape)] = new
+            if live <= 0:
+                live = 0
+                continue
+            total = 0.0
+            for j in range(len(shape)):
+                total += shape[j] * recent[(k - j) % len(shape)]
+            middle = r - step * (len(shape) - 1) / 2
+            if total > best and middle >= near:
+                best, where = total, middle
+        place[i], power[i] = min(where, end[i]), best
+
+
+def rays_of(start: Float, direction: Float, *, time_ns: NDArray[np.int64], at: Situation) -> Rays:
+    """Beams in the scene, from their starts (n, 3) and directions (n, 3) in the sensor's frame."""
+    assert at.poses is not None  # noqa: S101
+    poses = at.poses(time_ns)
+    return Rays(poses.place(start), poses.directions(direction))
