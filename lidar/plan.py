@@ -19,6 +19,7 @@ from geoscene.reach import OFFSET
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar import __version__
+from lidar.attacks.placed_object import with_objects
 from lidar.dataset.recording import Recording
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs
@@ -216,6 +217,8 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
+    stages = options.contents().stages
+    actors = with_objects(actors, stages, scene=scene, trajectory=trajectory)
     check_start(start, trajectory.duration_ns)
     jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
@@ -268,7 +271,7 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
     known = (POSES,) if options.traffic is None else (POSES, ROAD_USERS)
-    options.contents().stages.check(sensor_kinds(rig), known=known)
+    options.contents().stages.check({**sensor_kinds(rig), "scene": "scene"}, known=known)
     return sensors
 
 

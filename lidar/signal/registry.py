@@ -25,13 +25,21 @@ _STAGES = {
     "replay": "attacks.replay.Replay",
     "relay": "attacks.relay.Relay",
     "remove": "attacks.remove.Remove",
+    "placed_object": "attacks.placed_object.PlacedObject",
     "high_frequency_removal": "attacks.high_frequency_removal.HighFrequencyRemoval",
     "weather": "weather.stage.Weather",
     "weather_model": "weather.model_stage.WeatherModel",
 }
 """Module within `lidar` and class, by name."""
 
-SEAMS = {"echoes": "lidar", "cloud": "lidar", "image": "camera", "fixes": "gnss", "samples": "imu"}
+SEAMS = {
+    "echoes": "lidar",
+    "cloud": "lidar",
+    "image": "camera",
+    "fixes": "gnss",
+    "samples": "imu",
+    "scene": "scene",
+}
 """Kind of sensor of each seam; a stage has a method of that name for each seam that it acts on."""
 
 
