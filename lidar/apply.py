@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -91,11 +93,42 @@ def apply_stages(
         raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
         raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
-    if is_dataset:
-        if options.sensor:
-            raise InputError("`sensor`: a dataset has its own sensors; leave it out")
-        return _apply_to_dataset(open_dataset(source), out, stages=options.all_stages, progress=progress)
-    return _apply_to_clouds(clouds, source, out=out, options=options, progress=progress)
+    if is_dataset and options.sensor:
+        raise InputError("`sensor`: a dataset has its own sensors; leave it out")
+    with _complete(out) as part:
+        if is_dataset:
+            dataset = open_dataset(source)
+            done = _apply_to_dataset(dataset, part, stages=options.all_stages, progress=progress)
+        else:
+            done = _apply_to_clouds(clouds, source, out=part, options=options, progress=progress)
+    return replace(done, path=out)
+
+
+@contextmanager
+def _complete(out: Path) -> Iterator[Path]:
+    """Yield a temporary folder whose files become those of ``out`` unless the block raises.
+
+    They replace a former dataset there; other files stay.
+    """
+    place = out.resolve()
+    part = place.with_name(f"{place.name}.{os.getpid()}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        yield part
+        if Paths(out).manifest.exists():
+            remove_dataset(out)
+        if not place.exists() or not any(place.iterdir()):
+            part.replace(place)
+            return
+        manifest = Paths(part).manifest
+        files = [path for path in part.rglob("*") if path.is_file() and path != manifest]
+        for path in (*files, *([manifest] if manifest.exists() else [])):
+            target = place / path.relative_to(part)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            path.replace(target)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
 
 
 def _apply_to_dataset(
@@ -139,8 +172,6 @@ def _apply_to_dataset(
         _check_sight(dataset, recording, form=form, jobs=jobs)
     written = {path for job in jobs for path in recording.paths(*job).values()}
     written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
-    if Paths(out).manifest.exists():  # a former dataset, to be replaced
-        remove_dataset(out)
     _copy(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
     before = sum(points.values())
     points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)

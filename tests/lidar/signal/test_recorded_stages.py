@@ -348,3 +348,32 @@ def test_a_stage_that_looks_back_farther_than_it_says_is_an_error(scene, options
     far = (NamedStage("watching", Watching(3)),)
     with pytest.raises(LidarError, match="looks back 3 frames of top, more than its `lookback`"):
         drive(scene, tmp_path / "a", options=replace(options, stages=far))
+
+
+@dataclass(frozen=True)
+class Refusing(Stage):
+    """Cannot act on the third frame."""
+
+    def cloud(self, cloud, *, at, rng):
+        del rng
+        if at.frame == 2:
+            raise InputError("no such frame")
+        return cloud
+
+
+def test_a_stage_that_fails_at_a_later_frame_leaves_what_was_there(plain, tmp_path):
+    refusing = ApplyOptions(stages=(NamedStage("refusing", Refusing()),))
+    for source in (plain, plain / "top"):
+        with pytest.raises(InputError, match="no such frame"):
+            apply_stages(source, tmp_path / "new", options=refusing)
+        assert not list(tmp_path.iterdir())
+    shutil.copytree(plain, tmp_path / "old")
+    (tmp_path / "old" / "note.txt").write_text("mine")
+    before = files(tmp_path / "old")
+    with pytest.raises(InputError, match="no such frame"):
+        apply_stages(plain, tmp_path / "old", options=refusing, overwrite=True)
+    assert files(tmp_path / "old") == before
+    apply_stages(plain, tmp_path / "old", options=ApplyOptions(STAGES), overwrite=True)
+    apply_stages(plain, tmp_path / "fresh", options=ApplyOptions(STAGES))
+    assert files(tmp_path / "old") == files(tmp_path / "fresh") | {"note.txt": before["note.txt"]}
+    assert {path.name for path in tmp_path.iterdir()} == {"old", "fresh"}
