@@ -234,3 +234,14 @@ def test_the_program_names_what_it_cannot_measure(written: Callable[..., Path], 
     assert result.returncode == 1
     assert "Traceback" not in result.stderr
     assert "attack-none and 1 more" in result.stderr
+
+
+def test_the_program_writes_nothing_for_a_file_with_an_error(
+    written: Callable[..., Path], tmp_path: Path
+) -> None:
+    file = written(PHANTOM.replace("shape=object", "power=-1"))
+    result = run_program("lidar", "redteam", str(file), "-o", str(tmp_path / "out"))
+    assert result.returncode == 2
+    assert "power" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
