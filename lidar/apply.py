@@ -40,7 +40,7 @@ from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
 from lidar.signal.recorded import altered_recording, recorded_echoes
-from lidar.signal.registry import NamedStage, Stages
+from lidar.signal.registry import NO_STAGES, NamedStage, Stages
 from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES
@@ -140,39 +140,26 @@ def _apply_to_dataset(
     if {"stages", "applied_stages"} & recipe.keys():
         raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
     with reading_file(dataset.paths.manifest):
-        seed = int(dataset.manifest["seed"])
-        rig = _rig(recipe["rig"])
-        sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
-        chosen = Stages(stages, seed)
+        rig = rig_of(recipe["rig"])
+        chosen = Stages(stages, int(dataset.manifest["seed"]))
         chosen.check(sensor_kinds(rig), known=(POSES,))
         _check_images(chosen, rig)
-        recorded = [(name, text) for name, text in recipe["settings"]]
-        settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages))
-        contents = Contents(
-            tuple(recipe["formats"]), tuple(recipe["labels"]), recipe["deskew"], seed, *settings, chosen
-        )
-        crs = export_crs(dataset.frame, recipe["crs"])
         points = dict(dataset.manifest["points"])
-    recording = Recording(
-        out,
-        dataset.frame,
-        trajectory=dataset.trajectory(),
-        start=dataset.start,
-        geo=Georeference(dataset.frame, crs, exact=bool(recipe.get("exact"))),
-        contents=contents,
-    )
+    sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
+    recording = recording_again(dataset, out, stages=chosen)
+    contents = recording.contents
     jobs = [
         (s, frame)
         for s in sensors
         if recording.has_stages(s)
         for frame in range(len(dataset.sample_times(s.name)))
     ]
-    form = _richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
+    form = richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
     if form is not None:
         _check_sight(dataset, recording, form=form, jobs=jobs)
     written = {path for job in jobs for path in recording.paths(*job).values()}
     written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
-    _copy(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
+    copy_dataset(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
     before = sum(points.values())
     points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)
     for done, (device, frame) in enumerate(jobs):
@@ -191,7 +178,30 @@ def _apply_to_dataset(
     return ApplySummary(out, len(jobs), before, sum(points.values()))
 
 
-def _rig(rig: str) -> Rig:
+def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) -> Recording:
+    """What the frames of a dataset are written from once more, to another directory.
+
+    Raises DatasetError for a damaged ``dataset.json``.
+    """
+    recipe = dataset.manifest["recipe"]
+    with reading_file(dataset.paths.manifest):
+        seed = int(dataset.manifest["seed"])
+        recorded = [(name, text) for name, text in recipe["settings"]]
+        settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages.stages))
+        formats, labels = tuple(recipe["formats"]), tuple(recipe["labels"])
+        contents = Contents(formats, labels, recipe["deskew"], seed, *settings, stages)
+        crs = export_crs(dataset.frame, recipe["crs"])
+    return Recording(
+        out,
+        dataset.frame,
+        trajectory=dataset.trajectory(),
+        start=dataset.start,
+        geo=Georeference(dataset.frame, crs, exact=bool(recipe.get("exact"))),
+        contents=contents,
+    )
+
+
+def rig_of(rig: str) -> Rig:
     """A rig as a recipe names it: its name or file, and a digest.
 
     Raises InputError if the rig has changed since.
@@ -235,7 +245,7 @@ def _check_images(stages: Stages, rig: Rig) -> None:
                 )
 
 
-def _richest_format(contents: Contents) -> Format:
+def richest_format(contents: Contents) -> Format:
     """The format in the sensor frame that keeps most columns.
 
     Raises InputError if there is none.
@@ -248,7 +258,7 @@ def _richest_format(contents: Contents) -> Format:
     return max(found, key=lambda form: len(form.columns))
 
 
-def _copy(source: Path, out: Path, *, leave_out: set[Path]) -> None:
+def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:
     """Copy a directory but for some files, named as in ``out``."""
 
     def skip(folder: str, names: list[str]) -> list[str]:

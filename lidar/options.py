@@ -713,6 +713,23 @@ class DefendOptions:
             raise InputError(f"`seed` {self.seed}: give a non-negative integer")
 
 
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class SignOptions:
+    """Options of signing and verifying."""
+
+    watermark: Path | None = None
+    """File with the secret key of the watermark: 16 bytes or more, also as hexadecimal digits."""
+
+    chain: Path | None = None
+    """File with the key of the hash chain: a secret as of a watermark (HMAC-SHA-256), or an Ed25519 key
+    (PEM), of which the public one is enough to verify."""
+
+    step: float = 0.05
+    """Metres between coordinates of the same bit of the watermark; points move by at most half of it along
+    each axis. The same to sign and to verify."""
+
+
 def classes_of(names: Iterable[str]) -> list[int]:
     """Codes of classes by name; ``vehicles`` stands for all of them, with and without riders.
 

@@ -41,6 +41,14 @@ translation = [1.2, 0.0, 1.9]
 """
 ROUTE = """<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
 <trkpt lat="60.1662" lon="24.9413"/><trkpt lat="60.1655" lon="24.9405"/></trkseg></trk></gpx>"""
+PRIVATE_KEY = """-----BEGIN PRIVATE KEY-----
+MC4CAQAwBQYDK2VwBCIEIAABAgMEBQYHCAkKCwwNDg8QERITFBUWFxgZGhscHR4f
+-----END PRIVATE KEY-----
+"""
+PUBLIC_KEY = """-----BEGIN PUBLIC KEY-----
+MCowBQYDK2VwAyEAA6EHv/POEL4dcN0Y50vAmWfk1jCbpQ1fHdyGZBJVMbg=
+-----END PUBLIC KEY-----
+"""
 CAR = '<vehicle id="a" x="24.9413" y="60.1662" angle="0" type="car" lane="1_0" pos="1"/>'
 SECONDS = "".join(f'<timestep time="{second}">{CAR}</timestep>' for second in (300, 301))
 TRAFFIC = f"<fcd-export>{SECONDS}</fcd-export>"
@@ -100,6 +108,7 @@ def inputs(tmp_path_factory):
     matrix = matrix.replace("duration = 5", "duration = 0.1").replace("seed = [1, 2]", "seed = [1]")
     texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
     texts |= {"sweep.toml": sweep, "matrix.toml": matrix}
+    texts |= {"secret.key": "00" * 32, "private.pem": PRIVATE_KEY, "public.pem": PUBLIC_KEY}
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
     shutil.copytree(ROOT / "examples", folder / "examples")

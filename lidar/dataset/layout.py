@@ -10,6 +10,7 @@ DATASET/
   frames.csv              finished frames, with their points and digests of their files
   <sensor>/<format>/<frame>.<ext>
   <sensor>/truth/<frame>.npz  changes by stages; only with stages
+  integrity/              digests and the signature of `lidar sign`
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import json
 import logging
 import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -111,6 +113,11 @@ class Paths:
     def image(self, name: str, frame: int, *, kind: str) -> Path:
         """An image of a camera: ``rgb``, ``depth``, ``semantic``, ``instance`` or ``flow``."""
         return self.root / name / kind / f"{frame:06d}.png"
+
+    @property
+    def integrity(self) -> Path:
+        """Folder of digests and the signature of a signed dataset."""
+        return self.root / "integrity"
 
     def truth(self, name: str, frame: int) -> Path:
         """What stages did to a frame of a sensor."""
@@ -330,6 +337,8 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
 def remove_dataset(path: Path) -> None:
     """Delete the files of a dataset, its manifest last; files of others are kept, with a warning for each."""
     paths = Paths(path)
+    if (paths.integrity / "chain.json").is_file():
+        shutil.rmtree(paths.integrity)
     sensors: set[str] = set()
     with suppress(DatasetError):
         sensors = set(read_sensors(paths))

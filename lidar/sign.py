@@ -1,0 +1,290 @@
+"""Signs datasets: a watermark in the points of their clouds, and a signed hash chain over their files."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geoscene.files import write_atomically, write_json
+from geoscene.progress import Progress, silent
+from geoscene.typing import Float
+from lidar.apply import copy_dataset, recording_again, rig_of
+from lidar.dataset.formats import FORMATS, Format, format_of
+from lidar.dataset.formats.table import table_cloud
+from lidar.dataset.layout import Dataset, Paths, open_dataset, remove_dataset
+from lidar.dataset.record_clouds import write_clouds
+from lidar.dataset.recorded import cloud_points
+from lidar.dataset.recording import Recording
+from lidar.errors import DatasetError, FormatError, InputError, LidarError
+from lidar.integrity.digest_files import FrameDigests, Link, frame_file, links_bytes
+from lidar.integrity.keys import Signer
+from lidar.integrity.merkle import (
+    START,
+    BlockDigests,
+    block_digests,
+    link,
+    signed_message,
+)
+from lidar.integrity.watermark import Cells, Watermark
+from lidar.rig.devices import Scanner, scanners
+from lidar.sensors.cloud import Cloud
+
+SCHEMA = 1
+"""Version of the files in the folder ``integrity``."""
+
+_FRAME = re.compile(r"(\d{6,})[._].*")
+
+
+@dataclass(frozen=True, slots=True)
+class SignSummary:
+    """What was signed.
+
+    marked : clouds that got the watermark
+    rms    : metres by which it moved points, root mean square of their distance
+    frames : frames in hash chains
+    files  : files with digests
+    """
+
+    path: Path
+    marked: int = 0
+    rms: float = 0.0
+    frames: int = 0
+    files: int = 0
+
+
+def marked_formats(formats: tuple[str, ...]) -> list[Format]:
+    """The formats, of some, whose files bear a watermark that can be read from them alone."""
+    found = [FORMATS[name] for name in formats]
+    return [form for form in found if form.frame == "sensor" and {"ring", "column"} <= set(form.columns)]
+
+
+def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> Cells:
+    """Which pulses the returns of a cloud belong to."""
+    return Cells(sensor, frame, cloud.ring, cloud.column, cloud.echo)
+
+
+def sign_dataset(
+    source: str | Path,
+    out: str | Path | None,
+    *,
+    watermark: Watermark | None = None,
+    signer: Signer | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SignSummary:
+    """Write a dataset with a watermark, a signed hash chain or both to ``out``.
+
+    Without ``out`` the chain is added to the dataset itself; a watermark changes clouds and needs ``out``.
+
+    Raises InputError and DatasetError for a dataset that cannot be signed; nothing is written then.
+    """
+    source = Path(source)
+    dataset = open_dataset(source)
+    if watermark is None and signer is None:
+        raise InputError("give `watermark`, `chain` or both")
+    if dataset.manifest["frames_done"] != dataset.frames:
+        raise DatasetError(f"{source}: the drive was not finished; finish it first")
+    if out is None:
+        if watermark is not None:
+            raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
+        if Paths(source).integrity.exists() and not overwrite:
+            raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
+        return _chained(dataset, signer, summary=SignSummary(source), progress=progress)
+    out = Path(out)
+    here, there = source.resolve(), out.resolve()
+    if here == there or here in there.parents or there in here.parents:
+        raise InputError(f"{out}: give a directory outside of {source}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
+        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
+    summary = SignSummary(out)
+    if watermark is None:
+        _cleared(out)
+        copy_dataset(dataset.path, out, leave_out={Paths(out).integrity})
+    else:
+        summary = _marked(dataset, summary, watermark=watermark, progress=progress)
+    return _chained(open_dataset(out), signer, summary=summary, progress=progress)
+
+
+def _cleared(out: Path) -> None:
+    if Paths(out).manifest.exists():  # a former dataset, to be replaced
+        remove_dataset(out)
+
+
+def _marked(
+    dataset: Dataset, summary: SignSummary, *, watermark: Watermark, progress: Progress
+) -> SignSummary:
+    """Copy a dataset with a watermark in its clouds, in all their formats."""
+    recipe, out = dataset.manifest["recipe"], summary.path
+    if "watermark" in recipe:
+        raise DatasetError(f"{dataset.path}: has a watermark already; sign the original")
+    recording = recording_again(dataset, out)
+    forms = marked_formats(recording.contents.formats)
+    if not forms:
+        known = ", ".join(form.name for form in marked_formats(tuple(FORMATS)))
+        raise InputError(
+            f"{dataset.path}: clouds are {','.join(recording.contents.formats)}; a watermark needs one of"
+            f" {known}, which keep ring and column"
+        )
+    # Exact coordinates first: CSV rounds them.
+    form = min(forms, key=lambda form: form.name == "csv")
+    jobs = [
+        (scanner, frame)
+        for scanner in scanners(rig_of(recipe["rig"]))
+        for frame in range(len(dataset.sample_times(scanner.name)))
+    ]
+    clouds = {path for job in jobs for name, path in recording.paths(*job).items() if not _kept(name)}
+    _cleared(out)
+    leave_out = clouds | {Paths(out).manifest, Paths(out).journal, Paths(out).integrity}
+    copy_dataset(dataset.path, out, leave_out=leave_out)
+    squares = points = 0.0
+    for done, (scanner, frame) in enumerate(jobs):
+        progress("watermark", done, total=len(jobs))
+        moved = _mark_frame(dataset, recording, scanner=scanner, frame=frame, form=form, watermark=watermark)
+        squares, points = squares + float(moved @ moved), points + len(moved)
+    progress("watermark", len(jobs), total=len(jobs))
+    recipe = recipe | {"watermark": watermark.step}
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe})
+    return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
+
+
+def _kept(name: str) -> bool:
+    """Whether files of a frame, named as by `Recording.paths`, stay as they are with a watermark."""
+    return name in ("boxes", "truth") or name.startswith("labels ")
+
+
+def _mark_frame(
+    dataset: Dataset,
+    recording: Recording,
+    *,
+    scanner: Scanner,
+    frame: int,
+    form: Format,
+    watermark: Watermark,
+) -> Float:
+    """Write a cloud with the watermark; return the distances (n,) in metres by which points moved."""
+    source = replace(recording, out=dataset.path).paths(scanner, frame)
+    paths = recording.paths(scanner, frame)
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    table = cloud_points(source[form.name])
+    cloud = table_cloud(table, start_ns=scanner.frame_start_ns(frame))
+    marked = watermark.embedded(cloud.xyz, cells_of(cloud, sensor=scanner.name, frame=frame))
+    xyz = marked.astype(np.float32)
+    before = np.linalg.norm(cloud.xyz.astype(np.float64), axis=1)
+    longer = np.linalg.norm(xyz.astype(np.float64), axis=1) - before
+    moved: Float = np.linalg.norm(xyz - cloud.xyz.astype(np.float64), axis=1)
+    cloud = replace(cloud, xyz=xyz, range=cloud.range + longer)
+    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=table.get("velocity"))
+    return moved
+
+
+@dataclass(frozen=True)
+class SignedFiles:
+    """The files of a directory that are signed, by their paths relative to it.
+
+    frames : by sensor and frame number
+    others : that belong to no frame
+    """
+
+    frames: dict[str, dict[int, list[str]]]
+    others: list[str]
+
+    @property
+    def count(self) -> int:
+        """Number of files."""
+        return len(self.others) + sum(len(own) for group in self.frames.values() for own in group.values())
+
+
+def is_truth(place: Path) -> bool:
+    """Whether a file is ground truth of stages, which is not signed: whoever reads data does not have it."""
+    return "truth" in place.parts[:-1] or place.name.endswith(".truth.csv")
+
+
+def signed_files(dataset: Dataset) -> SignedFiles:
+    """The files of a dataset that are signed."""
+    sensors = dataset.sensors("lidar", "camera")
+    found = SignedFiles({name: {} for name in sensors}, [])
+    for path in sorted(dataset.path.rglob("*")):
+        place = path.relative_to(dataset.path)
+        if path.is_dir() or place.parts[0] == "integrity" or is_truth(place):
+            continue
+        number = _FRAME.fullmatch(place.name)
+        if place.parts[0] in sensors and len(place.parts) > 2 and number:
+            found.frames[place.parts[0]].setdefault(int(number[1]), []).append(place.as_posix())
+        else:
+            found.others.append(place.as_posix())
+    return found
+
+
+def file_digest(path: Path) -> bytes:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+
+
+def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:
+    """Digests of the blocks of a cloud; None for another file, or one that cannot be read."""
+    try:
+        table = format_of(path).read(path)
+    except (LidarError, OSError, ValueError):
+        return None
+    return block_digests(table, rate_hz=rate_hz)
+
+
+def frame_digests(dataset: Dataset, names: list[str], *, rate_hz: float) -> FrameDigests:
+    """Digests of the files of a frame."""
+    sha256 = {name: file_digest(dataset.path / name) for name in names}
+    found = {name: _cloud_blocks(dataset.path / name, rate_hz=rate_hz) for name in names}
+    return FrameDigests(sha256, {name: blocks for name, blocks in found.items() if blocks is not None})
+
+
+def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
+    try:
+        format_of(path)
+    except (FormatError, InputError):
+        return None
+    if path.parent.name == "boxes":
+        return None
+    return blocks_in(path, rate_hz=rate_hz)
+
+
+def _chained(
+    dataset: Dataset, signer: Signer | None, *, summary: SignSummary, progress: Progress
+) -> SignSummary:
+    """Write the signed hash chain over the files of a dataset."""
+    if signer is None:
+        return summary
+    signer.sign(b"")  # a key that cannot sign is refused before anything is written
+    files, folder = signed_files(dataset), dataset.paths.integrity
+    folder.mkdir(exist_ok=True)
+    (folder / "chain.json").unlink(missing_ok=True)  # written last
+    heads: dict[str, tuple[int, bytes]] = {}
+    total, done = sum(map(len, files.frames.values())), 0
+    for sensor, frames in files.frames.items():
+        times, rate_hz = dataset.sample_times(sensor), float(dataset.sensors()[sensor]["rate_hz"])
+        head, links = START, list[Link]()
+        for frame, names in sorted(frames.items()):
+            progress("sign", done, total=total)
+            digests = frame_digests(dataset, names, rate_hz=rate_hz)
+            write_atomically(frame_file(folder, sensor, frame=frame), digests.to_bytes())
+            time_ns = int(times[frame]) if frame < len(times) else -1
+            head = link(head, sensor=sensor, frame=frame, time_ns=time_ns, root=digests.root)
+            links.append(Link(frame, time_ns, digests.root, head))
+            done += 1
+        write_atomically(folder / f"{sensor}.csv", links_bytes(links))
+        heads[sensor] = len(links), head
+    tables = {name: file_digest(dataset.path / name) for name in files.others}
+    document = {
+        "schema": SCHEMA,
+        "algorithm": signer.algorithm,
+        "sensors": {name: {"frames": frames, "head": head.hex()} for name, (frames, head) in heads.items()},
+        "files": {name: sha256.hex() for name, sha256 in tables.items()},
+        "signature": signer.sign(signed_message(heads, tables)).hex(),
+    }
+    write_json(folder / "chain.json", document)
+    progress("sign", total, total=total)
+    return replace(summary, frames=total, files=files.count)

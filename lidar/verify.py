@@ -1,0 +1,418 @@
+"""Verifies the watermark and the signed hash chain of datasets, and names what was tampered with."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.progress import Progress, silent
+from geoscene.typing import Ints
+from lidar.dataset.formats import FORMATS
+from lidar.dataset.formats.table import table_cloud
+from lidar.dataset.layout import Dataset, open_dataset, reading_file
+from lidar.dataset.recorded import cloud_points
+from lidar.errors import DatasetError, InputError, LidarError
+from lidar.integrity.blocks import SECTORS
+from lidar.integrity.digest_files import FrameDigests, Link, frame_file, read_digests, read_links
+from lidar.integrity.keys import Signer
+from lidar.integrity.merkle import START, link, signed_message
+from lidar.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
+from lidar.integrity.watermark import Watermark
+from lidar.sign import (
+    SCHEMA,
+    blocks_in,
+    cells_of,
+    file_digest,
+    is_truth,
+    marked_formats,
+    signed_files,
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is not as it was signed.
+
+    what   : happened, such as ``changed``, ``missing``, ``added``
+    place  : path of the file, or name of the sensor
+    detail : more about it, one line
+    blocks : (k,) of a cloud that differ: ring times 36 plus sector
+    sensor, frame : of the file; empty and None for one of no frame
+    """
+
+    what: str
+    place: str
+    detail: str = ""
+    blocks: tuple[int, ...] = ()
+    sensor: str = ""
+    frame: int | None = None
+
+    def to_text(self) -> str:
+        """One line."""
+        return f"{self.place}: {self.what}" + (f" ({self.detail})" if self.detail else "")
+
+
+@dataclass(frozen=True)
+class ChainReport:
+    """What the hash chain says.
+
+    frames, files : that were compared
+    """
+
+    algorithm: str
+    frames: int
+    files: int
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class MarkedFrame:
+    """Broken places of the watermark of a cloud.
+
+    blocks : (k,) tampered ones: ring times 36 plus sector
+    forged : number of returns that do not bear the watermark
+    absent : whether the cloud has no watermark at all, such as one of another frame or key
+    """
+
+    file: str
+    sensor: str
+    frame: int
+    blocks: tuple[int, ...]
+    forged: int
+    places: tuple[Place, ...]
+    absent: bool
+
+    def to_text(self) -> list[str]:
+        """One line for the cloud and one for each place."""
+        if self.absent:
+            return [f"{self.file}: no watermark of this key and frame"]
+        text = block_text(np.array(self.blocks), world=False)
+        lines = [f"{self.file}: watermark broken in {len(self.blocks)} blocks ({text})"]
+        for place in self.places:
+            low, high = (", ".join(f"{v:.2f}" for v in corner) for corner in (place.low, place.high))
+            lines.append(f"  {place.kind}: {place.returns} returns in the box ({low}) to ({high}) m")
+        return lines
+
+
+@dataclass
+class WatermarkReport:
+    """What the watermark says of all clouds.
+
+    noise         : standard deviation in metres that the tests allow for
+    expected_rate : share of wrong bits by that noise
+    blocks        : that were tested
+    chance        : blocks of them that noise alone makes alarm, on average
+    """
+
+    noise: float
+    expected_rate: float
+    clouds: int = 0
+    bits: int = 0
+    wrong: int = 0
+    blocks: int = 0
+    chance: float = 0.0
+    tampered: int = 0
+    frames: list[MarkedFrame] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+
+    @property
+    def error_rate(self) -> float:
+        """Share of wrong bits."""
+        return self.wrong / max(self.bits, 1)
+
+    def add(self, verdict: FrameVerdict) -> None:
+        """Count a cloud."""
+        self.clouds += 1
+        self.bits += verdict.bits
+        self.wrong += verdict.wrong
+        self.blocks += len(verdict.blocks.block)
+        self.chance += float(verdict.blocks.chance.sum())
+        self.tampered += len(verdict.blocks.tampered)
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """What watermark and hash chain say; None for what was not asked for."""
+
+    watermark: WatermarkReport | None
+    chain: ChainReport | None
+
+    @property
+    def intact(self) -> bool:
+        """Whether nothing was found."""
+        marks = self.watermark is None or not (self.watermark.frames or self.watermark.findings)
+        return marks and (self.chain is None or not self.chain.findings)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as a document."""
+        document: dict[str, Any] = {"intact": self.intact}
+        if self.watermark is not None:
+            rates = {"error_rate": self.watermark.error_rate}
+            document["watermark"] = asdict(self.watermark) | rates
+        if self.chain is not None:
+            document["chain"] = asdict(self.chain)
+        return document
+
+    def to_text(self, name: str) -> list[str]:
+        """Lines: what was found, and a summary of the dataset called ``name``."""
+        lines = []
+        if (chain := self.chain) is not None:
+            lines += [finding.to_text() for finding in chain.findings]
+            counts = f"{chain.frames} frames, {chain.files} files"
+            state = f"{len(chain.findings)} findings" if chain.findings else "all as signed"
+            lines.append(f"{name}: hash chain ({chain.algorithm}) of {counts}: {state}")
+        if (marks := self.watermark) is not None:
+            lines += [finding.to_text() for finding in marks.findings]
+            lines += [line for frame in marks.frames for line in frame.to_text()]
+            lines.append(
+                f"{name}: watermark of {marks.clouds} clouds: {marks.wrong:,} of {marks.bits:,} bits wrong"
+                f" ({marks.error_rate:.3g}; by {marks.noise:g} m of noise {marks.expected_rate:.3g});"
+                f" {marks.tampered} of {marks.blocks:,} blocks tampered with"
+                f" (by chance {marks.chance:.2g})"
+            )
+        return lines
+
+
+def verify_dataset(
+    path: str | Path,
+    *,
+    watermark: Watermark | None = None,
+    signer: Signer | None = None,
+    noise: float = NOISE,
+    false_alarms: float = 0.01,
+    progress: Progress = silent,
+) -> VerifyReport:
+    """What was tampered with since `lidar.sign.sign_dataset`.
+
+    noise        : standard deviation in metres that coordinates got since, such as by another format
+    false_alarms : blocks of a cloud that the watermark's test may report wrongly
+
+    Raises InputError and DatasetError for a dataset without a watermark or signature that is asked for.
+    """
+    dataset = open_dataset(path)
+    if watermark is None and signer is None:
+        raise InputError("give `watermark`, `chain` or both")
+    if not 0 <= noise <= 1:
+        raise InputError(f"`noise` {noise:g}: give 0 to 1 metre")
+    if not 0 < false_alarms <= 100:
+        raise InputError(f"`false_alarms` {false_alarms:g}: give more than 0 and at most 100 blocks a cloud")
+    chain = None if signer is None else _chain_report(dataset, signer, progress=progress)
+    marks = None
+    if watermark is not None:
+        marks = _watermark_report(
+            dataset, watermark, noise=noise, false_alarms=false_alarms, progress=progress
+        )
+    return VerifyReport(marks, chain)
+
+
+def block_text(blocks: Ints, *, world: bool, most: int = 4) -> str:
+    """Rings and directions of blocks in words.
+
+    world : of a cloud in the world frame, whose sectors are parts of a turn in time
+    """
+    ring, sector = np.divmod(blocks, SECTORS)
+    step = 360 // SECTORS
+    if world:
+        words = [f"ring {r} part {s + 1} of {SECTORS}" for r, s in zip(ring, sector, strict=True)]
+    else:
+        words = [
+            f"ring {r} {s * step - 180} to {(s + 1) * step - 180} deg"
+            for r, s in zip(ring, sector, strict=True)
+        ]
+    more = f" and {len(words) - most} more" if len(words) > most else ""
+    return "; ".join(words[:most]) + more
+
+
+def _watermark_report(
+    dataset: Dataset, watermark: Watermark, *, noise: float, false_alarms: float, progress: Progress
+) -> WatermarkReport:
+    found = WatermarkReport(noise, watermark.error_rate(noise))
+    formats = tuple(dataset.manifest["recipe"].get("formats", ()))
+    forms = marked_formats(tuple(name for name in formats if name in FORMATS))
+    if not forms:
+        known = ", ".join(form.name for form in marked_formats(tuple(FORMATS)))
+        raise InputError(f"{dataset.path}: no clouds in a format that keeps a watermark ({known})")
+    names = list(dataset.sensors("lidar"))
+    jobs = [(n, form, k) for n in names for k in range(len(dataset.sample_times(n))) for form in forms]
+    for done, (name, form, frame) in enumerate(jobs):
+        progress("watermark", done, total=len(jobs))
+        path = form.path(dataset.paths.sensor(name), frame)
+        place = path.relative_to(dataset.path).as_posix()
+        try:
+            cloud = table_cloud(cloud_points(dataset.frame_file(path)))
+            cells = cells_of(cloud, sensor=name, frame=frame)
+            verdict = frame_verdict(watermark, cloud.xyz, cells=cells, noise=noise, false_alarms=false_alarms)
+        except LidarError as error:
+            what = "cannot be read" if path.exists() else "missing"
+            detail = "" if what == "missing" else str(error).removeprefix(f"{path}: ")
+            found.findings.append(Finding(what, place, detail, sensor=name, frame=frame))
+            continue
+        found.add(verdict)
+        if len(verdict.blocks.tampered):
+            blocks = tuple(verdict.blocks.tampered.tolist())
+            forged = int(verdict.forged.sum())
+            found.frames.append(
+                MarkedFrame(place, name, frame, blocks, forged, verdict.places, verdict.absent)
+            )
+    progress("watermark", len(jobs), total=len(jobs))
+    return found
+
+
+def _chain_report(dataset: Dataset, signer: Signer, *, progress: Progress) -> ChainReport:
+    path = dataset.paths.integrity / "chain.json"
+    if not path.is_file():
+        raise DatasetError(f"{dataset.path}: is not signed; lidar sign --chain signs it")
+    with reading_file(path):
+        text = path.read_text("utf-8")
+        document = json.loads(text)
+        if document["schema"] != SCHEMA:
+            raise DatasetError(f"{path}: schema version {document['schema']}, this program reads {SCHEMA}")
+        heads = {
+            name: (int(entry["frames"]), bytes.fromhex(entry["head"]))
+            for name, entry in document["sensors"].items()
+        }
+        tables = {name: bytes.fromhex(sha256) for name, sha256 in document["files"].items()}
+        signature, algorithm = bytes.fromhex(document["signature"]), str(document["algorithm"])
+    if algorithm != signer.algorithm:
+        raise InputError(f"{dataset.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
+    findings: list[Finding] = []
+    written = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
+    if text != written or not signer.verifies(signed_message(heads, tables), signature):
+        detail = "signed with another key, or the list of signed files was changed"
+        findings.append(Finding("signature is not valid", path.relative_to(dataset.path).as_posix(), detail))
+    files = signed_files(dataset)
+    findings += _tables_found(dataset, tables, present=files.others)
+    frames = 0
+    for sensor, head in heads.items():
+        found, count = _frames_found(
+            dataset, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
+        )
+        findings, frames = findings + found, frames + count
+    return ChainReport(algorithm, frames, files.count, tuple(findings))
+
+
+def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
+    """Differences of files of no frame."""
+    found = [Finding("added", name) for name in present if name not in signed]
+    for name, sha256 in signed.items():
+        path = _inside(dataset, name)
+        if path is None or not path.is_file():
+            found.append(Finding("missing", name))
+        elif file_digest(path) != sha256:
+            found.append(Finding("changed", name))
+    return found
+
+
+def _inside(dataset: Dataset, name: str) -> Path | None:
+    """A file of the dataset; None for a path that leads out of it."""
+    path = Path(name)
+    return None if path.is_absolute() or ".." in path.parts else dataset.path / path
+
+
+def _frames_found(
+    dataset: Dataset,
+    sensor: str,
+    *,
+    head: tuple[int, bytes],
+    files: dict[int, list[str]],
+    progress: Progress,
+) -> tuple[list[Finding], int]:
+    """Differences of the frames of a sensor, and the number of frames that were compared."""
+    place = f"integrity/{sensor}.csv"
+    try:
+        links = read_links(dataset.paths.integrity / f"{sensor}.csv")
+    except LidarError as error:
+        return [Finding("signed list cannot be read", place, str(error), sensor=sensor)], 0
+    found, signed = list[Finding](), dict[int, FrameDigests]()
+    if broken := _broken_link(links, sensor, head=head):
+        found.append(Finding("signed list was changed", place, broken, sensor=sensor))
+    for entry in links:
+        path = frame_file(dataset.paths.integrity, sensor, frame=entry.frame)
+        where: dict[str, Any] = {"sensor": sensor, "frame": entry.frame}
+        name = path.relative_to(dataset.path).as_posix()
+        try:
+            digests = signed[entry.frame] = read_digests(path)
+        except LidarError as error:
+            found.append(Finding("signed digests cannot be read", name, str(error), **where))
+            continue
+        if digests.root != entry.root:
+            found.append(Finding("signed digests were changed", name, **where))
+    rate_hz = float(dataset.sensors().get(sensor, {}).get("rate_hz", 0.0))
+    differing = _files_found(dataset, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
+    return [*found, *differing], len(links)
+
+
+def _broken_link(links: list[Link], sensor: str, *, head: tuple[int, bytes]) -> str:
+    """Where a chain is broken, in words; empty if it leads to the signed last link."""
+    former = START
+    for entry in links:
+        former = link(former, sensor=sensor, frame=entry.frame, time_ns=entry.time_ns, root=entry.root)
+        if former != entry.link:
+            return f"from frame {entry.frame} on"
+    if (len(links), former) != head:
+        return f"{len(links)} of {head[0]} frames, or another last link"
+    return ""
+
+
+def _files_found(
+    dataset: Dataset,
+    sensor: str,
+    *,
+    signed: dict[int, FrameDigests],
+    files: dict[int, list[str]],
+    rate_hz: float,
+    progress: Progress,
+) -> Iterator[Finding]:
+    """Files of a sensor's frames that are missing, were added, changed, or hold another frame."""
+    frame_of = {
+        (Path(name).parent.as_posix(), sha256): frame
+        for frame, digests in signed.items()
+        for name, sha256 in digests.sha256.items()
+    }
+    known = Counter(sha256 for digests in signed.values() for sha256 in digests.sha256.values())
+    for frame, names in files.items():
+        own = signed[frame].sha256 if frame in signed else {}
+        for name in names:
+            if name not in own and not is_truth(Path(name)):
+                yield Finding("added", name, sensor=sensor, frame=frame)
+    for done, (frame, digests) in enumerate(signed.items()):
+        progress(f"verify {sensor}", done, total=len(signed))
+        for name, sha256 in digests.sha256.items():
+            where: dict[str, Any] = {"sensor": sensor, "frame": frame}
+            path = _inside(dataset, name)
+            if path is None or not path.is_file():
+                yield Finding("missing", name, **where)
+                continue
+            got = file_digest(path)
+            if got == sha256:
+                continue
+            other = frame_of.get((Path(name).parent.as_posix(), got))
+            if other is not None and known[got] == 1:
+                yield Finding("replaced", name, f"holds frame {other}", **where)
+                continue
+            yield _changed(path, name, digests=digests, rate_hz=rate_hz, where=where)
+    progress(f"verify {sensor}", len(signed), total=len(signed))
+
+
+def _changed(
+    path: Path, name: str, *, digests: FrameDigests, rate_hz: float, where: dict[str, Any]
+) -> Finding:
+    """What differs in a file of a frame."""
+    before = digests.blocks.get(name)
+    if before is None:
+        return Finding("changed", name, **where)
+    after = blocks_in(path, rate_hz=rate_hz)
+    if after is None:
+        return Finding("changed", name, "cannot be read as a cloud any more", **where)
+    blocks = before.changed(after)
+    if not len(blocks):
+        detail = "no block of points differs: the header, or the order of points"
+        return Finding("changed", name, detail, **where)
+    world = path.suffix in (".laz", ".las")
+    return Finding("changed", name, block_text(blocks, world=world), tuple(blocks.tolist()), **where)
