@@ -15,7 +15,7 @@ from lidar.physics.echoes import Origin, TracedEchoes, joined, numbered
 from lidar.physics.link import amplitude
 from lidar.raycast.geometry import ALL
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, Stage, added_echoes, parameter
+from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter
 from lidar.world.world import GLASS
 
 METRES_PER_NS = 0.299792458 / 2
@@ -120,6 +120,11 @@ class Attacker(Stage):
                     f"{name} = {getattr(self, name):g} is over the {most:g} of {self.device}"
                     " (device = any has no limits)"
                 )
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Poses, for a fixed device."""
+        return (POSES,) if self.place else ()
 
     def aim(self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation) -> Aim | None:
         """The pulses that the device reaches; None in frames without a line of sight or out of reach."""
