@@ -130,7 +130,7 @@ class Attacker(Stage):
         """The pulses that the device reaches; None in frames without a line of sight or out of reach."""
         if not len(pulses) or not self.start <= at.start_ns * 1e-9 < self.stop:
             return None
-        towards = self._towards(pulses.time_ns, at=at)
+        towards = self.towards(pulses.time_ns, at=at)
         distance = np.linalg.norm(towards, axis=1)
         away = np.degrees(np.arctan2(pulses.direction[:, 1], pulses.direction[:, 0]))
         bearing = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
@@ -165,7 +165,7 @@ class Attacker(Stage):
         chosen[rng.choice(len(aim.row), self.budget, replace=False)] = True
         return aim.where(chosen)
 
-    def _towards(self, time_ns: NDArray[np.int64], *, at: Situation) -> Float:
+    def towards(self, time_ns: NDArray[np.int64], *, at: Situation) -> Float:
         """Vectors (n, 3) from the sensor to the device at times (n,), metres in the sensor frame."""
         if not self.place:
             angle = np.radians(self.bearing)
@@ -174,7 +174,7 @@ class Attacker(Stage):
         if at.poses is None or at.geo is None:
             raise InputError("`place` needs a dataset with poses; give `bearing` and `distance` instead")
         knots = np.unique(np.linspace(time_ns[0], time_ns[-1], _KNOTS).astype(np.int64))
-        vectors = _in_body(at.poses(knots), point=self._point(at.geo))
+        vectors = in_body(at.poses(knots), point=self._point(at.geo))
         return np.stack([np.interp(time_ns, knots, column) for column in vectors.T], axis=1)
 
     def _point(self, geo: Frame) -> Float:
@@ -270,7 +270,7 @@ def _degrees(place: str) -> tuple[float, float, float]:
     return lat, lon, height
 
 
-def _in_body(poses: Poses, *, point: Float) -> Float:
+def in_body(poses: Poses, *, point: Float) -> Float:
     """A point of the scene (3,) in the axes of a body, true metres, at each of its poses (n, 3)."""
     found: Float = np.einsum("nji,nj->ni", poses.rotation, (point - poses.position) / poses.scale)
     return found

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.attacks.attacker import Aim, SynchronisedAttacker, power_of, sent_back
+from lidar.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of, sent_back
 from lidar.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges
 from lidar.errors import InputError
 from lidar.physics.echoes import Origin, TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import POSES, Pulses, parameter
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,9 @@ class Inject(SynchronisedAttacker):
     kind: str = parameter("sedan", "road user that the phantom resembles", among=OBJECTS)
     range: float = parameter(7.0, "metres from the sensor to the phantom", low=0.1, high=1000)
     closing: float = parameter(0.0, "m/s by which it comes nearer", low=-100, high=100)
+    standing: bool = parameter(
+        False, "stays where it was at start, in the scene; else at the same range and bearing"
+    )
     offset: float = parameter(
         0.0, "degrees of azimuth of the phantom from the device to the left", low=-180, high=180
     )
@@ -51,6 +54,11 @@ class Inject(SynchronisedAttacker):
                 f"range = {self.range:g} is nearer than the device at {self.distance:g} m,"
                 " which needs predicts = true"
             )
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Poses, for a fixed device and for a phantom that stands in the scene."""
+        return (POSES,) if self.place or self.standing else ()
 
     def echoes(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
@@ -77,10 +85,9 @@ class Inject(SynchronisedAttacker):
         self, pulses: Pulses, echoes: TracedEchoes, *, aim: Aim, at: Situation, rng: np.random.Generator
     ) -> Float:
         """Distance (k,) of the phantom along each beam, metres; infinite where it has none."""
-        way = pulses.direction[aim.row]
-        ahead = float(np.degrees(np.arctan2(way[0, 1], way[0, 0])) - aim.azimuth[0]) if len(way) else 0.0
-        azimuth = ahead + self.offset + self.frame_jitter * rng.standard_normal()
-        distance = self.range - self.closing * (at.start_ns * 1e-9 - self.start)
+        azimuth, distance = self._place_of_phantom(pulses, aim=aim, at=at)
+        azimuth += self.frame_jitter * rng.standard_normal()
+        distance -= self.closing * (at.start_ns * 1e-9 - self.start)
         if self.shape == "random":
             return rng.uniform(distance, distance + self.deep, len(aim.row))
         ground = ground_below(pulses, echoes, azimuth=azimuth)
@@ -91,3 +98,18 @@ class Inject(SynchronisedAttacker):
             return far_trace_ranges(pulses, aim.row, kind=self.kind, seen_at=self.seen_at, **place)
         part = (0.0, self.strip) if self.shape == "occluded" else (0.0, 1.0)
         return object_ranges(pulses, aim.row, kind=self.kind, part=part, **place)
+
+    def _place_of_phantom(self, pulses: Pulses, *, aim: Aim, at: Situation) -> tuple[float, float]:
+        """Azimuth (degrees) and distance (metres) of the phantom, but for its own motion."""
+        if not self.standing:
+            way = pulses.direction[aim.row[:1]]
+            ahead = np.degrees(np.arctan2(way[:, 1], way[:, 0])) - aim.azimuth[:1]
+            return float(ahead.sum()) + self.offset, self.range
+        assert at.poses is not None  # noqa: S101 - see requires
+        first = np.array([round(self.start * 1e9)], np.int64)
+        towards = self.towards(first, at=at)[0]
+        angle = np.arctan2(towards[1], towards[0]) + np.radians(self.offset)
+        point = np.array([[self.range * np.cos(angle), self.range * np.sin(angle), 0.0]])
+        now = np.array([pulses.time_ns[aim.row].mean() if len(aim.row) else at.start_ns], np.int64)
+        x, y, _ = in_body(at.poses(now), point=at.poses(first).place(point)[0])[0]
+        return float(np.degrees(np.arctan2(y, x))), float(np.hypot(x, y))

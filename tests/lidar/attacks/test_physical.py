@@ -371,3 +371,32 @@ def test_truth_of_every_example_is_the_original_cloud(path, on):
     hidden = truth["hidden"][truth["hidden"] >= 0]
     assert np.isin(hidden, truth["removed"]).all()
     assert len(truth["removed"]) > 0
+
+
+def test_an_attack_has_a_beginning_an_end_and_a_bearing():
+    late = added(attacked(VLP, name="inject", start=0.2, stop=0.25, bearing=90.0))
+    assert np.median(azimuth(late)) == pytest.approx(90.0, abs=1.0)
+    assert not len(added(attacked(VLP, name="inject", start=0.3)))
+    assert not len(added(attacked(VLP, name="inject", stop=0.2)))
+
+
+def test_a_phantom_stands_in_the_scene():
+    """From a sensor that drives 10 m/s it comes nearer by 1 m in each frame."""
+    track = driven((10.0, 0.0, 0.0))
+
+    def at_frame(frame):
+        sweep = cast(
+            load_sensor("hdl64e_s3"), ROOF, frame=frame, seed=5, trajectory=track, world=ROOM, settings=PLAIN
+        )
+        at = replace(
+            situation(sweep),
+            poses=lambda time_ns: track.at(time_ns).mounted(ROOF.translation, ROOF.rotation),
+        )
+        stages = stages_of([{"name": "inject", "range": 18.0, "standing": True, "frame_jitter": 0.0}], seed=5)
+        found = added(altered_sweep(sweep, stages, at=at))
+        return np.percentile(found.xyz[:, 0], 5)
+
+    assert at_frame(0) == pytest.approx(18.0, abs=1.0)
+    assert at_frame(1) - at_frame(6) == pytest.approx(5.0, abs=0.2)
+    with pytest.raises(InputError, match="stage inject needs poses"):
+        stages_of([{"name": "inject", "standing": True}]).check({"top": "lidar"})
