@@ -218,6 +218,90 @@ def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
     return _png(picture)
 
 
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A named line, or dots if these are single values such as published ones."""
+
+    name: str
+    points: Sequence[tuple[float, float]]
+    dots: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Series on common axes, each linear from 0 or logarithmic."""
+
+    axes: Axes
+    series: Sequence[Series]
+    x_log: bool = True
+    y_log: bool = True
+
+
+def panels(some: Sequence[Panel], *, columns: int = 2, size: tuple[int, int] = (760, 520)) -> bytes:
+    """A PNG of panels side by side, each with a legend; values of 0 are left out of logarithmic axes."""
+    rows = -(-len(some) // columns)
+    picture = Image.new("RGB", (columns * size[0], rows * size[1]), (255, 255, 255))
+    for k, panel in enumerate(some):
+        picture.paste(_panel(panel, size=size), ((k % columns) * size[0], (k // columns) * size[1]))
+    return _png(picture)
+
+
+def _panel(panel: Panel, *, size: tuple[int, int]) -> Image.Image:
+    picture = Image.new("RGB", size, (255, 255, 255))
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
+    left, right, top, bottom = 72, size[0] - 230, 64, size[1] - 58
+    shown = [p for s in panel.series for p in s.points if _is_shown(p, panel)]
+    x_ends = _ends([x for x, _ in shown]) if panel.x_log else _linear_ends([x for x, _ in shown])
+    y_ends = _ends([y for _, y in shown]) if panel.y_log else _linear_ends([y for _, y in shown])
+
+    def place(point: tuple[float, float]) -> tuple[float, float]:
+        x, y = point
+        across = _place if panel.x_log else _even_place
+        up = _place if panel.y_log else _even_place
+        return across(x, x_ends, at=(left, right)), up(y, y_ends, at=(bottom, top))
+
+    pen.text((left, 12), panel.axes.title, fill=_INK, font=font)
+    pen.text(((left + right) / 2, size[1] - 12), panel.axes.x, fill=_INK, font=font, anchor="ms")
+    pen.text((10, top - 10), panel.axes.y, fill=_INK, font=font, anchor="ls")
+    for value in _marks(x_ends) if panel.x_log else _even_marks(x_ends):
+        u = place((value, y_ends[1]))[0]
+        pen.line((u, top, u, bottom), fill=_GREY)
+        pen.text((u, bottom + 6), f"{value:g}", fill=_INK, font=font, anchor="mt")
+    for value in _marks(y_ends) if panel.y_log else _even_marks(y_ends):
+        v = place((x_ends[1], value))[1]
+        pen.line((left, v, right, v), fill=_GREY)
+        pen.text((left - 8, v), panel.axes.y_text(value), fill=_INK, font=font, anchor="rm")
+    for k, one in enumerate(panel.series):
+        color, v = _COLORS[k % len(_COLORS)], top + 10 + 22 * k
+        points = [place(p) for p in one.points if _is_shown(p, panel)]
+        if one.dots:
+            for u, w in [*points, (right + 26, v)]:
+                pen.ellipse((u - 5, w - 5, u + 5, w + 5), outline=color, width=2, fill="white")
+        else:
+            if len(points) > 1:
+                pen.line(points, fill=color, width=2)
+            pen.line((right + 16, v, right + 36, v), fill=color, width=3)
+        pen.text((right + 44, v), one.name, fill=_INK, font=font, anchor="lm")
+    return picture
+
+
+def _is_shown(point: tuple[float, float], panel: Panel) -> bool:
+    x, y = point
+    return math.isfinite(x) and math.isfinite(y) and (x > 0 or not panel.x_log) and (y > 0 or not panel.y_log)
+
+
+def _linear_ends(values: Sequence[float]) -> tuple[float, float]:
+    return 0.0, _ends([max(values, default=1.0)])[1]
+
+
+def _even_marks(ends: tuple[float, float]) -> list[float]:
+    return [ends[1] * k / 5 for k in range(6)]
+
+
+def _even_place(value: float, ends: tuple[float, float], *, at: tuple[float, float]) -> float:
+    return at[0] + (at[1] - at[0]) * (min(max(value, ends[0]), ends[1]) - ends[0]) / (ends[1] - ends[0])
+
+
 def _png(picture: Image.Image) -> bytes:
     file = io.BytesIO()
     picture.save(file, "PNG")

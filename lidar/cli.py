@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, Parameter
 
@@ -508,6 +508,50 @@ def apply(
         print_json({**asdict(summary), "path": str(out)})
     else:
         print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
+    return 0
+
+
+@app.command
+def plot(
+    what: Literal["weather"],  # noqa: ARG001
+    /,
+    *,
+    sensor: str = "hdl64e_s2",
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Plot models against published values.
+
+    weather: range by visibility, extinction and lost returns by rate, and what air sends back by range.
+
+    For example:
+
+    lidar plot weather --sensor vlp16 -o weather.png
+
+    Parameters
+    ----------
+    what
+        What to plot: weather.
+    sensor
+        A built-in scanner (lidar sensors lists them) or a TOML file.
+    out
+        PNG to write.
+    """
+    from geoscene.files import write_atomically  # noqa: PLC0415
+    from lidar.rig.scanner import load_sensor  # noqa: PLC0415
+    from lidar.weather.figures import weather_figure  # noqa: PLC0415
+
+    if out.suffix != ".png":
+        raise InputError(f"`out` {out}: the plot is a PNG; give a name that ends with .png")
+    if out.exists() and not report.overwrite:
+        raise InputError(f"{out} exists; replace it with `overwrite`")
+    scanner = load_sensor(Path(sensor) if sensor.endswith(".toml") else sensor)
+    note_new_folder(out)
+    write_atomically(out, weather_figure(scanner))
+    if report.json:
+        print_json({"path": str(out)})
+    else:
+        print(f"{out}: weather and a {scanner.maker} {scanner.model}")
     return 0
 
 
