@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lidar.defences.observation import Observation
 from lidar.defences.verdict import Verdict
@@ -37,3 +38,13 @@ class Defence(Stage):
         scene  : what the map says is around, without road users; None unless ``needs`` has it
         rng    : random numbers of this defence and frame
         """
+
+    def pictures(
+        self, frame: Observation, verdict: Verdict, *, threshold: float
+    ) -> dict[str, NDArray[np.uint8]]:
+        """Pictures (h, w, 3) by name that show a verdict; none by default.
+
+        threshold : suspicion of objects above which there is an alarm
+        """
+        del frame, verdict, threshold
+        return {}

@@ -17,6 +17,7 @@ from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
+from lidar.camera.png import write_png
 from lidar.dataset.layout import Dataset
 from lidar.defences.calibration import Calibration, calibration_text, tail_of
 from lidar.defences.fusion import FUSED, fused, fused_threshold
@@ -118,6 +119,7 @@ def defend(
         if out is not None:
             tables.add(place, judged, truth=truth, thresholds=thresholds)
             _write_returns(out / place / f"{frame.number:06d}.npz", judged.verdicts)
+            _write_pictures(out / place, judged, defences=defences, thresholds=thresholds)
     rng = generator(seed, "bootstrap")
     found = Defended(
         tally.frames,
@@ -227,6 +229,22 @@ def _write_returns(path: Path, verdicts: dict[str, Verdict]) -> None:
     np.savez_compressed(buffer, **columns)  # type: ignore[arg-type]
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, buffer.getvalue())
+
+
+def _write_pictures(
+    folder: Path,
+    judged: Judged,
+    *,
+    defences: Sequence[NamedDefence],
+    thresholds: dict[tuple[str, str], float],
+) -> None:
+    for named in defences:
+        threshold = thresholds.get((named.name, "objects"), 1.0)
+        shown = named.defence.pictures(judged.frame, judged.verdicts[named.name], threshold=threshold)
+        for name, image in shown.items():
+            path = folder / named.name / f"{judged.frame.number:06d}_{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, image)
 
 
 class _Tables:

@@ -30,7 +30,7 @@ _MARGIN = 0.1  # metres by which boxes are grown on each side
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A camera's colour image that was taken nearest in time to a frame.
+    """A camera's colour image that was taken during a frame, or just before or after it.
 
     camera    : intrinsics and mount
     time_ns   : nanoseconds since the drive's start
@@ -43,11 +43,12 @@ class Picture:
 
     def rgb(self) -> NDArray[np.uint8]:
         """Colours (h, w, 3)."""
-        return _pixels(self.file)
+        return pixels_of(self.file)
 
 
 @functools.lru_cache(maxsize=4)
-def _pixels(file: Path) -> NDArray[np.uint8]:
+def pixels_of(file: Path) -> NDArray[np.uint8]:
+    """Colours (h, w, 3) of a PNG file."""
     from lidar.camera.png import read_png  # noqa: PLC0415
 
     return read_png(file)[..., :3].astype(np.uint8)

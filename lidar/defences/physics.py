@@ -100,7 +100,7 @@ def _off_quantum(frame: Observation) -> Bools:
 
 
 def _too_weak(frame: Observation) -> Bools:
-    """Returns whose power is under the detection threshold, where nearly all are above it."""
+    """Returns whose power is under the detection threshold, where the frame shows that there is one."""
     sensor = frame.sensor
     apparent = apparent_of_code(frame.intensity + 0.5, diffuse_code=sensor.diffuse_code)  # codes are rounded
     power = amplitude(
@@ -111,4 +111,6 @@ def _too_weak(frame: Observation) -> Bools:
         falloff=sensor.falloff,
     )
     weak: Bools = power < 0.98
-    return weak if len(weak) and weak.mean() < 1 - _ADAPTED else np.zeros(len(frame), bool)
+    # Without a threshold there are about as many returns just under it as just over it.
+    under, over = (((power >= low) & (power < 2 * low)).sum() for low in (0.49, 0.98))
+    return weak if over > 20 * under else np.zeros(len(frame), bool)

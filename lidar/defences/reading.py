@@ -56,14 +56,14 @@ class Scans:
 
         Raises DatasetError for a damaged file.
         """
-        start = int(self.clouds.time_ns[row])
+        start, number = int(self.clouds.time_ns[row]), int(self.clouds.frames[row])
         table = {name: c for name, c in cloud_points(self.clouds.files[row]).items() if name in SEEN}
         xyz = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float64)
         whole = {
             name: table[name].astype(np.int64) for name in ("time_ns", "ring", "column", "echo", "echoes")
         }
         return Observation(
-            number=int(self.clouds.frames[row]),
+            number=number,
             start_ns=start,
             sensor=self.sensor,
             mount=self.clouds.mount,
@@ -72,7 +72,9 @@ class Scans:
             range=table["range"].astype(np.float64),
             intensity=table["intensity"].astype(np.float64),
             pictures=tuple(
-                _nearest_picture(camera, images, time_ns=start) for camera, images in self.pictures
+                picture
+                for camera, images in self.pictures
+                for picture in _pictures_during(camera, images, window_ns=self.sensor.window_ns(number))
             ),
             navigation=self.navigation,
             **(whole | {"time_ns": start + whole["time_ns"]}),
@@ -127,9 +129,11 @@ def _pictures(dataset: Dataset, specs: dict[str, CameraSpec]) -> tuple[tuple[Cam
     return tuple((specs[name], stream) for name, stream in streams if stream is not None)
 
 
-def _nearest_picture(camera: CameraSpec, images: Stream, *, time_ns: int) -> Picture:
-    row = int(np.argmin(np.abs(images.time_ns - time_ns)))
-    return Picture(camera, int(images.time_ns[row]), images.files[row])
+def _pictures_during(camera: CameraSpec, images: Stream, *, window_ns: tuple[int, int]) -> list[Picture]:
+    """A camera's pictures from just before to just after a frame."""
+    room = int(0.5e9 / camera.rate_hz)
+    near = (images.time_ns >= window_ns[0] - room) & (images.time_ns <= window_ns[1] + room)
+    return [Picture(camera, int(images.time_ns[k]), images.files[k]) for k in np.flatnonzero(near)]
 
 
 def _navigation(dataset: Dataset) -> Navigation | None:

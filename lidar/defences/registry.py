@@ -18,7 +18,9 @@ _DEFENCES = {
     "temporal": "temporal.Temporal",
     "void": "void.Void",
     "azimuth": "azimuth.Azimuth",
+    "overlay": "overlay.Overlay",
     "map": "map.Map",
+    "navigation": "navigation.Navigation",
     "physics": "physics.Physics",
     "statistical": "statistical.Statistical",
 }

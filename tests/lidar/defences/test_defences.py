@@ -8,15 +8,21 @@ from helpers.forgery import CAR, in_box, observed, with_car, without
 from helpers.sensor_worlds import box, driven, world
 
 from geoscene.classes import Class
+from lidar.camera.png import write_png
 from lidar.defences.azimuth import Azimuth
 from lidar.defences.map import Map
+from lidar.defences.navigation import Navigation as Consistency
+from lidar.defences.observation import Navigation, Picture
 from lidar.defences.occlusion import Occlusion
+from lidar.defences.overlay import Overlay, projected
 from lidar.defences.physics import Physics
 from lidar.defences.shadow import Shadow
 from lidar.defences.statistical import Statistical
 from lidar.defences.temporal import Temporal
 from lidar.defences.void import Void
+from lidar.geometry.mounts import Mount
 from lidar.physics.settings import LEVELS
+from lidar.rig.specs import CameraSpec
 
 STREET = (
     box((-60, -60, -1), (60, 60, 0), feature=7, klass=Class.ROAD, material="asphalt"),
@@ -180,3 +186,80 @@ def test_an_object_that_comes_out_of_hiding_is_not_suspicious():
     assert judged(Temporal(), hidden, seen).frame < 0.3
     empty = observed(world(*STREET))[0]
     assert judged(Temporal(), empty, seen).frame > 0.8
+
+
+FRONT = CameraSpec(
+    "front", Mount((1.0, 0.0, 1.65), (-0.5, 0.5, -0.5, 0.5)), 640, 360, 500.0, 500.0, 319.5, 179.5
+)
+
+
+def drawn(path, *boxes):
+    """A picture of a grey road and sky with painted boxes (left, top, right, bottom)."""
+    rng = np.random.default_rng(1)
+    image = np.full((FRONT.height, FRONT.width, 3), 110.0)
+    image[:180] = (150, 180, 220)
+    for left, top, right, bottom in boxes:
+        image[top:bottom, left:right] = (160, 30, 30)
+    write_png(path, np.clip(image + 4 * rng.standard_normal(image.shape), 0, 255).astype(np.uint8))
+    return Picture(FRONT, 0, path)
+
+
+def bounds(frame, rows, picture):
+    pixels = projected(frame, rows, picture=picture)
+    return *np.floor(pixels.min(axis=0)).astype(int), *np.ceil(pixels.max(axis=0)).astype(int)
+
+
+def test_the_camera_confirms_a_car_that_it_sees_and_rejects_one_that_it_does_not(frame, tmp_path):
+    attacked, forged = with_car(frame, (10.0, 1.0, -0.98), points=150)
+    genuine = next(rows for rows in attacked.members if len(rows) and not forged[rows].any())
+    left, top, right, bottom = bounds(attacked, genuine, drawn(tmp_path / "blank.png"))
+    during = drawn(tmp_path / "car.png", (left - 2, top - 6, right + 2, bottom + 6))
+    later = replace(drawn(tmp_path / "later.png"), time_ns=10**8)
+    shown = replace(attacked, pictures=(during, later))
+    verdict = judged(Overlay(), shown)
+    fake, real = split(shown, forged, verdict.objects)
+    assert fake > 0.45 > 2 * real
+    pictures = Overlay().pictures(shown, verdict, threshold=0.4)
+    colors = {tuple(c) for image in pictures.values() for c in image.reshape(-1, 3).tolist()}
+    assert {(255, 40, 40), (40, 255, 40)} <= colors
+    late = replace(shown, pictures=(replace(shown.pictures[0], time_ns=10**9),))
+    assert judged(Overlay(), late).frame == 0, "a picture of another time says nothing"
+
+
+def with_fixes(frames, *, spoofed=(0.0, 0.0), gyro_z=0.0):
+    """Frames with RTK fixes that drift away at a speed (m/s east and north) and a gyroscope."""
+    rng, path = np.random.default_rng(1), frames[0].trajectory
+    time_ns = np.arange(0, 2 * 10**9, 10**8)
+    place = path.at(time_ns).position[:, :2] + 0.015 * rng.standard_normal((len(time_ns), 2))
+    place += np.outer(time_ns / 1e9, spoofed)
+    ones = np.ones(len(time_ns))
+    imu_ns = np.arange(0, 2 * 10**9, 10**7)
+    rate = gyro_z + 0.002 * rng.standard_normal(len(imu_ns))
+    gnss = {"time_ns": time_ns, "quality": 4 * ones, "hdop": ones}
+    data = Navigation(gnss, {"time_ns": imu_ns, "gyro_z": rate}, np.zeros(3), place)
+    return [replace(frame, navigation=data) for frame in frames]
+
+
+def test_fixes_that_drift_and_wrong_poses_contradict_the_scanner():
+    path = driven((6.0, 0.0, 0.0), yaw_rate=0.1)
+    frames = [
+        frame
+        for k in range(0, 11, 2)
+        for frame in observed(world(*STREET, car(*GENUINE)), trajectory=path, only=k)
+    ]
+    assert judged(Consistency(), *with_fixes(frames, gyro_z=0.1)).frame < 0.45
+    assert judged(Consistency(), *with_fixes(frames, spoofed=(0.0, 0.5), gyro_z=0.1)).frame > 0.8
+    assert judged(Consistency(), *with_fixes(frames, gyro_z=0.0)).frame > 0.8, "the gyroscope feels no turn"
+    false = driven((6.0, 0.5, 0.0), yaw_rate=0.1)
+    moved = [replace(frame, trajectory=false) for frame in with_fixes(frames, gyro_z=0.1)]
+    assert judged(Consistency(), *moved).frame > 0.8
+
+
+def test_without_fixes_or_with_too_little_to_match_nothing_is_known(frame):
+    navigation = with_fixes([frame])[0].navigation
+    lost = replace(navigation, east_north=np.full_like(navigation.east_north, np.nan))
+    path = driven((6.0, 0.0, 0.0))
+    frames = [observed(world(*STREET), trajectory=path, only=k)[0] for k in (0, 5)]
+    assert judged(Consistency(), *(replace(f, navigation=lost) for f in frames)).frame < 0.45
+    bare = [observed(world(STREET[0]), trajectory=path, only=k)[0] for k in (0, 5)]
+    assert judged(Consistency(), *with_fixes(bare, spoofed=(9.0, 0.0))).frame == 0

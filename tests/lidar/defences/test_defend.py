@@ -1,0 +1,179 @@
+"""Defences on recorded drives: files, scores, what they read, and data that lack what a defence needs."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from helpers.programs import run_program
+
+from lidar.apply import apply_stages
+from lidar.dataset.formats import FORMATS, read_table
+from lidar.dataset.layout import open_dataset
+from lidar.defences.calibration import read_calibration
+from lidar.defences.defend import calibrate, defend
+from lidar.defences.reading import SEEN, read_scans
+from lidar.defences.registry import defence_names, read_defences
+from lidar.errors import DatasetError, InputError
+from lidar.options import ApplyOptions, DriveOptions
+from lidar.pipeline import drive
+from lidar.signal.registry import read_stages
+
+RIG = """
+name = "small"
+[[lidar]]
+name = "top"
+preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
+[[camera]]
+name = "front"
+translation = [1.6, 0.0, 1.5]
+width = 160
+height = 90
+fov_deg = 90.0
+rate_hz = 10.0
+images = ["rgb"]
+[[gnss]]
+name = "gnss"
+translation = [0.0, 0.0, 1.6]
+rate_hz = 10.0
+[[imu]]
+name = "imu"
+translation = [0.0, 0.0, 0.6]
+rate_hz = 100.0
+"""
+BARE = RIG.partition("[[camera]]")[0]
+
+
+CALIBRATION = read_calibration()
+ALL = read_defences(["all"])
+
+
+def driven(scene, folder, rig, **options):
+    (folder / "rig.toml").write_text(rig)
+    options |= {"route": "random", "rig": str(folder / "rig.toml"), "duration": 0.5, "seed": 3}
+    drive(scene, folder / "drive", options=DriveOptions(workers=1, **options))
+    return folder / "drive"
+
+
+@pytest.fixture(scope="module")
+def plain(scene, tmp_path_factory):
+    return driven(scene, tmp_path_factory.mktemp("plain"), RIG)
+
+
+@pytest.fixture(scope="module")
+def attacked(plain, tmp_path_factory):
+    out = tmp_path_factory.mktemp("attacked") / "drive"
+    stages = read_stages(["inject:device=sun_2020,shape=object,range=8,distance=6,start=0.2"]).stages
+    apply_stages(plain, out, options=ApplyOptions(stages))
+    return out
+
+
+def test_every_defence_is_calibrated_by_the_program():
+    calibration = read_calibration()
+    for name in defence_names():
+        assert 0 <= calibration.threshold(name, "frames") <= 1
+
+
+def test_a_verdict_has_a_row_for_each_return_and_scores_against_the_truth(attacked, tmp_path):
+    dataset = open_dataset(attacked)
+    found = defend([dataset], ALL, calibration=CALIBRATION, rule="max", out=tmp_path / "out")
+    assert set(found.seconds) == set(defence_names())
+    document = json.loads((tmp_path / "out" / "defend.json").read_text())
+    assert set(document["defences"]) == {*defence_names(), "fused"}
+    with (tmp_path / "out" / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 5 * (1 + len(defence_names()))
+    assert [row["attacked"] for row in rows if row["defence"] == "fused"] == ["0", "0", "1", "1", "1"]
+    truth = np.load(dataset.paths.truth("top", 3))["origin"]
+    with np.load(tmp_path / "out" / "drive" / "top" / "000003.npz") as file:
+        assert {len(file[name]) for name in file.files if not name.endswith("_gaps")} == {len(truth)}
+    assert found.scores["occlusion", "returns"].attacked == sum(
+        (np.load(dataset.paths.truth("top", k))["origin"] > 0).sum() for k in range(5)
+    )
+    again = defend([dataset], ALL, calibration=CALIBRATION, rule="max", out=tmp_path / "b")
+    for path in (tmp_path / "out").rglob("*.[cp]*"):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "out")).read_bytes()
+    assert {k: v.auc for k, v in again.scores.items() if v.attacked}.keys() == {
+        k for k, v in found.scores.items() if v.attacked
+    }
+
+
+def test_defences_see_no_ground_truth(attacked, tmp_path):
+    """The verdicts are the same without truth files and with other labels."""
+    blind = tmp_path / "blind"
+    shutil.copytree(attacked, blind)
+    shutil.rmtree(blind / "top" / "truth")
+    (scans,) = read_scans(open_dataset(attacked))
+    for path in sorted((blind / "top" / "pcd").iterdir()):
+        table = read_table(path)
+        rng = np.random.default_rng(1)
+        changed = {
+            name: column if name in SEEN else rng.permutation(column) for name, column in table.items()
+        }
+        FORMATS["pcd"].write(path, changed)
+    judged = [
+        defend(
+            [open_dataset(folder)],
+            ALL,
+            calibration=CALIBRATION,
+            out=tmp_path / name,
+        )
+        for folder, name in ((attacked, "seeing"), (blind, "unseeing"))
+    ]
+    assert (
+        judged[0].scores["physics", "returns"].attacked > judged[1].scores["physics", "returns"].attacked == 0
+    )
+    for k in scans.frames:
+        one, other = (
+            np.load(next((tmp_path / name).rglob(f"{k:06d}.npz"))) for name in ("seeing", "unseeing")
+        )
+        assert one.files == other.files
+        assert all((one[name] == other[name]).all() for name in one.files)
+
+
+def test_data_that_lack_what_a_defence_needs_are_refused_and_all_leaves_it_out(scene, tmp_path):
+    bare = open_dataset(driven(scene, tmp_path, BARE))
+    for name, lack in (("overlay", "colour images"), ("navigation", "GNSS")):
+        with pytest.raises(InputError, match=f"{name}: needs .*{lack}"):
+            defend([bare], read_defences([name]), calibration=CALIBRATION, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    found = defend([bare], ALL, calibration=CALIBRATION)
+    assert set(found.seconds) == set(defence_names()) - {"overlay", "navigation"}
+    (tmp_path / "rig.toml").write_text(BARE + "# changed\n")
+    with pytest.raises(InputError, match="has changed"):
+        read_scans(bare)
+
+
+def test_clouds_without_ring_and_time_are_refused(scene, tmp_path):
+    with pytest.raises(DatasetError, match="drive again with `formats` pcd"):
+        read_scans(open_dataset(driven(scene, tmp_path, BARE, formats=("kitti",))))
+
+
+def test_calibration_takes_genuine_data_alone(plain, attacked, tmp_path):
+    made = calibrate([open_dataset(plain)], read_defences(["physics", "shadow"]), out=tmp_path / "c.toml")
+    assert read_calibration(tmp_path / "c.toml").tails.keys() == made.tails.keys()
+    with pytest.raises(DatasetError, match="was attacked"):
+        calibrate([open_dataset(attacked)], read_defences(["physics"]), out=tmp_path / "d.toml")
+    assert not (tmp_path / "d.toml").exists()
+
+
+def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
+    listed = json.loads(run_program("lidar", "defences", "--json").stdout)
+    assert [row["name"] for row in listed["defences"]] == defence_names()
+    words = ("lidar", "defend", attacked, "--defence", "occlusion:cell=0.5,physics", "-q")
+    found = json.loads(run_program(*words, "--json", "-o", tmp_path / "out").stdout)
+    assert found["defences"]["occlusion"]["returns"]["attacked"] > 0
+    assert json.loads((tmp_path / "out" / "defend.json").read_text())["options"][0]["cell"] == 0.5
+    for extra, message in {
+        ("--defence", "oclusion"): "is occlusion meant",
+        ("--defence", "physics", "-o", str(tmp_path / "out")): "exists already",
+        ("--defence", "physics", "--fuse", "mean"): "max or fisher",
+        ("--defence", "physics", "--calibrate"): "give --out",
+        ("--defence", "physics", "--calibration", str(attacked / "dataset.json")): "no calibration",
+    }.items():
+        refused = run_program("lidar", "defend", attacked, *extra, "-q")
+        assert refused.returncode == 2, extra
+        assert message in refused.stderr
+        assert refused.stderr.count("\n") == 1
