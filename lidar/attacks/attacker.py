@@ -110,7 +110,7 @@ class Attacker(Stage):
         """Validate the parameters, also against the device's limits."""
         super().__post_init__()
         if self.place:
-            _degrees(self.place)
+            degrees_of(self.place)
         elif self.distance > self.reach:
             raise InputError(f"distance = {self.distance:g} is over reach = {self.reach:g}")
         limits = DEVICES[self.device]
@@ -178,7 +178,7 @@ class Attacker(Stage):
         return np.stack([np.interp(time_ns, knots, column) for column in vectors.T], axis=1)
 
     def _point(self, geo: Frame) -> Float:
-        lat, lon, height = _degrees(self.place)
+        lat, lon, height = degrees_of(self.place)
         x, y = geo.from_geographic(lon, lat)
         return np.array([float(x), float(y), height])
 
@@ -259,7 +259,7 @@ class SynchronisedAttacker(TimedAttacker):
         return aim.where(rng.random(len(aim.row)) < 0.5**self.code_bits) if self.code_bits else aim
 
 
-def _degrees(place: str) -> tuple[float, float, float]:
+def degrees_of(place: str) -> tuple[float, float, float]:
     """Latitude, longitude and height of a text; raises InputError for others."""
     try:
         lat, lon, height = (float(word) for word in place.replace(",", " ").split())

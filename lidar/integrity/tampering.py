@@ -35,7 +35,7 @@ _NEIGHBOURS = 6
 _ABSENT = 0.4
 """Share of wrong bits from which a cloud has no watermark; without one it is a half."""
 
-_WIDEST = 40.0
+_WIDEST = 170.0
 """Degrees of a gap that is filled with the directions of removed returns."""
 
 
