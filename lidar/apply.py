@@ -88,7 +88,7 @@ def apply_stages(
     if here == there or here in there.parents or there in here.parents:
         raise InputError(f"{out}: give a directory outside of {source}")
     is_dataset = Paths(source).manifest.exists()
-    clouds = [] if is_dataset else _foreign_clouds(source)
+    clouds = [] if is_dataset else foreign_clouds(source)
     if not is_dataset and not clouds:
         raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
@@ -272,21 +272,42 @@ def _apply_to_frame(
     dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int
 ) -> int:
     """Write a cloud after the stages with its labels, boxes and truth; return the number of points."""
-    begin, contents = scanner.frame_start_ns(frame), recording.contents
+    contents = recording.contents
+    recorded = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=frame)
+
+    def cloud_of(earlier: int) -> Cloud:
+        return recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=earlier)
+
+    threshold = contents.scanner.link or contents.scanner.detection
+    at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
+    altered = altered_recording(recorded, contents.stages, sensor=scanner.sensor, at=at, threshold=threshold)
+    truth = cloud_truth(altered, start_ns=scanner.frame_start_ns(frame))
+    write_altered(
+        altered, truth, dataset=dataset, recording=recording, form=form, scanner=scanner, frame=frame
+    )
+    return len(altered.cloud)
+
+
+def write_altered(
+    altered: Altered,
+    truth: dict[str, NDArray[Any]],
+    *,
+    dataset: Dataset,
+    recording: Recording,
+    form: Format,
+    scanner: Scanner,
+    frame: int,
+) -> None:
+    """Write a changed cloud of a dataset with its labels, boxes and truth.
+
+    form : in which the dataset's cloud was read
+    """
+    contents, cloud = recording.contents, altered.cloud
     source = replace(recording, out=dataset.path).paths(scanner, frame)
     paths = recording.paths(scanner, frame)
     for path in paths.values():
         path.parent.mkdir(parents=True, exist_ok=True)
     table = cloud_points(source[form.name])
-    recorded = _completed(table_cloud(table, start_ns=begin), scanner.sensor, columns=form.columns)
-
-    def cloud_of(earlier: int) -> Cloud:
-        return _recorded(dataset, recording, form=form, scanner=scanner, frame=earlier)
-
-    threshold = contents.scanner.link or contents.scanner.detection
-    at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
-    altered = altered_recording(recorded, contents.stages, sensor=scanner.sensor, at=at, threshold=threshold)
-    cloud = altered.cloud
     if form.kitti:  # recorded without the vehicle's motion: all points are those of the frame's start
         cloud = replace(cloud, time_ns=np.zeros_like(cloud.time_ns))
     velocity = None
@@ -305,11 +326,14 @@ def _apply_to_frame(
                 instances = [int(row["instance"]) for row in rows]
             hits = [np.count_nonzero(cloud.feature == instance) for instance in instances]
             write_columns(Paths(recording.out).frame_boxes(scanner.name, frame), columns | {"points": hits})
-    write_truth(paths["truth"], cloud_truth(altered, start_ns=begin))
-    return len(cloud)
+    target = Paths(recording.out).truth(scanner.name, frame)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_truth(target, truth)
 
 
-def _recorded(dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int) -> Cloud:
+def recorded_cloud(
+    dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int
+) -> Cloud:
     """A cloud of a dataset."""
     path = replace(recording, out=dataset.path).paths(scanner, frame)[form.name]
     cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(frame))
@@ -329,7 +353,7 @@ def _check_sight(
         (
             (
                 *recorded_echoes(
-                    _recorded(dataset, recording, form=form, scanner=device, frame=frame), device.sensor
+                    recorded_cloud(dataset, recording, form=form, scanner=device, frame=frame), device.sensor
                 ),
                 situation_of(recording, device, frame=frame),
             )
@@ -377,7 +401,7 @@ def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, f
 _IMAGES = {"depth", "semantic", "instance"}
 
 
-def _foreign_clouds(source: Path) -> list[tuple[Path, Format]]:
+def foreign_clouds(source: Path) -> list[tuple[Path, Format]]:
     """Point clouds of KITTI and nuScenes in a folder, in order."""
     found = []
     for path in sorted(source.rglob("*.bin")):
@@ -414,7 +438,7 @@ def _apply_to_clouds(
         place = path.relative_to(source)
         stem = path.name.removesuffix(form.suffix)
         device = devices[path.parent.name, form.name]
-        recorded = _read_foreign(path, form, device=device)
+        recorded = read_foreign(path, form, device=device)
         frame = int(stem) if stem.isdigit() else stem
         at = Situation(device.name, frame, earlier=_Former(clouds, done, device=device).cloud)
         altered = altered_recording(recorded, chosen, sensor=device, at=at)
@@ -424,7 +448,7 @@ def _apply_to_clouds(
         write_truth((out / "truth" / place).with_name(f"{stem}.npz"), cloud_truth(altered, start_ns=0))
         labels = path.parent.parent / "labels" / f"{stem}.label"
         if form is _KITTI and labels.is_file():
-            _select_labels(labels, out / labels.relative_to(source), altered=altered)
+            select_labels(labels, out / labels.relative_to(source), altered=altered)
         before, after = before + len(recorded), after + len(altered.cloud)
     progress("stages", len(clouds), total=len(clouds))
     return ApplySummary(out, len(clouds), before, after)
@@ -432,11 +456,11 @@ def _apply_to_clouds(
 
 def _seen(path: Path, form: Format, *, device: Sensor) -> Seen:
     """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
-    recorded = _read_foreign(path, form, device=device)
+    recorded = read_foreign(path, form, device=device)
     return (*recorded_echoes(recorded, device), Situation(device.name, path.name))
 
 
-def _read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
+def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
     """A point cloud of KITTI or nuScenes."""
     return _completed(table_cloud(form.read(path)), device, columns=form.columns)
 
@@ -459,10 +483,10 @@ class _Former:
         row = self.row - frames
         if row < 0 or self.clouds[row][0].parent != path.parent:
             return None
-        return _read_foreign(self.clouds[row][0], form, device=self.device)
+        return read_foreign(self.clouds[row][0], form, device=self.device)
 
 
-def _select_labels(path: Path, out: Path, *, altered: Altered) -> None:
+def select_labels(path: Path, out: Path, *, altered: Altered) -> None:
     """Write labels of SemanticKITTI for the returns after stages; added ones are unlabelled (0)."""
     codes = np.append(np.fromfile(path, "<u4"), np.uint32(0))
     if len(codes) != len(altered.original) + 1:

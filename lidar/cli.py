@@ -34,6 +34,7 @@ from lidar.options import (
     AccuracyOptions,
     ApplyOptions,
     DefendOptions,
+    DenoiseOptions,
     DriveOptions,
     ExportOptions,
     MapOptions,
@@ -552,6 +553,46 @@ def plot(
         print_json({"path": str(out)})
     else:
         print(f"{out}: weather and a {scanner.maker} {scanner.model}")
+    return 0
+
+
+@app.command
+def denoise(
+    dataset: Path,
+    /,
+    *,
+    options: DenoiseOptions,
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Remove the returns of rain and snow from recorded clouds, and score filters where the truth is known.
+
+    For example:
+
+    lidar denoise snowy --method dror,lior,ddior
+
+    lidar denoise snowy --method dror:angle=0.2 -o clean
+
+    Parameters
+    ----------
+    dataset
+        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+    out
+        Directory to write the clouds to that the only method leaves.
+    """
+    from lidar.denoise.denoise import denoise as denoised  # noqa: PLC0415
+    from lidar.denoise.filters import read_methods  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    methods = read_methods(options.methods)
+    if out is not None:
+        note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        found = denoised(dataset, methods, out=out, overwrite=report.overwrite, progress=progress)
+    if report.json:
+        print_json(found.to_json())
+    else:
+        print(columns(found.table()))
     return 0
 
 

@@ -730,6 +730,16 @@ class SignOptions:
     each axis. The same to sign and to verify."""
 
 
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class DenoiseOptions:
+    """Options of filters on recorded clouds."""
+
+    methods: Annotated[tuple[str, ...], Parameter(name="--method"), WORDS]
+    """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE:KEY=VALUE.
+    docs/weather.md lists their parameters."""
+
+
 def classes_of(names: Iterable[str]) -> list[int]:
     """Codes of classes by name; ``vehicles`` stands for all of them, with and without riders.
 
