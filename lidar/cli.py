@@ -569,9 +569,9 @@ def denoise(
 
     For example:
 
-    lidar denoise snowy --method dror,lior,ddior
+    lidar denoise drive --method dror,lior,ddior
 
-    lidar denoise snowy --method dror:angle=0.2 -o clean
+    lidar denoise drive --method dror:angle=0.2 -o clean
 
     Parameters
     ----------
