@@ -15,6 +15,7 @@ from lidar.defences.calibration import read_calibration
 from lidar.defences.defend import calibrate, defend
 from lidar.defences.reading import SEEN, read_scans
 from lidar.defences.registry import defence_names, read_defences
+from lidar.defences.run import DETECTOR
 from lidar.errors import DatasetError, InputError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.pipeline import drive
@@ -79,7 +80,7 @@ def test_every_defence_is_calibrated_by_the_program():
 def test_a_verdict_has_a_row_for_each_return_and_scores_against_the_truth(attacked, tmp_path):
     dataset = open_dataset(attacked)
     found = defend([dataset], ALL, calibration=CALIBRATION, rule="max", out=tmp_path / "out")
-    assert set(found.seconds) == set(defence_names())
+    assert set(found.seconds) == {*defence_names(), DETECTOR}
     document = json.loads((tmp_path / "out" / "defend.json").read_text())
     assert set(document["defences"]) == {*defence_names(), "fused"}
     with (tmp_path / "out" / "frames.csv").open() as file:
@@ -140,7 +141,7 @@ def test_data_that_lack_what_a_defence_needs_are_refused_and_all_leaves_it_out(s
             defend([bare], read_defences([name]), calibration=CALIBRATION, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     found = defend([bare], ALL, calibration=CALIBRATION)
-    assert set(found.seconds) == set(defence_names()) - {"overlay", "navigation"}
+    assert set(found.seconds) == {*defence_names(), DETECTOR} - {"overlay", "navigation"}
     (tmp_path / "rig.toml").write_text(BARE + "# changed\n")
     with pytest.raises(InputError, match="has changed"):
         read_scans(bare)
