@@ -88,11 +88,20 @@ def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, at: 
     has_new = np.zeros(len(pulses), bool)
     has_new[echoes.pulse[is_new]] = True
     is_mixed = has_new[echoes.pulse]
-    mixed, others = echoes.take(np.flatnonzero(is_mixed)), echoes.take(np.flatnonzero(~is_mixed))
-    mixed = mixed.take(np.lexsort((mixed.range, mixed.pulse)))
+    rows, others = np.flatnonzero(is_mixed), echoes.take(np.flatnonzero(~is_mixed))
+    mixed = echoes.take(rows[_order(echoes.pulse[rows], distance=echoes.range[rows])])
     # Off the axis, so that an echo of several is described by the one that sends back most.
     mixed = merged(replace(mixed, axis=np.zeros(len(mixed), bool)), pulses.sensor.echo_separation)
     return by_pulse(others, mixed)
+
+
+def _order(pulse: NDArray[np.int32], *, distance: Float) -> NDArray[np.int64]:
+    """The rows by pulse and distance: `numpy.lexsort`, for a tenth of its cost where no two are alike."""
+    key = pulse + distance / 2**16
+    order: NDArray[np.int64] = np.argsort(key)
+    if np.any(np.diff(key[order]) == 0):
+        order = np.lexsort((distance, pulse))
+    return order
 
 
 def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:

@@ -94,20 +94,33 @@ def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field
 @functools.lru_cache(maxsize=8)
 def _place_share(setting: WeatherSetting, geo: Frame, *, corner: tuple[float, float], count: int) -> Float:
     """The share (count, count) of a place at samples: 1 within, falling to 0 over the edge around it."""
+    x, y = (c + _STEP * np.arange(count) for c in corner)
+    return _share_of_place(setting, geo, *np.meshgrid(x, y))
+
+
+def _share_of_place(setting: WeatherSetting, geo: Frame, *points: Any) -> Float:
+    """The share of a place at scene coordinates x and y: 1 within, falling to 0 over the edge around it."""
     import shapely  # noqa: PLC0415  (0.1 s)
 
-    x, y = (c + _STEP * np.arange(count) for c in corner)
-    points = shapely.points(*np.meshgrid(x, y))
     if setting.radius:
-        place = shapely.Point(*geo.from_geographic(setting.longitude, setting.latitude)).buffer(
-            setting.radius
-        )
+        centre = shapely.Point(*geo.from_geographic(setting.longitude, setting.latitude))
+        away = np.maximum(shapely.distance(shapely.points(*points), centre) - setting.radius, 0.0)
     else:
         lon, lat = np.array(setting.corners()).T
         place = shapely.Polygon(np.transpose(geo.from_geographic(lon, lat)))
-    away = shapely.distance(points, place)
-    share: Float = np.clip(1 - away / setting.edge, 0, 1) if setting.edge else (away <= 0).astype(float)
+        away = shapely.distance(shapely.points(*points), place)
+    share: Float = np.clip(1 - away / setting.edge, 0, 1) if setting.edge else np.where(away > 0, 0.0, 1.0)
     return share
+
+
+def is_within(setting: WeatherSetting, *, at: Situation) -> bool:
+    """Whether a sensor is within the place of a setting, or half of its edge around it."""
+    if not (setting.radius or setting.polygon):
+        return True
+    if at.poses is None or at.geo is None:
+        raise InputError("weather with a place needs poses, which these images do not have")
+    x, y = at.poses(np.array([at.start_ns])).position[0, :2]
+    return bool(_share_of_place(setting, at.geo, x, y) >= 0.5)
 
 
 def plume_pattern(

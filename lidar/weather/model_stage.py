@@ -8,11 +8,13 @@ import numpy as np
 
 from geoscene.classes import Class
 from geoscene.typing import Float
+from lidar.camera.render import Frame
 from lidar.errors import InputError
 from lidar.physics.echoes import Origin
 from lidar.sensors.cloud import TracedCloud
 from lidar.signal.situation import Situation
 from lidar.signal.stage import parameter
+from lidar.weather.camera import weathered
 from lidar.weather.hahner import hahner_fog, hahner_snow
 from lidar.weather.lisa import LOST, SCATTERED, Lidar, Returns, goodin, lisa
 from lidar.weather.media import medium_of
@@ -67,6 +69,10 @@ class WeatherModel(WeatherSetting):
             )
             return _changed(cloud, found, white=1.0)
         return _changed(cloud, self._dimmed(distance, code / _WHITE, amount=amount, rng=rng), white=_WHITE)
+
+    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+        """The image that a camera takes in this weather, by the physical model: these have no cameras."""
+        return weathered(frame, self, at=at, rng=rng)
 
     def _dimmed(
         self, distance: Float, reflectance: Float, *, amount: float, rng: np.random.Generator
