@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -22,8 +21,6 @@ from lidar.weather.setting import WeatherSetting
 @dataclass(frozen=True)
 class Weather(WeatherSetting):
     """Rain, fog, snow, dust or spray: dims echoes, and sends back echoes of its own."""
-
-    settings: ClassVar[tuple[tuple[str, str], ...]] = (("link", "on"),)
 
     model: str = parameter("physical", "the model; others are stage weather_model", among=("physical",))
 
