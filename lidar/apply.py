@@ -95,7 +95,7 @@ def apply_stages(
         raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
     if is_dataset and options.sensor:
         raise InputError("`sensor`: a dataset has its own sensors; leave it out")
-    with _complete(out) as part:
+    with complete_folder(out) as part:
         if is_dataset:
             dataset = open_dataset(source)
             done = _apply_to_dataset(dataset, part, stages=options.all_stages, progress=progress)
@@ -105,7 +105,7 @@ def apply_stages(
 
 
 @contextmanager
-def _complete(out: Path) -> Iterator[Path]:
+def complete_folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder whose files become those of ``out`` unless the block raises.
 
     They replace a former dataset there; other files stay.

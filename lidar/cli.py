@@ -14,6 +14,7 @@ from cyclopts import App, Parameter
 from geoscene.console import (
     DEFAULTS,
     FAILURE,
+    SEVERAL,
     WORDS,
     Report,
     command_line,
@@ -696,6 +697,63 @@ def defences(*, json: JsonFlag = False) -> int:
             cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
     print(columns(cells))
     print("\nlidar defend DATASET --defence NAME:KEY=VALUE,... judges recorded data (see docs/defences.md).")
+    return 0
+
+
+@app.command
+def tamper(
+    dataset: Path,
+    /,
+    *,
+    replace: Annotated[tuple[str, ...], SEVERAL] = (),
+    by: Path | None = None,
+    freeze: bool = False,
+    shift: Annotated[tuple[str, ...], SEVERAL] = (),
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Replace recorded files by those of other frames or drives, and shift time stamps between sensors.
+
+    For attacks on what is stored; tamper.truth.csv tells what was done. Other attacks on recorded data are
+    stages: lidar apply --attack.
+
+    For example:
+
+    lidar tamper drive --replace lidar_top:1-1=0 --shift lidar_top=0.05 -o tampered
+
+    Parameters
+    ----------
+    dataset
+        Directory of the dataset.
+    replace
+        Frames and the first of those that replace them: SENSOR:FIRST-LAST=SOURCE; repeat for more.
+    by
+        Directory of the dataset that these are taken from; the same one by default.
+    freeze
+        Repeat the first of them.
+    shift
+        Sensor and the seconds by which its time stamps are later: SENSOR=SECONDS; repeat for more.
+    out
+        Directory to write to.
+    """
+    from lidar.tamper import read_replacement, read_shift  # noqa: PLC0415
+    from lidar.tamper import tamper as tampered  # noqa: PLC0415
+
+    note_new_folder(out)
+    done = tampered(
+        dataset,
+        out,
+        replacements=[read_replacement(text) for text in replace],
+        by=by or "",
+        freeze=freeze,
+        shifts=[read_shift(text) for text in shift],
+        overwrite=report.overwrite,
+    )
+    if report.json:
+        print_json({**asdict(done), "path": str(out)})
+    else:
+        shifts = "".join(f"; {name} is {ns / 1e9:g} s late" for name, ns in done.shifts.items())
+        print(f"{out}: {done.files} files replaced{shifts}")
     return 0
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import copy_dataset, recording_again, rig_of
+from lidar.apply import complete_folder, copy_dataset, recording_again, rig_of
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset, remove_dataset
+from lidar.dataset.layout import Dataset, Paths, open_dataset
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Recording
@@ -100,18 +100,14 @@ def sign_dataset(
         raise InputError(f"{out}: give a directory outside of {source}")
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
         raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
-    summary = SignSummary(out)
-    if watermark is None:
-        _cleared(out)
-        copy_dataset(dataset.path, out, leave_out={Paths(out).integrity})
-    else:
-        summary = _marked(dataset, summary, watermark=watermark, progress=progress)
-    return _chained(open_dataset(out), signer, summary=summary, progress=progress)
-
-
-def _cleared(out: Path) -> None:
-    if Paths(out).manifest.exists():  # a former dataset, to be replaced
-        remove_dataset(out)
+    with complete_folder(out) as part:
+        summary = SignSummary(part)
+        if watermark is None:
+            copy_dataset(dataset.path, part, leave_out={Paths(part).integrity})
+        else:
+            summary = _marked(dataset, summary, watermark=watermark, progress=progress)
+        summary = _chained(open_dataset(part), signer, summary=summary, progress=progress)
+    return replace(summary, path=out)
 
 
 def _marked(
@@ -137,7 +133,6 @@ def _marked(
         for frame in range(len(dataset.sample_times(scanner.name)))
     ]
     clouds = {path for job in jobs for name, path in recording.paths(*job).items() if not _kept(name)}
-    _cleared(out)
     leave_out = clouds | {Paths(out).manifest, Paths(out).journal, Paths(out).integrity}
     copy_dataset(dataset.path, out, leave_out=leave_out)
     squares = points = 0.0
