@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -348,19 +348,17 @@ def _check_sight(
     jobs: Sequence[tuple[Scanner | Camera, int]],
 ) -> None:
     """Raise InputError for an attacker that no scanner sees in any of the frames."""
-    check_sight(
-        recording.contents.stages,
-        (
-            (
-                *recorded_echoes(
-                    recorded_cloud(dataset, recording, form=form, scanner=device, frame=frame), device.sensor
-                ),
-                situation_of(recording, device, frame=frame),
-            )
-            for device, frame in jobs
-            if isinstance(device, Scanner)
-        ),
+
+    def seen(scanner: Scanner, at: Situation) -> Seen:
+        cloud = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=int(at.frame))
+        return (*recorded_echoes(cloud, scanner.sensor), at)
+
+    places = (
+        (device, situation_of(recording, device, frame=frame))
+        for device, frame in jobs
+        if isinstance(device, Scanner)
     )
+    check_sight(recording.contents.stages, ((at, partial(seen, device, at)) for device, at in places))
 
 
 def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:
@@ -430,7 +428,7 @@ def _apply_to_clouds(
     chosen = Stages(options.all_stages)
     chosen.check({name: "lidar" for name, _ in devices})
     check_sight(
-        chosen, (_seen(path, form, device=devices[path.parent.name, form.name]) for path, form in clouds)
+        chosen, (_place_of(path, form, device=devices[path.parent.name, form.name]) for path, form in clouds)
     )
     before = after = 0
     for done, (path, form) in enumerate(clouds):
@@ -454,10 +452,10 @@ def _apply_to_clouds(
     return ApplySummary(out, len(clouds), before, after)
 
 
-def _seen(path: Path, form: Format, *, device: Sensor) -> Seen:
+def _place_of(path: Path, form: Format, *, device: Sensor) -> tuple[Situation, Callable[[], Seen]]:
     """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
-    recorded = read_foreign(path, form, device=device)
-    return (*recorded_echoes(recorded, device), Situation(device.name, path.name))
+    at = Situation(device.name, path.name)
+    return at, lambda: (*recorded_echoes(read_foreign(path, form, device=device), device), at)
 
 
 def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
+from lidar.signal.situation import Situation
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import Region
 
@@ -197,16 +199,20 @@ def _driven(
     )
 
 
-def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[Seen]:
-    """Frames of a drive's scanners in its world."""
+def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Situation, Callable[[], Seen]]]:
+    """Where a drive's scanners take their frames, and what they see there; the world is loaded as needed."""
     worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.contents.world)
-    for chunk, region in chunks(plan.jobs, recording.trajectory):
+
+    def seen(scanner: Scanner, frame: int, *, region: Region) -> Seen:
         worlds.follow(region)
+        world = worlds.during(*scanner.sensor.window_ns(frame))
+        return sent_only(scanner.sensor, situation_of(recording, scanner, frame=frame, world=world))
+
+    for chunk, region in chunks(plan.jobs, recording.trajectory):
         for job in chunk:
             if isinstance(job.sensor, Scanner):
-                world = worlds.during(*job.sensor.sensor.window_ns(job.frame))
-                at = situation_of(recording, job.sensor, frame=job.frame, world=world)
-                yield sent_only(job.sensor.sensor, at)
+                at = situation_of(recording, job.sensor, frame=job.frame)
+                yield at, partial(seen, job.sensor, job.frame, region=region)
 
 
 def trim_memory() -> None:

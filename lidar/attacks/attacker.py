@@ -31,6 +31,7 @@ A fit to Jin et al. 2023: 90 % of the errors below 0.102 m within 6 degrees, abo
 """
 
 _KNOTS = 11  # moments of a frame at which the direction to a fixed attacker is computed
+_PER_FRAME = 100.0  # metres by which a vehicle moves within a frame, at most
 _BESIDE = np.radians(1.5)  # angle around the attacker within which recorded returns tell what is in between
 _FOUND_BEFORE = 1.0  # metres before the attacker at which such a return blocks its light
 
@@ -128,7 +129,7 @@ class Attacker(Stage):
 
     def aim(self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation) -> Aim | None:
         """The pulses that the device reaches; None in frames without a line of sight or out of reach."""
-        if not len(pulses) or not self.start <= at.start_ns * 1e-9 < self.stop:
+        if not len(pulses) or not self.may_reach(at):
             return None
         towards = self.towards(pulses.time_ns, at=at)
         distance = np.linalg.norm(towards, axis=1)
@@ -151,6 +152,15 @@ class Attacker(Stage):
         )
         power = self.power * (POWER_AT / distance[row]) ** 2
         return Aim(row, azimuth[row], distance[row], power)
+
+    def may_reach(self, at: Situation) -> bool:
+        """Whether the device attacks at the time of a frame and is not far out of reach."""
+        if not self.start <= at.start_ns * 1e-9 < self.stop:
+            return False
+        if not self.place:
+            return True
+        away = self.towards(np.array([at.start_ns], np.int64), at=at)
+        return float(np.linalg.norm(away)) <= self.reach + _PER_FRAME
 
     @property
     def budget(self) -> int:

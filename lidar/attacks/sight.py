@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import cast
 
 import numpy as np
@@ -19,18 +19,25 @@ Seen = tuple[Pulses, TracedEchoes, Situation]
 """Pulses of a frame, the echoes that are known without rays, and where it is taken."""
 
 
-def check_sight(stages: Stages, frames: Iterable[Seen]) -> None:
-    """Raise InputError for a device that is in the line of sight of a scanner in none of the frames."""
+def check_sight(stages: Stages, frames: Iterable[tuple[Situation, Callable[[], Seen]]]) -> None:
+    """Raise InputError for a device that is in the line of sight of a scanner in none of the frames.
+
+    frames : where each is taken, without its world, and what it sees, which is asked for near the device
+    """
     waiting = [named for named in stages.stages if isinstance(named.stage, Attacker)]
     rest = iter(frames)
     while waiting and (frame := next(rest, None)):
-        pulses, echoes, at = frame
-        waiting = [
+        where, seen = frame
+        near = [
             named
             for named in waiting
-            if named.sensor not in ("", at.sensor)
-            or cast("Attacker", named.stage).aim(pulses, echoes, at=at) is None
+            if named.sensor in ("", where.sensor) and cast("Attacker", named.stage).may_reach(where)
         ]
+        if near:
+            pulses, echoes, at = seen()
+            for named in near:
+                if cast("Attacker", named.stage).aim(pulses, echoes, at=at) is not None:
+                    waiting.remove(named)
     for named in waiting:
         reach = cast("Attacker", named.stage).reach
         raise InputError(

@@ -335,13 +335,17 @@ def test_a_device_that_is_never_in_sight_is_refused():
     seen, hidden = place_of((20.0, 5.0, 1.5)), place_of((20.0, 5.0, -3.0))
     for place, fits in ((seen, True), (hidden, False)):
         stages = stages_of([{"name": "inject", "place": "{} {} {}".format(*place)}], seed=5)
-        frames = [sent_only(VLP.sensor, situation(VLP))] * 2
+        frames = [(situation(VLP), lambda: sent_only(VLP.sensor, situation(VLP)))] * 2
         if fits:
             check_sight(stages, frames)
         else:
             with pytest.raises(InputError, match="attack inject: its device is in the line of sight of no"):
                 check_sight(stages, frames)
     check_sight(stages_of([{"name": "cover_glass"}]), [])
+    lon, lat = GEO.to_geographic(500.0, 0.0)  # what far frames show is not asked for
+    far = stages_of([{"name": "inject", "place": f"{lat} {lon} 1.5"}], seed=5)
+    with pytest.raises(InputError, match="in the line of sight of no scanner"):
+        check_sight(far, [(situation(VLP), pytest.fail)])
 
 
 EXAMPLES = sorted((Path(__file__).parents[3] / "examples" / "attacks").glob("*.toml"))
