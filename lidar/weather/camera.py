@@ -21,6 +21,7 @@ from lidar.random_streams import generator
 from lidar.rig.camera_model import pixel_rays, project
 from lidar.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
+from lidar.weather.fields import FARTHEST, Field, Rays, amounts, place_field
 from lidar.weather.media import Medium, medium_of
 from lidar.weather.setting import WeatherSetting
 from lidar.weather.streaks import Particles, streak_cover
@@ -93,14 +94,17 @@ def _through_air(
     camera = at.camera
     added = _exposed(at, lambda sources: sources.mean)
     path = np.where(np.isfinite(distance), distance, _to_sky(camera, pose, top=_TOP[setting.kind]))
+    field, here = place_field(setting, FARTHEST, at=at), 1.0
+    if field is not None:
+        path, here = _path_through(field, path, camera=camera, pose=pose)
     clear = np.exp(-air.extinction * path).astype(np.float32)[..., None]
     light = light * clear + added * (1 - clear)
     particles = falling(setting, air)
-    if particles is None:
+    if particles is None or here <= 0:
         return light
     cover = streak_cover(
         camera,
-        particles,
+        replace(particles, density=particles.density * here),
         exposure=(camera.exposure_ns or EXPOSURE_NS) / 1e9,
         down=-pose.rotation[0, 2],
         air=(_wind(setting) - _velocity(at)) @ pose.rotation[0],
@@ -167,6 +171,21 @@ def _to_sky(camera: CameraSpec, pose: Poses, *, top: float) -> NDArray[np.float3
     shape = camera.height, camera.width
     through: NDArray[np.float32] = np.nan_to_num(path).astype(np.float32).reshape(shape)
     return through
+
+
+def _path_through(
+    field: Field, path: NDArray[np.float32], *, camera: CameraSpec, pose: Poses
+) -> tuple[NDArray[np.float32], float]:
+    """Metres (h, w) through an even medium of the same optical depth, and the share of it at the camera.
+
+    path : (h, w) metres along each pixel's ray
+    """
+    direction = pose.directions(np.nan_to_num(pixel_rays(camera)))
+    rays = Rays(np.broadcast_to(pose.position, direction.shape), direction)
+    pulse, far = np.arange(len(direction)), np.minimum(path.ravel(), FARTHEST).astype(np.float64)
+    _, column = amounts(field, rays, pulse=pulse, distance=far)
+    here, _ = amounts(field, rays, pulse=pulse[:1], distance=np.zeros(1))
+    return column.astype(np.float32).reshape(path.shape), float(here[0])
 
 
 def _wind(setting: WeatherSetting) -> Float:

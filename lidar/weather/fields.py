@@ -19,6 +19,9 @@ from lidar.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 from lidar.weather.setting import WeatherSetting
 
+FARTHEST = 300.0
+"""Metres from a sensor up to which weather differs from place to place."""
+
 _STEP = 2.0  # metres between samples of a field
 _TILE = 64.0  # metres that a sensor moves until its field is sampled anew
 _ABOVE = 2.0  # metres of a sensor above the ground, assumed
@@ -60,9 +63,9 @@ class Rays:
     way: Float
 
 
-def _around(position: Float, sensor: Sensor) -> tuple[tuple[float, float], int]:
-    """The corner of a sensor's field, the same for nearby positions, and the number of samples on a side."""
-    reach = min(sensor.max_range, 300.0) + _TILE
+def _around(position: Float, far: float) -> tuple[tuple[float, float], int]:
+    """The corner of a field up to a distance, the same for nearby positions, and its samples on a side."""
+    reach = min(far, FARTHEST) + _TILE
     x, y = (np.floor(position[:2] / _TILE) + 0.5) * _TILE - reach
     return (float(x), float(y)), int(2 * reach / _STEP) + 1
 
@@ -74,6 +77,14 @@ def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field
     """
     if setting.kind == "spray":
         return spray_field(sensor, at=at)
+    return place_field(setting, sensor.max_range, at=at)
+
+
+def place_field(setting: WeatherSetting, far: float, *, at: Situation) -> Field | None:
+    """Where the weather of a setting is up to a distance from a sensor; None for everywhere.
+
+    Raises InputError if the setting has a place or plumes, and the situation knows no poses.
+    """
     has_place = bool(setting.radius or setting.polygon)
     plumes = setting.medium == "plumes"
     if not (has_place or plumes):
@@ -81,7 +92,7 @@ def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field
     if at.poses is None or at.geo is None:
         raise InputError("weather with a place or plumes needs poses, which these clouds do not have")
     position = at.poses(np.array([at.start_ns])).position[0]
-    corner, count = _around(position, sensor)
+    corner, count = _around(position, far)
     share = np.ones((count, count))
     if has_place:
         share = _place_share(setting, at.geo, corner=corner, count=count)
@@ -94,33 +105,19 @@ def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field
 @functools.lru_cache(maxsize=8)
 def _place_share(setting: WeatherSetting, geo: Frame, *, corner: tuple[float, float], count: int) -> Float:
     """The share (count, count) of a place at samples: 1 within, falling to 0 over the edge around it."""
-    x, y = (c + _STEP * np.arange(count) for c in corner)
-    return _share_of_place(setting, geo, *np.meshgrid(x, y))
-
-
-def _share_of_place(setting: WeatherSetting, geo: Frame, *points: Any) -> Float:
-    """The share of a place at scene coordinates x and y: 1 within, falling to 0 over the edge around it."""
     import shapely  # noqa: PLC0415  (0.1 s)
 
+    x, y = (c + _STEP * np.arange(count) for c in corner)
+    points = shapely.points(*np.meshgrid(x, y))
     if setting.radius:
         centre = shapely.Point(*geo.from_geographic(setting.longitude, setting.latitude))
-        away = np.maximum(shapely.distance(shapely.points(*points), centre) - setting.radius, 0.0)
+        away = np.maximum(shapely.distance(points, centre) - setting.radius, 0.0)
     else:
         lon, lat = np.array(setting.corners()).T
         place = shapely.Polygon(np.transpose(geo.from_geographic(lon, lat)))
-        away = shapely.distance(shapely.points(*points), place)
+        away = shapely.distance(points, place)
     share: Float = np.clip(1 - away / setting.edge, 0, 1) if setting.edge else np.where(away > 0, 0.0, 1.0)
     return share
-
-
-def is_within(setting: WeatherSetting, *, at: Situation) -> bool:
-    """Whether a sensor is within the place of a setting, or half of its edge around it."""
-    if not (setting.radius or setting.polygon):
-        return True
-    if at.poses is None or at.geo is None:
-        raise InputError("weather with a place needs poses, which these images do not have")
-    x, y = at.poses(np.array([at.start_ns])).position[0, :2]
-    return bool(_share_of_place(setting, at.geo, x, y) >= 0.5)
 
 
 def plume_pattern(
@@ -156,7 +153,7 @@ def spray_field(sensor: Sensor, *, at: Situation) -> Field | None:
             "spray needs road users, which recorded data do not have: use lidar drive --traffic on"
         )
     position = at.poses(np.array([at.start_ns])).position[0]
-    corner, count = _around(position, sensor)
+    corner, count = _around(position, sensor.max_range)
     share = np.zeros((count, count))
     frame = at.frame if isinstance(at.frame, int) else 0
     start_ns, end_ns = sensor.window_ns(frame)

@@ -12,7 +12,7 @@ from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, ROAD_USERS, Pulses, parameter
 from lidar.weather.air import through_air
 from lidar.weather.camera import weathered
-from lidar.weather.fields import field_of, is_within, spray_extinction
+from lidar.weather.fields import field_of, spray_extinction
 from lidar.weather.glass import dazzled, through_glass
 from lidar.weather.media import Medium, medium_of, spray
 from lidar.weather.setting import WeatherSetting
@@ -42,9 +42,7 @@ class Weather(WeatherSetting):
         return echoes
 
     def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
-        """The image that the camera takes: in the weather, if the camera is in its place."""
-        if not is_within(self, at=at):
-            return frame
+        """The image that the camera takes."""
         return weathered(frame, self, at=at, rng=rng)
 
     @property

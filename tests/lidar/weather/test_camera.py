@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from geoscene.classes import Class
+from geoscene.frames import Frame as GeoFrame
 from lidar.camera import shade
 from lidar.camera.light import daylight
 from lidar.camera.render import Frame
@@ -21,6 +22,7 @@ from lidar.weather.streaks import Particles, streak_cover
 from lidar.weather.window_drops import Drops, drops_on, through_drops
 
 CAMERA = CameraSpec("front", Mount(), 320, 180, 300.0, 300.0, 159.5, 89.5, exposure_ns=5_000_000)
+GEO = GeoFrame.at(7.1, 50.7)
 AHEAD = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Scene from camera: it looks along the scene's x axis."""
 SUN = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
@@ -82,6 +84,28 @@ def test_depth_is_along_the_axis_but_light_travels_along_the_ray():
     longer = np.hypot(1.0, 159.5 / 300)
     clear = 1 - found[90, [0, 160], 1] / sky[90, [0, 160], 1]
     assert np.log(clear[0]) / np.log(clear[1]) == pytest.approx(longer, rel=0.03)
+
+
+def test_light_passes_as_much_of_a_bank_of_fog_as_lies_in_its_way():
+    """A bank of 20 m around the camera before a wall at 60 m is as 20 m of fog; none lies 2 km away."""
+    image, middle = picture(60.0), (90, 160)
+    lon, lat = map(float, GEO.to_geographic(0.0, 0.0))
+    bank = WeatherSetting("fog", 40.0, longitude=lon, latitude=lat, radius=20.0)
+    at = situation(geo=GEO)
+    found = linear_of()[seen(image, bank, at).rgb[middle]]
+    even = linear_of()[seen(picture(20.0), WeatherSetting("fog", 40.0), at).rgb[middle]]
+    np.testing.assert_allclose(found, even, atol=0.05)
+    lon, lat = map(float, GEO.to_geographic(2000.0, 0.0))
+    away = WeatherSetting("rain", 40.0, longitude=lon, latitude=lat, radius=20.0)
+    np.testing.assert_array_equal(seen(image, away, at).rgb, image.rgb)
+
+
+def test_plumes_of_dust_veil_parts_of_an_image():
+    at = situation(geo=GEO, seed=4)
+    light = linear_of()[seen(picture(250.0), WeatherSetting("dust", 30.0), at).rgb[60]]
+    even = linear_of()[seen(picture(250.0), WeatherSetting("dust", 30.0, medium="even"), at).rgb[60]]
+    assert light.std() > 5 * even.std()
+    assert light.mean() < even.mean()
 
 
 def test_labels_and_depth_stay():

@@ -21,7 +21,7 @@ from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, ROAD_USERS, pulses_of
 from lidar.weather.air import through_air
-from lidar.weather.fields import Field, Rays, _add_spray, amounts, is_within, plume_pattern
+from lidar.weather.fields import Field, Rays, _add_spray, amounts, plume_pattern
 from lidar.weather.glass import glare_noise, through_glass
 from lidar.weather.media import medium_of, rain
 from lidar.weather.setting import WeatherSetting, read_weather
@@ -77,15 +77,6 @@ def test_weather_elsewhere_and_at_other_times_changes_nothing():
     for some in (setting, WeatherSetting(kind="fog", amount=10.0, start=5.0)):
         found = altered([some])
         np.testing.assert_array_equal(found.cloud.intensity, found.original.intensity)
-
-
-def test_cameras_are_in_the_weather_if_they_are_in_its_place():
-    near = dict(zip(("longitude", "latitude"), map(float, GEO.to_geographic(50, 0)), strict=True))
-    radii = {30.0: False, 45.0: True, 60.0: True}
-    for radius, expected in radii.items():
-        setting = WeatherSetting(kind="fog", amount=50.0, radius=radius, edge=20.0, **near)
-        assert is_within(setting, at=SITUATION) == expected
-    assert is_within(WeatherSetting(kind="fog", amount=50.0), at=Situation("front", 0))
 
 
 def test_a_place_that_holds_all_is_everywhere():
