@@ -128,7 +128,7 @@ class Attacker(Stage):
         return (POSES,) if self.place else ()
 
     def aim(self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation) -> Aim | None:
-        """The pulses that the device reaches; None in frames without a line of sight or out of reach."""
+        """The pulses that the device reaches; None without a line of sight, or out of reach or view."""
         if not len(pulses) or not self.may_reach(at):
             return None
         towards = self.towards(pulses.time_ns, at=at)
@@ -150,6 +150,8 @@ class Attacker(Stage):
             & (np.abs(rise) <= limits.rise / 2)
             & (distance <= self.reach)
         )
+        if not len(row):
+            return None
         power = self.power * (POWER_AT / distance[row]) ** 2
         return Aim(row, azimuth[row], distance[row], power)
 

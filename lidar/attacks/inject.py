@@ -104,12 +104,12 @@ class Inject(SynchronisedAttacker):
         if not self.standing:
             way = pulses.direction[aim.row[:1]]
             ahead = np.degrees(np.arctan2(way[:, 1], way[:, 0])) - aim.azimuth[:1]
-            return float(ahead.sum()) + self.offset, self.range
+            return float(ahead[0]) + self.offset, self.range
         assert at.poses is not None  # noqa: S101 - see requires
         first = np.array([round(self.start * 1e9)], np.int64)
         towards = self.towards(first, at=at)[0]
         angle = np.arctan2(towards[1], towards[0]) + np.radians(self.offset)
         point = np.array([[self.range * np.cos(angle), self.range * np.sin(angle), 0.0]])
-        now = np.array([pulses.time_ns[aim.row].mean() if len(aim.row) else at.start_ns], np.int64)
+        now = np.array([pulses.time_ns[aim.row].mean()], np.int64)
         x, y, _ = in_body(at.poses(now), point=at.poses(first).place(point)[0])[0]
         return float(np.degrees(np.arctan2(y, x))), float(np.hypot(x, y))

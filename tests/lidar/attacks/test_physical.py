@@ -342,6 +342,10 @@ def test_a_device_that_is_never_in_sight_is_refused():
             with pytest.raises(InputError, match="attack inject: its device is in the line of sight of no"):
                 check_sight(stages, frames)
     check_sight(stages_of([{"name": "cover_glass"}]), [])
+    aside = stages_of([{"name": "inject", "bearing": 90.0}])  # of a scanner that looks ahead
+    livox = load_sensor("mid40")
+    with pytest.raises(InputError, match="in the line of sight of no scanner"):
+        check_sight(aside, [(situation(VLP), lambda: sent_only(livox, situation(VLP)))])
     lon, lat = GEO.to_geographic(500.0, 0.0)  # what far frames show is not asked for
     far = stages_of([{"name": "inject", "place": f"{lat} {lon} 1.5"}], seed=5)
     with pytest.raises(InputError, match="in the line of sight of no scanner"):
