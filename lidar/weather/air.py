@@ -114,5 +114,12 @@ def _field_response(
     white = pi * backscatter * strength(sensor, distance) * _STEP
     shape = pulse_shape(sensor.pulse_ns, _STEP)
     return strongest_response(
-        *where, end=end, white=white, extinction=medium.extinction, shape=shape, step=_STEP, near=near
+        *where,
+        end=end,
+        white=white,
+        extinction=medium.extinction,
+        shape=shape,
+        step=_STEP,
+        near=near,
+        least=least_power(sensor),
     )

@@ -15,6 +15,7 @@ from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.random_streams import generator
+from lidar.raycast.memory import inlined
 from lidar.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 from lidar.weather.setting import WeatherSetting
@@ -198,20 +199,25 @@ def amounts(field: Field, rays: Rays, *, pulse: NDArray[np.integer], distance: F
 
 
 def _packed(field: Field) -> tuple[Any, ...]:
-    return (field.corner[0], field.corner[1], field.share, field.ground, field.height)
+    return field.share, (*field.corner, field.ground, field.height)
 
 
-@njit(cache=True, nogil=True)
-def _share(field: Any, start: Any, way: Any, pulse: Any, distance: Any) -> Any:
-    """The share of the medium at a range along a pulse."""
-    x0, y0, grid, ground, height = field
+@inlined
+def _share(grid: Any, frame: Any, start: Any, way: Any, pulse: Any, distance: Any) -> Any:
+    """The share of the medium at a range along a pulse; frame: corner, ground and height of the field."""
+    x0, y0, ground, height = frame
     x, y = start[pulse, 0] + distance * way[pulse, 0], start[pulse, 1] + distance * way[pulse, 1]
-    column, row = int(np.floor((x - x0) / _STEP + 0.5)), int(np.floor((y - y0) / _STEP + 0.5))
-    if row < 0 or column < 0 or row >= grid.shape[0] or column >= grid.shape[1]:
+    u, v = (x - x0) / _STEP, (y - y0) / _STEP
+    if not (0.0 <= u < grid.shape[1] - 1 and 0.0 <= v < grid.shape[0] - 1):
         return 0.0
-    above = max(start[pulse, 2] + distance * way[pulse, 2] - ground, 0.0)
-    share = grid[row, column]
-    return share * np.exp(-above / height) if share > 0.0 else 0.0
+    column, row = int(u), int(v)
+    u, v = u - column, v - row
+    share = (1 - v) * ((1 - u) * grid[row, column] + u * grid[row, column + 1])
+    share += v * ((1 - u) * grid[row + 1, column] + u * grid[row + 1, column + 1])
+    if share <= 0.0:
+        return 0.0
+    above = start[pulse, 2] + distance * way[pulse, 2] - ground
+    return share * np.exp(-above / height) if above > 0.0 else share
 
 
 @njit(cache=True, nogil=True)
@@ -219,14 +225,15 @@ def _amounts(field: Any, rays: Any, places: Any, here: Any, column: Any) -> None
     """Fill the share at places and its integral up to them, by the midpoint rule."""
     start, way = rays
     pulse, distance = places
+    grid, frame = field
     for i in range(len(pulse)):
         steps = max(1, int(np.ceil(distance[i])))
         step = distance[i] / steps
         total = 0.0
         for k in range(steps):
-            total += _share(field, start, way, pulse[i], (k + 0.5) * step)
+            total += _share(grid, frame, start, way, pulse[i], (k + 0.5) * step)
         column[i] = total * step
-        here[i] = _share(field, start, way, pulse[i], distance[i])
+        here[i] = _share(grid, frame, start, way, pulse[i], distance[i])
 
 
 def strongest_response(
@@ -239,15 +246,18 @@ def strongest_response(
     shape: Float,
     step: float,
     near: float,
+    least: float,
 ) -> tuple[Float, Float]:
     """Range and power (n,) of the maximum of the response of a medium in beams that end at ranges (n,).
 
     white : (k,) what a share of 1 sends back over a step at ranges (0.5, 1.5, ...) steps, if nothing dims it
     shape : (s,) power of the pulse at steps of range
     near  : metres from which on the maximum is looked for
+    least : power of responses that are not worth looking for
     """
     place, power = np.empty(len(end)), np.zeros(len(end))
-    air = end, white, extinction, shape, step, near
+    beyond = np.maximum.accumulate(white[::-1])[::-1] * (shape.sum() * field.share.max())
+    air = end, white, beyond, extinction, shape, step, near, least
     _strongest(_packed(field), (rays.start, rays.way), air, place, power)
     return place, power
 
@@ -256,32 +266,37 @@ def strongest_response(
 def _strongest(field: Any, rays: Any, air: Any, place: Any, power: Any) -> None:
     """Fill range and power of the strongest response of each pulse."""
     start, way = rays
-    end, white, extinction, shape, step, near = air
-    recent = np.zeros(len(shape))
+    grid, frame = field
+    end, white, beyond, extinction, shape, step, near, least = air
+    taps = len(shape)
+    sent = np.zeros(len(white) + 2 * taps)  # back by each step of range, after as many zeros as the pulse has
     for i in range(len(end)):
-        recent[:] = 0.0
-        best, where, column, live = 0.0, 0.0, 0.0, 0
-        for k in range(len(white) + len(shape)):
+        best, where, passed, live, last = 0.0, 0.0, 1.0, 0, 0
+        for k in range(len(white) + taps):
             r = (k + 0.5) * step
             new = 0.0
             if k < len(white) and r < end[i]:
-                share = _share(field, start, way, i, r)
-                new = share * white[k] * np.exp(-2 * extinction * (column + 0.5 * share * step))
-                column += share * step
+                if live == 0 and beyond[k] * passed < max(best, least):
+                    break
+                share = _share(grid, frame, start, way, i, r)
+                if share > 0.0:
+                    within = np.exp(-extinction * share * step)
+                    new = share * white[k] * passed * within
+                    passed *= within * within
             elif live == 0:
                 break
-            live = len(shape) if new > 0.0 else live - 1
-            recent[k % len(shape)] = new
-            if live <= 0:
-                live = 0
+            live = taps if new > 0.0 else max(live - 1, 0)
+            sent[k + taps], last = new, k
+            if live == 0:
                 continue
             total = 0.0
-            for j in range(len(shape)):
-                total += shape[j] * recent[(k - j) % len(shape)]
-            middle = r - step * (len(shape) - 1) / 2
+            for j in range(taps):
+                total += shape[j] * sent[k + taps - j]
+            middle = r - step * (taps - 1) / 2
             if total > best and middle >= near:
                 best, where = total, middle
         place[i], power[i] = min(where, end[i]), best
+        sent[: last + taps + 1] = 0.0
 
 
 def rays_of(start: Float, direction: Float, *, time_ns: NDArray[np.int64], at: Situation) -> Rays:

@@ -134,7 +134,11 @@ def test_plumes_of_dust_drift_with_the_wind():
 
 
 def test_dust_in_plumes_gives_returns_within_them_and_hides_less_than_even_dust():
-    plumes, even = (altered([WeatherSetting(kind="dust", amount=4.0, medium=m)]) for m in ("plumes", "even"))
+    sweep = replace(SWEEP, sensor=replace(SENSOR, reference_range=150.0))
+    plumes, even = (
+        altered([WeatherSetting(kind="dust", amount=10.0, medium=medium)], sweep=sweep)
+        for medium in ("plumes", "even")
+    )
     kept = [np.sum(found.cloud.source >= 0) for found in (plumes, even)]
     assert len(plumes.original) > kept[0] > kept[1]
     dust = plumes.cloud.origin == Origin.WEATHER

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -107,3 +108,11 @@ def test_a_setting_is_made_again_from_its_table(kind):
     table = setting.table()
     assert table.pop("name") == "weather"
     assert WeatherSetting(**table) == setting == replace(setting, wind=3)
+
+
+def test_the_example_is_a_morning():
+    path = Path(__file__).parents[3] / "examples" / "weather" / "morning.toml"
+    settings = read_weather(str(path))
+    assert [s.kind for s in settings] == ["fog", "rain", "rain"]
+    now = [[s.kind for s in settings if s.amount_at(t) is not None] for t in (0, 299, 300, 600, 900, 5000)]
+    assert now == [["fog"], ["fog"], ["rain"], ["rain"], ["rain"], ["rain"]]
