@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar.errors import InputError
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import POSES, ROAD_USERS, Stage, parameter
 
 _TEXTURE = 1.2  # mm of water that fill the texture of a road (Hahner et al. 2022)
 
@@ -142,6 +142,15 @@ class WeatherSetting(Stage):
     def image_kinds(self) -> tuple[str, ...]:
         """The air's light depends on the distance."""
         return ("depth",)
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Road users for spray, poses and time for weather over time and place, plumes and the sun."""
+        if self.kind == "spray":
+            return (ROAD_USERS, POSES)
+        passing = self.start > 0 or self.end < FOREVER
+        placed = self.radius or self.polygon or self.sunlight or self.medium == "plumes"
+        return (POSES,) if passing or placed else ()
 
     def amount_at(self, seconds: float) -> float | None:
         """The amount at a time since the drive's start; None before and after the weather.

@@ -9,7 +9,7 @@ import numpy as np
 from lidar.camera.render import Frame
 from lidar.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import POSES, ROAD_USERS, Pulses, parameter
+from lidar.signal.stage import Pulses, parameter
 from lidar.weather.air import through_air
 from lidar.weather.camera import weathered
 from lidar.weather.fields import field_of, spray_extinction
@@ -44,14 +44,6 @@ class Weather(WeatherSetting):
     def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
         """The image that the camera takes."""
         return weathered(frame, self, at=at, rng=rng)
-
-    @property
-    def requires(self) -> tuple[str, ...]:
-        """Road users for spray, poses and time for places, plumes and the sun."""
-        if self.kind == "spray":
-            return (ROAD_USERS, POSES)
-        placed = self.radius or self.polygon or self.sunlight or self.medium == "plumes"
-        return (POSES,) if placed else ()
 
     def _medium(self, wavelength_nm: float, *, amount: float) -> Medium:
         if self.kind == "spray":

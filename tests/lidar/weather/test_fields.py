@@ -237,4 +237,7 @@ def test_needs_are_checked_before_a_drive_begins():
     with pytest.raises(InputError, match="weather needs road users"):
         stages.check({"lidar_top": "lidar"}, known=(POSES,))
     stages.check({"lidar_top": "lidar"}, known=(POSES, ROAD_USERS))
+    passing = stages_of([s.table() for s in read_weather("rain=5,model=lisa,end=20")])
+    with pytest.raises(InputError, match="weather_model needs poses and time"):
+        passing.check({"velodyne": "lidar"})
     stages_of([s.table() for s in read_weather("rain=5,fog=100")]).check({"lidar_top": "lidar"})
