@@ -54,8 +54,8 @@ class Success:
     scene    : of the drives; ``all`` for all of them
     attacked : frames that the attack changed
     success  : forge: attacked frames in which the detector reports a forged object; hide: targets that it no
-               longer finds. Targets are road users that it finds without the attack and that lost half of
-               their returns.
+               longer finds; mislead: attacked frames whose last fix is off. Targets are road users that it
+               finds without the attack and that lost half of their returns.
     added, lost : mean number of returns of an attacked frame
     """
 
@@ -298,7 +298,7 @@ def _success(
         attack.goal,
         frames=len(frames),
         attacked=len(attacked),
-        success=_success_rate(attacked, attack, score=measure.score),
+        success=_success_rate(attacked, attack, measure=measure),
         added=_mean(frame["added"] for _, frame in attacked),
         lost=_mean(frame["lost"] for _, frame in attacked),
         **known,
@@ -309,7 +309,7 @@ def _success_rate(
     attacked: Sequence[tuple[Any, Mapping[str, Any]]],
     attack: Attack,
     *,
-    score: float,
+    measure: Measure,
     defence: str = "",
     thresholds: Mapping[tuple[str, str], float] | None = None,
 ) -> Rate:
@@ -320,6 +320,8 @@ def _success_rate(
         silent = not defence or frame["suspicion"][defence] <= (thresholds or {})[defence, "frames"]
         if attack.goal == "hide":
             tried, reached = frame["targets"], frame["hidden"] * silent
+        elif attack.goal == "mislead":
+            tried, reached = 1, int(silent and frame["fix_error"] >= measure.deviation)
         else:
             suspicions = frame["object_suspicion"].get(defence)
             if suspicions is None:
@@ -327,7 +329,7 @@ def _success_rate(
             else:
                 passed = [suspicion <= (thresholds or {})[defence, "objects"] for suspicion in suspicions]
             objects = zip(frame["objects"]["forged"], frame["objects"]["score"], passed, strict=True)
-            tried, reached = 1, int(any(f and s >= score and p for f, s, p in objects))
+            tried, reached = 1, int(any(f and s >= measure.score and p for f, s, p in objects))
         hits, count = hits + reached, count + tried
         blocks |= {block} if tried else set()
     return rate(hits, count, blocks=len(blocks))
@@ -355,7 +357,7 @@ def _detections(
     ]
     for defence in _defences(attacked):
         judged = [(block, frame) for block, frame in frames if defence in frame["suspicion"]]
-        residual = _success_rate(judged, attack, score=measure.score, defence=defence, thresholds=thresholds)
+        residual = _success_rate(judged, attack, measure=measure, defence=defence, thresholds=thresholds)
         for level in ("frames", "objects"):
             threshold = thresholds.get((defence, level), 1.0)
             samples = _samples(plain, attacked, defence=defence, level=level, block=measure.block)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from geoscene.files import digest_of, write_json
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
-from geoscene.typing import Bools, Ints
+from geoscene.typing import Bools, Float, Ints
 from lidar import __version__
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
@@ -41,7 +41,10 @@ NEAR = {"vehicle": 2.0, "person": 1.0, "cycle": 1.5}
 _LOST = 0.5
 """Share of a road user's returns that an attack takes from which on the road user is a target."""
 
-_COLUMNS = ("id", "instance", "x", "y", "vx", "vy", "points")
+PLACED = "placed_object"
+"""Kind of an object that an attacker puts into the scene."""
+
+_COLUMNS = ("id", "instance", "kind", "x", "y", "vx", "vy", "length", "width", "points")
 
 
 @dataclass(frozen=True)
@@ -128,13 +131,15 @@ def _frames(
         truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
         users = _users(dataset, name, frame=frame.number)
         matched = _matched(frame, users)
+        placed = [user for user in users if user["kind"] == PLACED and user["points"] > 0]
+        forged = truth.objects(frame.members) | _near(frame, placed)
         figures: dict[str, Any] = {
             "sensor": name,
             "frame": frame.number,
             "seconds": frame.start_ns * 1e-9,
-            "added": int(truth.returns.sum()),
+            "added": int(truth.returns.sum()) + sum(int(user["points"]) for user in placed),
             "lost": len(truth.removed_xyz),
-            "objects": _objects(frame, forged=truth.objects(frame.members), matched=matched),
+            "objects": _objects(frame, forged=forged, matched=matched),
             "suspicion": {key: round(v.frame, 5) for key, v in judged.verdicts.items()},
             "object_suspicion": {
                 key: v.objects.round(5).tolist()
@@ -239,20 +244,35 @@ def _matched(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Ints:
     number = np.full(len(boxes), -1, np.int64)
     if not users:
         return number
-    time_ns = np.array([_time(frame, rows) for rows in frame.members], np.int64)
-    place = frame.placed(boxes.centre, time_ns)[:, :2]
-    scale = float(frame.poses([frame.start_ns]).scale[0, 0])
-    xy, speed = (np.array([[user[a], user[b]] for user in users]) for a, b in (("x", "y"), ("vx", "vy")))
+    away = _apart(frame, users)
     kinds = np.array([KINDS.get(user["class"], "") for user in users])
     free = np.ones(len(users), bool)
     for k in range(len(boxes)):
-        later = (time_ns[k] - frame.start_ns) * 1e-9
-        apart = np.hypot(*(xy + later * speed * scale - place[k]).T) / scale
-        apart[~free | (kinds != boxes.kind[k])] = np.inf
+        apart = np.where(free & (kinds == boxes.kind[k]), away[k], np.inf)
         nearest = int(np.argmin(apart))
         if apart[nearest] <= NEAR[str(boxes.kind[k])]:
             number[k], free[nearest] = users[nearest]["id"], False
     return number
+
+
+def _near(frame: Observation, placed: Sequence[Mapping[str, Any]]) -> Bools:
+    """Whether each box of the detector is at an object that an attacker placed."""
+    if not placed:
+        return np.zeros(len(frame.objects), bool)
+    reach = np.array([np.hypot(user["length"], user["width"]) / 2 + 1.0 for user in placed])
+    near: Bools = np.any(_apart(frame, placed) <= reach, axis=1)
+    return near
+
+
+def _apart(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Float:
+    """Metres (k, m) from the middles of the detector's boxes to those of road users, at the boxes' times."""
+    time_ns = np.array([_time(frame, rows) for rows in frame.members], np.int64)
+    place = frame.placed(frame.objects.centre, time_ns)[:, None, :2]
+    scale = float(frame.poses([frame.start_ns]).scale[0, 0])
+    xy, speed = (np.array([[user[a], user[b]] for user in users]) for a, b in (("x", "y"), ("vx", "vy")))
+    later = ((time_ns - frame.start_ns) * 1e-9)[:, None, None]
+    apart: Float = np.linalg.norm(xy + later * speed * scale - place, axis=2) / scale
+    return apart
 
 
 def _time(frame: Observation, rows: NDArray[np.intp]) -> int:

@@ -15,8 +15,8 @@ from lidar.redteam.published import ATTACKS as PUBLISHED
 from lidar.sweep.grid import GridDrive, drives_of
 from lidar.sweep.words import naming, text_of
 
-GOALS = ("forge", "hide")
-"""What an attack is for: an object that is not there, or one that is not found."""
+GOALS = ("forge", "hide", "mislead")
+"""What an attack is for: an object that is not there, one that is not found, or a false position."""
 
 _TABLES = ("drive", "grid", "map", "attack", "defences", "measure")
 _POOLED = ("seed", "attack")
@@ -46,12 +46,15 @@ class Measure:
     score        : of a detection from which on it counts
     false_alarms : share of the genuine frames that may be alarmed
     false_objects: share of the genuine objects that may be alarmed
+    deviation    : metres of a fix from the genuine one from which on the vehicle is misled; a car that is
+                   1.8 m wide in the middle of a lane of 3.5 m is 0.85 m from its edge
     block        : seconds of a drive that count as one independent trial
     """
 
     score: float = 0.3
     false_alarms: float = 0.05
     false_objects: float = 0.01
+    deviation: float = 0.85
     block: float = 1.0
 
     def __post_init__(self) -> None:
@@ -59,6 +62,8 @@ class Measure:
         for name in ("score", "false_alarms", "false_objects"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(f"measure: {name} = {getattr(self, name):g}: give a share between 0 and 1")
+        if not 0.01 <= self.deviation <= 1e6:
+            raise InputError(f"measure: deviation = {self.deviation:g}: give 0.01 to 1,000,000 m")
         if not 0.1 <= self.block <= 600:
             raise InputError(f"measure: block = {self.block:g}: give 0.1 to 600 seconds")
 
@@ -94,7 +99,7 @@ def read_plan(path: Path) -> Plan:
 
     Tables ``drive``, ``grid`` and ``map`` are those of a sweep; each drive is made without attack and with
     each attack of the tables ``[[attack]]`` (``name``, ``attack``: the value of ``lidar drive --attack``,
-    ``goal``: forge or hide, ``published``: what to compare with). Table ``defences`` has ``use``, a list of
+    ``goal``: of `GOALS`, ``published``: what to compare with). Table ``defences`` has ``use``, a list of
     defences as for ``lidar defend``; table ``measure`` has the fields of `Measure`.
 
     Raises InputError, which names the file and what in it has the error.

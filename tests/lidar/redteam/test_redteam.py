@@ -200,6 +200,60 @@ def test_defences_together_notice_what_each_notices(written: Callable[..., Path]
     assert next(row for row in found.detection if row.defence == "fused").genuine.share <= 0.05
 
 
+def test_a_fix_that_is_off_misleads(written: Callable[..., Path]) -> None:
+    drives = read_grid(written("", grid="seed = [1, 2]"))
+    attack = Attack("drift", "gnss_spoof", "mislead")
+    plain = [_frame(k / 10, suspicion=0.1) for k in range(40)]
+    changed = [_frame(k / 10, suspicion=0.9 * (k >= 30)) | {"fix_error": k / 20} for k in range(40)]
+    found = evaluated(
+        [
+            Figures(Run(drives[0], None, {}, drives[0].name), plain, []),
+            Figures(Run(drives[1], attack, {}, drives[0].name), changed, []),
+        ],
+        [attack],
+        measure=Measure(deviation=1.0),
+    )
+    (success,) = found.success
+    assert (success.attacked, success.success.hits) == (39, 20)  # the first frame is as without attack
+    assert found.detection[0].residual.hits == 10
+    assert found.detection[0].latency == pytest.approx(2.9)
+
+
+SPOOFED = """
+[[attack]]
+name = "cube"
+attack = "placed_object:ahead=8"
+goal = "forge"
+
+[[attack]]
+name = "spoofed fixes"
+attack = "gnss_spoof:kind=step,left=5,start=0"
+goal = "mislead"
+
+[defences]
+use = ["shadow"]
+"""
+
+
+def test_attacks_without_truth_files_of_clouds_are_told_from_the_drive_without_attack(
+    written: Callable[..., Path], tmp_path: Path
+) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text(
+        'name = "mine"\n[[lidar]]\nname = "top"\npreset = "vlp16"\ntranslation = [1.2, 0.0, 1.9]\n'
+        '[[gnss]]\nname = "gnss"\ntranslation = [0.6, 0.0, 1.6]\n[[imu]]\nname = "imu"\n',
+        "utf-8",
+    )
+    file = written(SPOOFED)
+    file.write_text(file.read_text("utf-8").replace('rig = "vlp16"', f'rig = "{rig}"'), "utf-8")
+    found = redteam(file, tmp_path / "out")
+    assert found.failed == {}
+    cube, spoofed = found.matrix.success
+    assert cube.attacked == cube.frames
+    assert cube.added > 50
+    assert spoofed.success.share == 1.0
+
+
 def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> None:
     file = written(PHANTOM + DAZZLE + '[defences]\nuse = ["occlusion", "shadow"]')
     first = redteam(file, tmp_path / "out")
