@@ -36,12 +36,14 @@ def through_air(
     *,
     medium: Medium,
     field: Field | None,
+    lens: float,
     at: Situation,
     rng: np.random.Generator,
 ) -> TracedEchoes:
     """The echoes that are left, and those of the air, in any order.
 
     field : where the medium is; None for everywhere
+    lens  : diameter of the receiver's lens, metres
     """
     if medium.extinction <= 0 or (field is not None and not field.share.any()):
         return echoes
@@ -51,7 +53,7 @@ def through_air(
     end = _beam_ends(pulses, echoes)
     some, backscatter, distance = None, np.empty(0), response_ranges(pulses.sensor)
     if len(medium.diameter):
-        some, backscatter, distance = particles(pulses.sensor, medium)
+        some, backscatter, distance = particles(pulses.sensor, medium, lens=lens)
     else:
         backscatter = np.full(len(distance), medium.backscatter)
     found: Found = np.empty(0, np.int64), np.empty(0), np.empty(0)
@@ -68,11 +70,13 @@ def through_air(
     m = len(echoes)
     single = _noticed(pulses, (found[0], found[1], found[2] * passed[m:]), share=here[m:], rng=rng)
     if field is None or rays is None:
-        soft = soft_target(pulses.sensor, medium.extinction, backscatter=backscatter, distance=distance)
+        soft = soft_target(
+            pulses.sensor, medium.extinction, backscatter=backscatter, distance=distance, lens=lens
+        )
         place, power = soft.at(end)
     else:
         place, power = _field_response(
-            pulses, (field, rays), end=end, medium=medium, rest=(distance, backscatter)
+            pulses, (field, rays), end=end, medium=medium, rest=(distance, backscatter), lens=lens
         )
     seen = np.flatnonzero(power > least_power(pulses.sensor))
     pulse = np.concatenate((seen, single[0]))
@@ -102,7 +106,13 @@ def _noticed(pulses: Pulses, found: Found, *, share: Float, rng: np.random.Gener
 
 
 def _field_response(
-    pulses: Pulses, where: tuple[Field, Rays], *, end: Float, medium: Medium, rest: tuple[Float, Float]
+    pulses: Pulses,
+    where: tuple[Field, Rays],
+    *,
+    end: Float,
+    medium: Medium,
+    rest: tuple[Float, Float],
+    lens: float,
 ) -> tuple[Float, Float]:
     """Range and power (n,) of the soft target of a medium that differs from place to place."""
     sensor = pulses.sensor
@@ -111,7 +121,7 @@ def _field_response(
     # Beyond the ranges of the response of even air, no particle is seen one by one.
     backscatter = np.interp(distance, *rest, right=medium.backscatter)
     near = sensor.min_range - sensor.pattern.range_offset
-    white = pi * backscatter * strength(sensor, distance) * _STEP
+    white = pi * backscatter * strength(sensor, distance, lens=lens) * _STEP
     shape = pulse_shape(sensor.pulse_ns, _STEP)
     return strongest_response(
         *where,

@@ -19,6 +19,9 @@ _DEVIATIONS = 3.5
 MOST = 12.0
 """Mean number of particles per pulse above which fewer are drawn."""
 
+LENS = 0.03
+"""Metres, diameter of the receiver's lens, typical value."""
+
 LIGHT = 0.299792458
 """Metres per nanosecond."""
 
@@ -26,27 +29,26 @@ _OVERLAP = (
     0.9,
     1.0,
 )  # metres between which the beam enters the receiver's field of view (Hahner et al. 2021)
-_LENS = 0.03  # metres, diameter of the receiver's lens, typical value
 _REACH = 60.0  # metres beyond the minimum range within which the response of even air has its maximum
 _STEP = 0.05  # metres between samples of the response
 _CLASSES = 64  # of range
 
 
-def overlap(sensor: Sensor, distance: Float) -> Float:
+def overlap(sensor: Sensor, distance: Float, *, lens: float = LENS) -> Float:
     """Share of the light (n,) from near particles that falls on the detector, at distances in metres.
 
     A receiver that is focused far away images what is near as a disk as wide as its lens, seen from there;
     the detector is as wide as the beam (form factor of a lidar: Measures 1984, chapter 7).
     """
     near, far = _OVERLAP
-    focus = _LENS / np.sqrt(np.prod(sensor.divergence))
+    focus = lens / np.sqrt(np.prod(sensor.divergence))
     share: Float = np.clip((distance - near) / (far - near), 0, 1) / (1 + (focus / distance) ** 2)
     return share
 
 
-def strength(sensor: Sensor, distance: Float) -> Float:
+def strength(sensor: Sensor, distance: Float, *, lens: float = LENS) -> Float:
     """Power (n,) over the threshold of a white layer, at distances in metres from the beam's start."""
-    return overlap(sensor, distance) * amplitude(
+    return overlap(sensor, distance, lens=lens) * amplitude(
         1.0,
         distance + sensor.pattern.range_offset,
         reference_reflectance=sensor.reference_reflectance,
@@ -89,7 +91,9 @@ class SoftTarget:
         return self.range[row], np.where(row >= 0, self.power[row], 0.0)
 
 
-def soft_target(sensor: Sensor, extinction: float, *, backscatter: Float, distance: Float) -> SoftTarget:
+def soft_target(
+    sensor: Sensor, extinction: float, *, backscatter: Float, distance: Float, lens: float = LENS
+) -> SoftTarget:
     """The echo of even air whose particles add up: the pulse convolved with what the air sends back.
 
     The power at range R is pi times the integral of pulse(R - r) b(r) exp(-2 a r) over r, in units of that of
@@ -99,7 +103,8 @@ def soft_target(sensor: Sensor, extinction: float, *, backscatter: Float, distan
     distance    : (k,) metres, evenly spaced
     """
     step = float(distance[1] - distance[0])
-    sent_back = pi * backscatter * strength(sensor, distance) * np.exp(-2 * extinction * distance) * step
+    white = strength(sensor, distance, lens=lens) * np.exp(-2 * extinction * distance)
+    sent_back = pi * backscatter * white * step
     shape = pulse_shape(sensor.pulse_ns, step)
     whole = np.convolve(sent_back, shape)
     # An echo's range is that of its maximum, less that of the pulse itself.
@@ -134,7 +139,9 @@ class Particles:
     least: float
 
 
-def particles(sensor: Sensor, medium: Medium, *, most: float = MOST) -> tuple[Particles, Float, Float]:
+def particles(
+    sensor: Sensor, medium: Medium, *, most: float = MOST, lens: float = LENS
+) -> tuple[Particles, Float, Float]:
     """What a pulse may meet, and the back-scatter (k,) of all the rest at distances (k,) in metres.
 
     A particle of the back-scatter cross-section s, off the axis of a Gaussian beam, sends back the power of
@@ -146,7 +153,7 @@ def particles(sensor: Sensor, medium: Medium, *, most: float = MOST) -> tuple[Pa
     edges = np.geomspace(distance[0], sensor.max_range, _CLASSES + 1)
     middle, depth = np.sqrt(edges[1:] * edges[:-1]), np.diff(edges)
     area = np.pi / 2 * np.prod(_half_widths(sensor, middle), axis=0)
-    strongest = _on_axis(sensor, medium, distance=middle)
+    strongest = _on_axis(sensor, medium, distance=middle, lens=lens)
 
     def expected(least: float) -> Float:
         u = np.log(np.maximum(strongest / least, 1.0))
@@ -164,7 +171,8 @@ def particles(sensor: Sensor, medium: Medium, *, most: float = MOST) -> tuple[Pa
         strongest.ravel()[cells],
         least,
     )
-    share = np.minimum(1.0, least / np.maximum(_on_axis(sensor, medium, distance=distance), 1e-300))
+    on_axis = _on_axis(sensor, medium, distance=distance, lens=lens)
+    share = np.minimum(1.0, least / np.maximum(on_axis, 1e-300))
     rest = (medium.number[:, None] * medium.section[:, None] * share).sum(axis=0) / (4 * pi)
     return drawn, rest, distance
 
@@ -183,12 +191,12 @@ def _half_widths(sensor: Sensor, distance: Float) -> Float:
     return widths
 
 
-def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float) -> Float:
+def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float, lens: float) -> Float:
     """Power (s, k) over the threshold of particles of each size on the beam's axis at distances."""
     irradiance = 2 / (pi * np.prod(_half_widths(sensor, distance), axis=0))
     # A particle larger than the beam sends back no more than the whole of it.
     reflectance = np.minimum(medium.section[:, None] * irradiance / 4, 1.0)
-    power: Float = reflectance * strength(sensor, distance)
+    power: Float = reflectance * strength(sensor, distance, lens=lens)
     return power
 
 

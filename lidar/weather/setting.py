@@ -107,6 +107,9 @@ class WeatherSetting(Stage):
     wind_from: float = parameter(270.0, "direction that the wind comes from, degrees", low=0, high=360)
     wetness: float = parameter(-1.0, "wetness of surfaces, 0 to 1; -1: of the kind", low=-1, high=1)
     snow_cover: float = parameter(-1.0, "share of ground under snow; -1: of the kind", low=-1, high=1)
+    lens: float = parameter(
+        30.0, "diameter of the receiver's lens, mm, which blurs what is near; 0: none", low=0, high=1000
+    )
     drops: float = parameter(0.0, "share of the cover glass under drops of water", low=0, high=1)
     dirt: float = parameter(0.0, "share of light that dirt on the cover glass absorbs", low=0, high=0.99)
     sunlight: float = parameter(0.0, "direct sunlight, lux, which dazzles the detector", low=0, high=150_000)

@@ -34,7 +34,8 @@ class Weather(WeatherSetting):
         medium = self._medium(sensor.wavelength_nm, amount=amount)
         if medium.extinction > 0:
             field = field_of(self, sensor, at=at)
-            echoes = through_air(pulses, echoes, medium=medium, field=field, at=at, rng=rng)
+            lens = self.lens / 1000
+            echoes = through_air(pulses, echoes, medium=medium, field=field, lens=lens, at=at, rng=rng)
         if self.drops or self.dirt:
             echoes = through_glass(pulses, echoes, drops=self.drops, dirt=self.dirt, at=at)
         if self.sunlight:

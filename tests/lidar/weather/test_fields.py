@@ -102,7 +102,9 @@ def test_an_even_field_gives_what_even_air_does():
     field = Field((-400.0, -400.0), np.ones((401, 401)), 0.0, np.inf)
     for medium in (medium_of("fog", 40, wavelength_nm=905, medium="kim"), rain(100, 905.0)):
         even, general = (
-            through_air(pulses, echoes, medium=medium, field=where, at=at, rng=np.random.default_rng(0))
+            through_air(
+                pulses, echoes, medium=medium, field=where, lens=0.02, at=at, rng=np.random.default_rng(0)
+            )
             for where in (None, field)
         )
         m = len(echoes)

@@ -153,6 +153,17 @@ def test_dense_fog_is_a_ring_around_the_sensor():
     assert found.intensity[found.origin == Origin.WEATHER].max() < 5
 
 
+def test_a_smaller_lens_sees_more_of_what_is_near():
+    dust = [
+        np.sum(altered(SWEEP, f"snow=2,lens={lens}").cloud.origin == Origin.WEATHER) for lens in (60, 30, 0)
+    ]
+    assert 0 < dust[0] < dust[1] < dust[2]
+    sensor, distance = SWEEP.sensor, np.array([5.0, 50.0])
+    ratio = strength(sensor, distance, lens=0.03) / strength(sensor, distance, lens=0.0)
+    focus = 0.03 / np.sqrt(0.003 * 0.0012)
+    np.testing.assert_allclose(ratio, 1 / (1 + (focus / distance) ** 2))
+
+
 def test_snow_returns_thin_out_with_range_and_are_dim():
     found = altered(sweep_of(sensor="hdl64e_s2"), "snow=2").cloud
     flakes = found.origin == Origin.WEATHER
