@@ -18,6 +18,9 @@ from lidar.errors import InputError
 TAILS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
 """Shares of genuine returns, objects or frames at whose suspicions a calibration is stored."""
 
+_STEP = 1e-9
+"""Of suspicion, after one that many samples have."""
+
 _FEWEST = 3
 """Genuine samples above the last stored suspicion."""
 
@@ -38,16 +41,22 @@ class Tail:
     def of(self, suspicion: Float) -> Float:
         """Share (n,) of genuine samples that are at least as suspicious; at least 1 / (count + 1).
 
-        Between stored suspicions, and from the last one to suspicion 1, its logarithm is linear.
+        Between stored suspicions, and from the last one to suspicion 1, its logarithm is linear. Of one that
+        is stored several times, as many samples have it, the share is that stored before; of 0 it is 1.
         """
         least = 1 / (self.count + 1)
-        x = np.concatenate([[-1e-9], self.suspicion, [1.0]])
-        y = np.log(
-            np.concatenate([[1.0], self.share, [min(least, self.share[-1] / 2 if len(self.share) else 0.5)]])
-        )
-        x, first = np.unique(x[::-1], return_index=True)  # of equal suspicions the least share
-        found: Float = np.exp(np.interp(suspicion, x, np.maximum(y[::-1][first], np.log(least))))
-        return found
+        x, y = [0.0], [1.0]
+        for value in np.unique(self.suspicion):
+            same = np.flatnonzero(self.suspicion == value)
+            if len(same) > 1 and value > 0:
+                x.append(value)
+                y.append(self.share[same[0] - 1] if same[0] else 1.0)
+            x.append(value + (_STEP if len(same) > 1 or value == 0 else 0.0))
+            y.append(self.share[same[-1]])
+        x.append(max(1.0, x[-1] + _STEP))
+        y.append(min(least, y[-1] / 2))
+        share: Float = np.exp(np.interp(suspicion, x, np.log(np.maximum(y, least))))
+        return share
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,3 +114,19 @@ def test_defences_are_read_from_text():
         read_defences(["shadow", "all"])
     with pytest.raises(InputError, match="give one or more"):
         read_defences([])
+
+
+def test_a_suspicion_that_most_genuine_samples_have_is_not_unusual():
+    """Most returns have suspicion 0; several stored shares are then those of 0."""
+    rng = np.random.default_rng(8)
+    column = np.where(rng.random(100_000) < 0.97, 0.0, np.where(rng.random(100_000) < 0.5, 0.2, 0.8))
+    tail = tail_of(Samples.of([(column, np.zeros(len(column), bool))]))
+    share = tail.of(np.array([0.0, 0.1, 0.2, 0.5, 0.8]))
+    assert share[0] == 1
+    true = np.array([np.mean(column >= s) for s in (0.0, 0.1, 0.2, 0.5, 0.8)])
+    assert (share >= true / 2.5).all(), "as exact as the stored shares are apart"
+    assert (share[1:] < 2.5 * true[1:]).all()
+    calibration = Calibration({("one", level): tail for level in ("returns", "frames")})
+    verdict = fused({"one": Verdict(column, None, 0.0)}, calibration, rule="max")
+    for level in FALSE_ALARMS:
+        assert np.mean(verdict.returns > fused_threshold(level)) <= FALSE_ALARMS[level]
