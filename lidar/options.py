@@ -332,7 +332,8 @@ class DriveOptions:
             return ROADS[self.road]
         from lidar.weather.road import road_conditions  # noqa: PLC0415
 
-        return road_conditions(self._weather())
+        ground = self.contents().world
+        return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)
 
     def _weather(self) -> WeatherList:
         """Weather among the stages."""

@@ -165,7 +165,7 @@ def read_stages(texts: Iterable[str], *, seed: int = 0) -> Stages:
 
     Raises InputError as `read_stage` does, and for a file that cannot be read.
     """
-    return stages_of(_tables(texts, "stage"), seed=seed)
+    return Stages(numbered(_read_all(texts, "stage")), seed)
 
 
 def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
@@ -173,12 +173,7 @@ def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
 
     Raises InputError as `read_stages` does, and for a stage that is no attack.
     """
-    tables = _tables(texts, "attack")
-    known = [name for name, place in _STAGES.items() if place.startswith("attacks.")]
-    for table in tables:
-        if (name := table.get("name")) in _STAGES and name not in known:
-            raise InputError(f"stage {name} is no attack (attacks are {', '.join(known)})")
-    return stages_of(tables).stages
+    return numbered(_read_all(texts, "attack"))
 
 
 def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
@@ -194,12 +189,28 @@ def numbered(stages: Iterable[NamedStage]) -> tuple[NamedStage, ...]:
     return tuple(found)
 
 
-def _tables(texts: Iterable[str], kind: str) -> list[Mapping[str, Any]]:
-    """Tables of stages from texts, and from files with tables ``[[kind]]``."""
-    tables: list[Mapping[str, Any]] = []
+def _read_all(texts: Iterable[str], kind: str) -> list[NamedStage]:
+    """Stages from texts, and from files with tables ``[[kind]]``; an error names the file and the table."""
+    found = []
     for text in texts:
-        tables += _file_tables(Path(text), kind) if text.endswith(".toml") else [_text_table(text)]
-    return tables
+        if not text.endswith(".toml"):
+            found.append(_read_kind(_text_table(text), kind))
+            continue
+        for number, table in enumerate(_file_tables(Path(text), kind), 1):
+            try:
+                found.append(_read_kind(table, kind))
+            except InputError as error:
+                raise InputError(f"{text}: [[{kind}]] {number}: {error}") from None
+    return found
+
+
+def _read_kind(table: Mapping[str, Any], kind: str) -> NamedStage:
+    """A stage from a table; raises InputError, also for a stage that is no attack where attacks are read."""
+    named = read_stage(table)
+    attacks = [name for name, place in _STAGES.items() if place.startswith("attacks.")]
+    if kind == "attack" and named.name not in attacks:
+        raise InputError(f"stage {named.name} is no attack (attacks are {', '.join(attacks)})")
+    return named
 
 
 def _file_tables(path: Path, kind: str) -> list[Mapping[str, Any]]:

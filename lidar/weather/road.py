@@ -9,31 +9,26 @@ from lidar.planning.road_conditions import DRY_GRIP, SNOW_GRIP, WET_GRIP, RoadCo
 from lidar.weather.media import CONTRAST, medium_of
 from lidar.weather.setting import WeatherSetting
 
-_WET, _SNOWED = {"rain": 1.0, "spray": 1.0}, {"snow": 1.0}
-"""Wetness and share of snow of the roads, by kind of weather; 0 of others."""
 _GREEN_NM = 550.0
 """Wavelength of visibilities, nanometres."""
 
 
-def road_conditions(weather: Iterable[WeatherSetting]) -> RoadConditions:
-    """Grip and visibility of all weather that is everywhere, at its worst: one state for a whole drive.
+def road_conditions(weather: Iterable[WeatherSetting], *, wetness: float, snow: float) -> RoadConditions:
+    """Grip of wet and snowy ground, and the visibility in all weather that is everywhere, at its worst.
 
-    Weather of a place, and plumes behind vehicles, change neither.
+    wetness : share of the ground that is soaked, see `lidar.world.settings.WorldSettings`
+    snow    : share of it that is under snow
+
+    Weather of a place, and plumes behind vehicles, do not lower the visibility.
     """
-    wet = snowed = extinction = 0.0
-    for setting in weather:
-        if setting.radius or setting.polygon:
-            continue
-        wet = max(wet, _given(setting.wetness, _WET.get(setting.kind, 0.0)))
-        snowed = max(snowed, _given(setting.snow_cover, _SNOWED.get(setting.kind, 0.0)))
-        if setting.kind != "clear" and setting.medium != "plumes":
-            extinction += max(_extinction(setting, amount) for amount in _amounts(setting))
-    grip = (1 - snowed) * (DRY_GRIP + wet * (WET_GRIP - DRY_GRIP)) + snowed * SNOW_GRIP
+    extinction = sum(
+        max(_extinction(setting, amount) for amount in _amounts(setting))
+        for setting in weather
+        if setting.kind != "clear" and setting.medium != "plumes"
+        if not (setting.radius or setting.polygon)
+    )
+    grip = (1 - snow) * (DRY_GRIP + wetness * (WET_GRIP - DRY_GRIP)) + snow * SNOW_GRIP
     return RoadConditions(grip, CONTRAST / extinction if extinction else math.inf)
-
-
-def _given(value: float, default: float) -> float:
-    return default if value < 0 else value
 
 
 def _amounts(setting: WeatherSetting) -> list[float]:

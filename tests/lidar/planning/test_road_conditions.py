@@ -11,14 +11,14 @@ from lidar.planning.road_conditions import DRY, ROADS, RoadConditions, vehicle_o
 from lidar.rig.vehicle import load_vehicle
 from lidar.signal.registry import NamedStage
 from lidar.traffic.trips import DRIVERS, driver_on
-from lidar.weather.road import road_conditions
 from lidar.weather.setting import read_weather
 
 CAR = load_vehicle("car")
 
 
-def in_weather(text):
-    return road_conditions(read_weather(text))
+def in_weather(text, *more, **options):
+    weather = (*read_weather(text), *more)
+    return DriveOptions(route="random", weather=weather, road="by-weather", **options).road_conditions()
 
 
 @pytest.mark.parametrize(("metres", "kmh"), [(31.2, 30), (63.5, 50), (104.9, 70), (184.2, 100), (284.2, 130)])
@@ -47,7 +47,9 @@ def test_weather_makes_roads_slippery_and_the_air_dim():
     assert in_weather("clear") == DRY
     assert in_weather("rain=10mm/h").grip == ROADS["wet"].grip
     assert in_weather("rain=10mm/h").visibility == pytest.approx(2500, rel=0.3)
-    assert in_weather("snow=2mm/h").grip == ROADS["snow"].grip
+    assert in_weather("snow=4mm/h").grip == pytest.approx(ROADS["snow"].grip)
+    assert in_weather("snow=2mm/h").grip == pytest.approx((0.2 + 0.85 - 0.3 * 0.25) / 2)
+    assert in_weather("snow=2mm/h", settings=(("snow", "0"), ("wetness", "1"))).grip == ROADS["wet"].grip
     assert in_weather("snow=2mm/h").visibility < in_weather("snow=0.5mm/h").visibility
     fog = in_weather("fog=50m")
     assert fog.grip == DRY.grip
@@ -56,7 +58,7 @@ def test_weather_makes_roads_slippery_and_the_air_dim():
     assert in_weather("rain=10mm/h,wetness=0.5").grip == pytest.approx((0.85 + 0.6) / 2)
     assert in_weather("dust=20m") == DRY
     assert in_weather("fog=50m,longitude=8,latitude=47,radius=100") == DRY
-    growing = road_conditions([replace(read_weather("fog=500m")[0], amount_to=50.0, end=60.0)])
+    growing = in_weather("clear", replace(read_weather("fog=500m")[0], amount_to=50.0, end=60.0))
     assert growing.visibility == pytest.approx(50, rel=0.02)
 
 

@@ -118,7 +118,7 @@ def test_files_of_attacks_hold_attacks_only(tmp_path):
     for text, match in (
         ('[[stage]]\nname = "blinding"\n', r"give tables \[\[attack\]\]"),
         ('[[attack]]\nname = "dropped_packets"\n', r"is no attack \(attacks are blinding\)"),
-        ("[[attack]]\npower = 3\n", "has no name"),
+        ("[[attack]]\npower = 3\n", r"a\.toml: \[\[attack\]\] 1: a stage has no name"),
         ("attack = []\n", r"give tables \[\[attack\]\]"),
         ('[[attack]]\nname = "blinding"\npower = 11\n', "power = 11 is not within 0 to 10"),
     ):
