@@ -22,11 +22,16 @@ class Defence(Stage):
 
     history : number of earlier frames that it looks at
     needs   : what a dataset must have: ``columns`` (ring, column, time and range of returns), ``cameras``,
-              ``scene`` or ``navigation``
+              ``scene``, ``navigation`` or ``watermark``
     """
 
     history: ClassVar[int] = 0
     needs: ClassVar[frozenset[str]] = frozenset()
+
+    @property
+    def lacks(self) -> str:
+        """What its parameters lack, in words; empty if nothing."""
+        return ""
 
     @abstractmethod
     def judge(

@@ -43,7 +43,8 @@ def able(scans: Sequence[Scans], defences: Sequence[NamedDefence]) -> list[Named
     """
     found = []
     for named in defences:
-        lacks = [text for each in scans if (text := _lacks(each, needs=named.defence.needs))]
+        texts = (_lacks(each, needs=named.defence.needs) for each in scans)
+        lacks = [text for text in (named.defence.lacks, *texts) if text]
         if lacks and named.named:
             raise InputError(f"defence {named.name}: {lacks[0]}")
         if not lacks:
@@ -60,6 +61,8 @@ def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
         return f"needs colour images, and {path} has none"
     if "navigation" in needs and scans.navigation is None:
         return f"needs a GNSS receiver and an inertial unit, and the rig of {path} lacks one"
+    if "watermark" in needs and "watermark" not in scans.dataset.manifest["recipe"]:
+        return f"needs clouds with a watermark (lidar sign), and {path} has none"
     return ""
 
 

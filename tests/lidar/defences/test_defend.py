@@ -17,8 +17,10 @@ from lidar.defences.reading import SEEN, read_scans
 from lidar.defences.registry import defence_names, read_defences
 from lidar.defences.run import DETECTOR
 from lidar.errors import DatasetError, InputError
+from lidar.integrity.watermark import Watermark
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.pipeline import drive
+from lidar.sign import sign_dataset
 from lidar.signal.registry import read_stages
 
 RIG = """
@@ -49,6 +51,7 @@ BARE = RIG.partition("[[camera]]")[0]
 
 CALIBRATION = read_calibration()
 ALL = read_defences(["all"])
+UNSIGNED = [name for name in defence_names() if name != "watermark"]
 
 
 def driven(scene, folder, rig, **options):
@@ -80,12 +83,12 @@ def test_every_defence_is_calibrated_by_the_program():
 def test_a_verdict_has_a_row_for_each_return_and_scores_against_the_truth(attacked, tmp_path):
     dataset = open_dataset(attacked)
     found = defend([dataset], ALL, calibration=CALIBRATION, rule="max", out=tmp_path / "out")
-    assert set(found.seconds) == {*defence_names(), DETECTOR}
+    assert set(found.seconds) == {*UNSIGNED, DETECTOR}
     document = json.loads((tmp_path / "out" / "defend.json").read_text())
-    assert set(document["defences"]) == {*defence_names(), "fused"}
+    assert set(document["defences"]) == {*UNSIGNED, "fused"}
     with (tmp_path / "out" / "frames.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == 5 * (1 + len(defence_names()))
+    assert len(rows) == 5 * (1 + len(UNSIGNED))
     assert [row["attacked"] for row in rows if row["defence"] == "fused"] == ["0", "0", "1", "1", "1"]
     truth = np.load(dataset.paths.truth("top", 3))["origin"]
     with np.load(tmp_path / "out" / "drive" / "top" / "000003.npz") as file:
@@ -134,6 +137,24 @@ def test_defences_see_no_ground_truth(attacked, tmp_path):
         assert all((one[name] == other[name]).all() for name in one.files)
 
 
+def test_the_watermark_tells_injected_returns_apart(plain, tmp_path):
+    (tmp_path / "key").write_text("00112233445566778899aabbccddeeff")
+    mark = Watermark(bytes.fromhex("00112233445566778899aabbccddeeff"))
+    sign_dataset(plain, tmp_path / "signed", watermark=mark)
+    stages = read_stages(["insert:distance=7,start=0.2"]).stages
+    apply_stages(tmp_path / "signed", tmp_path / "forged", options=ApplyOptions(stages))
+    chosen = read_defences([f"watermark:key={tmp_path / 'key'}"])
+    found = defend([open_dataset(tmp_path / "forged")], chosen, calibration=CALIBRATION)
+    scores = found.scores["watermark", "returns"]
+    assert scores.attacked > 100
+    assert scores.auc[0] > 0.999
+    assert found.scores["watermark", "frames"].auc[0] == 1
+    with pytest.raises(InputError, match="watermark: needs clouds with a watermark"):
+        defend([open_dataset(plain)], chosen, calibration=CALIBRATION)
+    with pytest.raises(InputError, match="watermark: needs the key of the watermark"):
+        defend([open_dataset(tmp_path / "signed")], read_defences(["watermark"]), calibration=CALIBRATION)
+
+
 def test_data_that_lack_what_a_defence_needs_are_refused_and_all_leaves_it_out(scene, tmp_path):
     bare = open_dataset(driven(scene, tmp_path, BARE))
     for name, lack in (("overlay", "colour images"), ("navigation", "GNSS")):
@@ -141,7 +162,7 @@ def test_data_that_lack_what_a_defence_needs_are_refused_and_all_leaves_it_out(s
             defend([bare], read_defences([name]), calibration=CALIBRATION, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
     found = defend([bare], ALL, calibration=CALIBRATION)
-    assert set(found.seconds) == {*defence_names(), DETECTOR} - {"overlay", "navigation"}
+    assert set(found.seconds) == {*UNSIGNED, DETECTOR} - {"overlay", "navigation"}
     (tmp_path / "rig.toml").write_text(BARE + "# changed\n")
     with pytest.raises(InputError, match="has changed"):
         read_scans(bare)
