@@ -43,7 +43,10 @@ ATTACKS = {
         0.927, 0.927, "removal of 90 % of a target's points, success 92.7 %", "Cao et al. 2023"
     ),
     "high-frequency": Band(
-        0.96, None, "at least 96 % of the points in the window removed", "Sato et al. 2024, 2025"
+        None,
+        None,
+        "at least 96 % of the points in the window removed; no success rate is stated",
+        "Sato et al. 2024, 2025",
     ),
     "pla": Band(
         None,
@@ -52,7 +55,10 @@ ATTACKS = {
         "Jin et al. 2023",
     ),
     "wraith": Band(
-        0.7, 1.0, "forged cars that the best earlier defences miss: more than 70 %", "arXiv 2303.09731"
+        None,
+        None,
+        "ghost over several frames; the best earlier defences remove fewer than 30 % of forged cars",
+        "arXiv 2303.09731",
     ),
 }
 """Success of attacks, by key of the option ``published``."""
