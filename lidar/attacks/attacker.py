@@ -13,13 +13,11 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.physics.echoes import Origin, TracedEchoes, joined, numbered
 from lidar.physics.link import amplitude
+from lidar.physics.pulse_identity import METRES_PER_NS
 from lidar.raycast.geometry import ALL
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter
 from lidar.world.world import GLASS
-
-METRES_PER_NS = 0.299792458 / 2
-"""Range per nanosecond of delay."""
 
 POWER_AT = 10.0
 """Metres from the sensor at which the parameter ``power`` holds."""
@@ -242,7 +240,7 @@ class TimedAttacker(Attacker):
 class SynchronisedAttacker(TimedAttacker):
     """A device that knows when the sensor fires, and sends what it has prepared for each pulse.
 
-    It cannot know a random delay or code of each pulse: see ``firing_jitter`` and ``code_bits``.
+    It cannot know a random delay or code of each pulse: see `lidar.physics.pulse_identity`.
     """
 
     frame_jitter: float = parameter(
@@ -251,24 +249,12 @@ class SynchronisedAttacker(TimedAttacker):
     sync: float = parameter(
         0.0, "ns, standard deviation of the synchronisation from frame to frame", low=0, high=1e6
     )
-    firing_jitter: float = parameter(
-        0.0, "ns by which the sensor delays its pulses at random, as a defence", low=0, high=1e6
-    )
-    code_bits: int = parameter(
-        0, "bits of the code of each pulse of the sensor, as a defence", low=0, high=64
-    )
 
     def errors(self, aim: Aim, *, rng: np.random.Generator) -> Float:
-        """Errors as of any device that answers, of the synchronisation and of the sensor's random delays."""
+        """Errors as of any device that answers, and of the synchronisation."""
         own = super().errors(aim, rng=rng)
-        shift = self.sync * rng.standard_normal()
-        late = self.firing_jitter * rng.uniform(-0.5, 0.5, len(aim.row))
-        error: Float = own + METRES_PER_NS * (shift + late)
+        error: Float = own + METRES_PER_NS * self.sync * rng.standard_normal()
         return error
-
-    def accepted(self, aim: Aim, *, rng: np.random.Generator) -> Aim:
-        """The pulses that have the right code by chance."""
-        return aim.where(rng.random(len(aim.row)) < 0.5**self.code_bits) if self.code_bits else aim
 
 
 def degrees_of(place: str) -> tuple[float, float, float]:

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar.attacks.attacker import DEVICES, METRES_PER_NS, Attacker, sent_back
+from lidar.attacks.attacker import DEVICES, Attacker, sent_back
 from lidar.attacks.remove import POWER_SPREAD
 from lidar.physics.echoes import Origin, TracedEchoes
+from lidar.physics.pulse_identity import METRES_PER_NS, has_code
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 
@@ -22,9 +23,6 @@ class HighFrequencyRemoval(Attacker):
 
     device: str = parameter("pra_2023", "hardware, which limits points and angles", among=(*DEVICES,))
     frequency: float = parameter(5.0, "MHz, of its pulses; typical value", low=1e-3, high=100)
-    code_bits: int = parameter(
-        0, "bits of the code of each pulse of the sensor, as a defence", low=0, high=64
-    )
 
     def echoes(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
@@ -40,7 +38,6 @@ class HighFrequencyRemoval(Attacker):
         distance = (first[:, None] + step * np.arange(most)).ravel() - pulses.sensor.pattern.range_offset
         row = np.repeat(aim.row, most)
         power = np.repeat(aim.power, most) * rng.uniform(*POWER_SPREAD, len(row))
-        if self.code_bits:
-            accepted = rng.random(len(row)) < 0.5**self.code_bits
-            row, distance, power = row[accepted], distance[accepted], power[accepted]
+        accepted = has_code(pulses.sensor, len(row), rng=rng)
+        row, distance, power = row[accepted], distance[accepted], power[accepted]
         return sent_back(pulses, echoes, row=row, distance=distance, power=power, origin=Origin.INJECTED)

@@ -11,6 +11,7 @@ from lidar.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of,
 from lidar.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges
 from lidar.errors import InputError
 from lidar.physics.echoes import Origin, TracedEchoes
+from lidar.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses, parameter
 
@@ -75,8 +76,10 @@ class Inject(SynchronisedAttacker):
             usable &= distance >= aim.distance
         known = np.full(len(pulses), np.inf)
         known[aim.row] = distance
-        aim = self.accepted(self.spent(aim.where(usable), rng=rng), rng=rng)
+        aim = self.spent(aim.where(usable), rng=rng)
+        aim = aim.where(has_code(sensor, len(aim.row), rng=rng))
         distance = known[aim.row] + self.errors(aim, rng=rng)
+        distance += shift_by_delay(sensor, len(aim.row), rng=rng)
         reflectance = rng.uniform(self.dimmest, self.brightest, len(aim.row))
         power = np.minimum(power_of(pulses, reflectance, distance=distance), aim.power)
         return sent_back(pulses, echoes, row=aim.row, distance=distance, power=power, origin=Origin.INJECTED)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar.attacks.attacker import METRES_PER_NS, TimedAttacker, power_of, sent_back
+from lidar.attacks.attacker import TimedAttacker, power_of, sent_back
 from lidar.physics.echoes import Origin, TracedEchoes
+from lidar.physics.pulse_identity import METRES_PER_NS
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 

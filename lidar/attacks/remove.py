@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.attacks.attacker import DEVICES, Aim, Attacker, crowded_out, sent_back
+from lidar.attacks.attacker import DEVICES, Aim, Attacker, sent_back
 from lidar.physics.echoes import Origin, TracedEchoes
+from lidar.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 
@@ -20,7 +21,8 @@ POWER_SPREAD = (0.5, 1.0)
 class Remove(Attacker):
     """Returns are removed: by pulses nearer than the least range, by dazzling, or by jamming (Cao 2023).
 
-    ``near`` needs synchronisation with the sensor, the others do not.
+    ``near`` needs synchronisation with the sensor, the others do not. Codes of pulses hinder all but
+    ``saturation``, random delays only ``near``.
     """
 
     device: str = parameter("pra_2023", "hardware, which limits points and angles", among=(*DEVICES,))
@@ -39,18 +41,22 @@ class Remove(Attacker):
         if aim is None:
             return echoes
         aim = self.spent(aim.where(rng.random(len(aim.row)) < self.share), rng=rng)
-        if self.method == "near":
-            return echoes.where(~crowded_out(pulses, echoes, row=aim.row, power=aim.power))
         if self.method == "saturation":
             return echoes.where(~_dazzled(pulses, echoes, aim=aim))
         sensor = pulses.sensor
-        distance = rng.uniform(0, sensor.max_range, len(aim.row)) - sensor.pattern.range_offset
+        aim = aim.where(has_code(sensor, len(aim.row), rng=rng))
+        if self.method == "near":
+            away, power = sensor.min_range / 2 + shift_by_delay(sensor, len(aim.row), rng=rng), aim.power
+        else:
+            away = rng.uniform(0, sensor.max_range, len(aim.row))
+            power = aim.power * rng.uniform(*POWER_SPREAD, len(aim.row))
+        heard = away > 0  # others come before the sensor fires
         return sent_back(
             pulses,
             echoes,
-            row=aim.row,
-            distance=distance,
-            power=aim.power * rng.uniform(*POWER_SPREAD, len(aim.row)),
+            row=aim.row[heard],
+            distance=away[heard] - sensor.pattern.range_offset,
+            power=power[heard],
             origin=Origin.INJECTED,
         )
 

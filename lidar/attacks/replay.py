@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lidar.attacks.attacker import Aim, SynchronisedAttacker, power_of, sent_back
 from lidar.physics.echoes import Origin, TracedEchoes
 from lidar.physics.intensity import apparent_of_code
+from lidar.physics.pulse_identity import has_code, shift_by_delay
 from lidar.sensors.cloud import Cloud
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
@@ -49,10 +50,12 @@ class Replay(SynchronisedAttacker):
         source = _same_beam(old, pulses, aim=aim)
         seen = np.zeros(len(pulses), np.int64)
         seen[aim.row] = source
-        aim = self.accepted(self.spent(aim.where(source >= 0), rng=rng), rng=rng)
+        sensor, aim = pulses.sensor, self.spent(aim.where(source >= 0), rng=rng)
+        aim = aim.where(has_code(sensor, len(aim.row), rng=rng))
         chosen = old.take(seen[aim.row])
-        distance = chosen.range - pulses.sensor.pattern.range_offset + self.errors(aim, rng=rng)
-        apparent = apparent_of_code(chosen.intensity, diffuse_code=pulses.sensor.diffuse_code)
+        distance = chosen.range - sensor.pattern.range_offset + self.errors(aim, rng=rng)
+        distance += shift_by_delay(sensor, len(aim.row), rng=rng)
+        apparent = apparent_of_code(chosen.intensity, diffuse_code=sensor.diffuse_code)
         power = np.minimum(self.gain * power_of(pulses, apparent, distance=distance), aim.power)
         return sent_back(pulses, echoes, row=aim.row, distance=distance, power=power, origin=Origin.REPLAYED)
 

@@ -64,6 +64,9 @@ def _mounted(mount: Mount) -> dict[str, Any]:
     }
 
 
+_SECRETS = ("firing_jitter_ns", "code_bits")
+"""Stated of scanners that have them."""
+
 _SCANNER = ("wavelength_nm", "min_range", "max_range", "range_quantum", "return_mode", "fmcw")
 
 
@@ -83,6 +86,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "rate_hz": s.rate_hz,
                 "time_offset_ns": s.start_ns,
                 **{name: getattr(s, name) for name in _SCANNER},
+                **{name: value for name in _SECRETS if (value := getattr(s, name))},
                 **_mounted(sensor.spec.mount),
             }
         else:

@@ -22,7 +22,7 @@ class Defence(Stage):
 
     history : number of earlier frames that it looks at
     needs   : what a dataset must have: ``columns`` (ring, column, time and range of returns), ``cameras``,
-              ``scene``, ``navigation`` or ``watermark``
+              ``scene``, ``navigation``, ``watermark`` or ``firing_jitter`` (random firing times)
     """
 
     history: ClassVar[int] = 0

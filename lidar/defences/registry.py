@@ -23,6 +23,7 @@ _DEFENCES = {
     "navigation": "navigation.Navigation",
     "physics": "physics.Physics",
     "statistical": "statistical.Statistical",
+    "timing": "timing.Timing",
     "watermark": "watermark.Watermark",
 }
 """Module within this folder and class, by name."""

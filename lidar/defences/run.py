@@ -63,6 +63,8 @@ def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
         return f"needs a GNSS receiver and an inertial unit, and the rig of {path} lacks one"
     if "watermark" in needs and "watermark" not in scans.dataset.manifest["recipe"]:
         return f"needs clouds with a watermark (lidar sign), and {path} has none"
+    if "firing_jitter" in needs and not scans.sensor.firing_jitter_ns:
+        return f"needs random firing times, and {scans.sensor.name} of {path} has none (firing_jitter_ns)"
     return ""
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
 from lidar.physics.link import amplitude, apparent_of, daylight_noise, false_alarm_probability, noise_of
+from lidar.physics.pulse_identity import has_code
 from lidar.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
 from lidar.physics.reflect import RETRO
 from lidar.physics.settings import ScannerSettings
@@ -68,6 +69,7 @@ def false_echoes(
     if settings.interference:
         rng = generator(seed, sensor.name, frame, "interference")
         pulse = np.flatnonzero(rng.random(len(pulses)) < 1 - (1 - _OVERLAP) ** settings.interference)
+        pulse = pulse[has_code(sensor, len(pulse), rng=rng)]
         power = 100 ** rng.random(len(pulse))  # log-uniform over two decades, assumed
         found.append((Origin.INTERFERENCE, _anywhere(sensor, pulse, power=power, rng=rng)))
     if settings.false_alarms:

@@ -84,6 +84,8 @@ def scanners(rig: Rig) -> list[Scanner]:
                 rate_hz=s.rate_hz,
                 return_mode=s.return_mode,
                 start_ns=s.time_offset_ns,
+                firing_jitter_ns=s.firing_jitter_ns,
+                code_bits=s.code_bits,
             ),
         )
         for s in rig.lidars

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 
@@ -28,6 +28,9 @@ KINDS = ("spinning", "prism", "sweep", "table", "flash", "scan2d", "line")
 
 WEAK_SIGMA = (0.09 / math.sqrt(2), 0.0)
 """Default of `Sensor.weak_sigma`: dR / sqrt(2) of LISA (Kilic et al. 2021), with its dR of 0.09 m."""
+
+MOST_JITTER_NS, MOST_CODE_BITS = 1e4, 64
+"""Greatest random delay of pulses, and longest code."""
 
 _RATES_HZ = (1e-3, 1e4)
 """Least and greatest rate of a scanner's frames."""
@@ -67,6 +70,8 @@ class Sensor:
     diffuse_code  : intensity code of a perfect white Lambertian target
     fmcw          : also measures radial velocity
     velocity_sigma : m/s, standard deviation of the radial velocity
+    firing_jitter_ns : nanoseconds over which the sensor delays each pulse at random, known to it alone
+    code_bits     : bits of the random code of each pulse; echoes with another code are dropped
     pattern       : firing pattern
     note          : what the preset does not model exactly
     source        : where each number of the preset comes from
@@ -99,6 +104,8 @@ class Sensor:
     fmcw: bool
     pattern: Pattern
     velocity_sigma: float = 0.0
+    firing_jitter_ns: float = 0.0
+    code_bits: int = 0
     signal_noise: float = 0.0
     falloff: float = 2.0
     weak_sigma: tuple[float, float] = WEAK_SIGMA
@@ -144,6 +151,8 @@ def load_sensor(
     rate_hz: float = 0.0,
     return_mode: str = "",
     start_ns: int = 0,
+    firing_jitter_ns: float = 0.0,
+    code_bits: int = 0,
 ) -> Sensor:
     """A scanner from a preset (one of `sensor_names`) or a TOML file.
 
@@ -151,6 +160,7 @@ def load_sensor(
     rate_hz     : revolutions or frames per second; 0 for the first of the preset's rates
     return_mode : the first of the preset's modes by default
     start_ns    : start of frame 0, nanoseconds since the drive's start
+    firing_jitter_ns, code_bits : as in `Sensor`; 0 for the preset's
 
     Raises RigError, naming file, line and key, for keys that are missing, unknown or out of bounds.
     """
@@ -164,8 +174,13 @@ def load_sensor(
             raise RigError(f"sensor {preset!r} is not known: {', '.join(sensor_names())}, or a .toml file")
         file = resources.files("lidar.rig") / "sensors" / f"{preset}.toml"
         table = read_table(file, name=f"presets/{preset}.toml")
-    return _read(
+    sensor = _read(
         table, name or Path(preset).stem, rate_hz=rate_hz, return_mode=return_mode, start_ns=start_ns
+    )
+    return replace(
+        sensor,
+        firing_jitter_ns=firing_jitter_ns or sensor.firing_jitter_ns,
+        code_bits=code_bits or sensor.code_bits,
     )
 
 
@@ -219,6 +234,8 @@ def _read(table: Table, name: str, *, rate_hz: float, return_mode: str, start_ns
         diffuse_code=table.number("diffuse_code", 100.0, above=0.0, high=255.0),
         fmcw=table.flag("fmcw", False),
         velocity_sigma=table.number("velocity_sigma", 0.0, low=0.0),
+        firing_jitter_ns=table.number("firing_jitter_ns", 0.0, low=0.0, high=MOST_JITTER_NS),
+        code_bits=table.integer("code_bits", 0, low=0, high=MOST_CODE_BITS),
         signal_noise=table.number("signal_noise", 0.0, low=0.0, high=1.0),
         falloff=table.number("falloff", 2.0, low=1.0, high=4.0),
         weak_sigma=(own, background),

@@ -14,6 +14,7 @@ from lidar.errors import RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount
 from lidar.rig.imu_grades import PRESETS
+from lidar.rig.scanner import MOST_CODE_BITS, MOST_JITTER_NS
 from lidar.rig.toml_table import Table, read_table
 
 
@@ -26,6 +27,8 @@ class LidarSpec:
     rate_hz        : revolutions or frames per second; 0 for the preset's own
     time_offset_ns : start of frame 0 after the drive's start
     return_mode    : one of the preset's modes; empty for its first
+    firing_jitter_ns, code_bits : random delay and code of pulses, as in `lidar.rig.scanner.Sensor`; 0 for the
+                     preset's
     """
 
     name: str
@@ -34,6 +37,8 @@ class LidarSpec:
     rate_hz: float = 0.0
     time_offset_ns: int = 0
     return_mode: str = ""
+    firing_jitter_ns: float = 0.0
+    code_bits: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +192,8 @@ def _lidar(table: Table, folder: Path) -> LidarSpec:
         rate_hz=rate_hz,
         time_offset_ns=table.integer("time_offset_ns", 0, low=0),
         return_mode=table.text("return_mode", ""),
+        firing_jitter_ns=table.number("firing_jitter_ns", 0.0, low=0.0, high=MOST_JITTER_NS),
+        code_bits=table.integer("code_bits", 0, low=0, high=MOST_CODE_BITS),
     )
 
 

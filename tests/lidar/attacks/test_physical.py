@@ -10,11 +10,12 @@ from scipy import stats
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
-from lidar.attacks.attacker import DEVICES, METRES_PER_NS
+from lidar.attacks.attacker import DEVICES
 from lidar.attacks.sight import check_sight, sent_only
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.physics.echoes import Origin
+from lidar.physics.pulse_identity import METRES_PER_NS
 from lidar.physics.settings import LEVELS, PLAIN
 from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.scan import cast
@@ -159,17 +160,58 @@ def test_a_phantom_comes_nearer():
     assert nearest(1) - nearest(11) == pytest.approx(10.0, abs=0.3)
 
 
-def test_random_firing_delays_and_codes_hinder_injection_but_not_relay():
-    def spread(**defence):
-        found = added(attacked(VLP, name="inject", shape="wall", wide=100.0, high=9.0, range=30.0, **defence))
-        return len(found), found.xyz[:, 0].std()
+def guarded(sweep, **secrets):
+    """The sweep of a scanner that delays or codes its pulses; its genuine echoes are the same."""
+    return replace(sweep, sensor=replace(sweep.sensor, **secrets))
 
-    plain, delayed, coded = spread(), spread(firing_jitter=100.0), spread(code_bits=3)
-    assert delayed[1] == pytest.approx(METRES_PER_NS * 100 / np.sqrt(12), rel=0.12)  # uniform over 15 m
-    assert plain[1] < 0.3
-    assert coded[0] == pytest.approx(plain[0] / 8, rel=0.3)
-    with pytest.raises(InputError, match="no parameter 'code_bits'"):
-        read_stage({"name": "relay", "code_bits": 3})
+
+WALL = {"name": "inject", "shape": "wall", "wide": 100.0, "high": 9.0, "range": 30.0, "jitter": 0.0}
+"""A wall whose ranges have no error of the device."""
+
+
+@pytest.mark.parametrize(("delay", "metres"), [(10.0, 1.5), (100.0, 15.0)])
+def test_prepared_pulses_scatter_uniformly_by_random_firing_delays(delay, metres):
+    plain = attacked(VLP, **WALL, jitter_per_degree=0.0)
+    delayed = attacked(guarded(VLP, firing_jitter_ns=delay), **WALL, jitter_per_degree=0.0)
+    assert np.array_equal(delayed.original.xyz, plain.original.xyz)
+    assert added(plain).xyz[:, 0].std() < 0.01
+    found, wall = added(delayed).xyz, np.median(added(plain).xyz[:, 0])
+    away = np.linalg.norm(found, axis=1)
+    off = away - wall * away / found[:, 0]  # along the beam, from where it meets the wall
+    assert np.ptp(off) == pytest.approx(metres, rel=0.02)
+    assert stats.kstest(off, stats.uniform(-metres / 2, metres).cdf).pvalue > 0.01
+
+
+@pytest.mark.parametrize("bits", [1, 3, 6])
+def test_prepared_pulses_have_the_code_by_chance(bits):
+    plain, coded = (added(attacked(guarded(VLP, code_bits=k), **WALL)) for k in (0, bits))
+    low, high = stats.binom(len(plain), 0.5**bits).interval(0.9999)
+    assert low <= len(coded) <= high
+
+
+def test_a_relay_has_the_sensors_own_time_and_code():
+    plain, secret = (
+        added(attacked(guarded(VLP, **secrets), name="relay", distance=8.0))
+        for secrets in ({}, {"firing_jitter_ns": 100.0, "code_bits": 16})
+    )
+    assert np.array_equal(plain.xyz, secret.xyz)
+
+
+def test_removal_below_the_least_range_fails_against_random_delays_and_codes():
+    """Of pulses that scatter over 15 m, half come before the sensor fires, and few are near enough."""
+
+    def removed(**secrets):
+        found = attacked(guarded(VLP, **secrets), name="remove")
+        inside = np.abs(azimuth(found.original)) < 22
+        gone = np.zeros(len(found.original), bool)
+        gone[cloud_truth(found, start_ns=0)["removed"]] = True
+        return gone[inside].mean(), len(added(found)) / inside.sum()
+
+    assert removed()[0] > 0.96
+    lost, shown = removed(firing_jitter_ns=100.0)
+    assert lost == pytest.approx(0.98 * (0.5 + 0.25 / 15), abs=0.05)
+    assert shown == pytest.approx(0.98 * (0.5 - 0.25 / 15), abs=0.05)
+    assert removed(code_bits=5)[0] < 0.06
 
 
 def test_relayed_returns_are_delayed_by_the_speed_of_light():
@@ -212,8 +254,17 @@ def test_jamming_and_pulse_trains_put_returns_at_random_ranges():
         assert gone[inside].mean() >= 0.96
         away = np.linalg.norm(added(found).xyz, axis=1)
         assert stats.kstest(away[:2000], stats.uniform(0, 120).cdf).statistic < 0.05
-    kept = attacked(HDL, name="high_frequency_removal", code_bits=12)
-    assert len(added(kept)) < 0.01 * inside.sum()
+
+
+def test_pulse_trains_defeat_coarse_codes_and_not_fine_ones():
+    """A return is replaced if one of the n pulses that arrive has its code: 1 - (1 - 2^-k)^n."""
+    for bits, frequency in ((1, 20.0), (3, 20.0), (8, 20.0), (12, 5.0)):
+        found = attacked(guarded(HDL, code_bits=bits), name="high_frequency_removal", frequency=frequency)
+        inside = np.abs(azimuth(found.original)) < 22
+        gone = np.zeros(len(found.original), bool)
+        gone[cloud_truth(found, start_ns=0)["removed"]] = True
+        arrive = HDL.sensor.max_range / (METRES_PER_NS * 1e3 / frequency)
+        assert gone[inside].mean() == pytest.approx(1 - (1 - 0.5**bits) ** arrive, abs=0.05)
 
 
 def test_a_device_behind_a_wall_does_nothing():

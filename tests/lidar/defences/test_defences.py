@@ -1,6 +1,7 @@
 """Defences on frames with forged cars and missing returns, against the same frames as they were measured."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,12 +17,17 @@ from lidar.defences.observation import Navigation, Picture
 from lidar.defences.occlusion import Occlusion
 from lidar.defences.overlay import Overlay, projected
 from lidar.defences.physics import Physics
+from lidar.defences.registry import read_defences
+from lidar.defences.run import able
 from lidar.defences.shadow import Shadow
 from lidar.defences.statistical import Statistical
 from lidar.defences.temporal import Temporal
+from lidar.defences.timing import Timing
 from lidar.defences.void import Void
+from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.physics.settings import LEVELS
+from lidar.physics.pulse_identity import METRES_PER_NS
+from lidar.physics.settings import LEVELS, PLAIN
 from lidar.rig.specs import CameraSpec
 
 STREET = (
@@ -70,6 +76,49 @@ def test_a_car_that_stops_every_ray_is_beyond_occlusion_and_shadow(frame):
     attacked, forged = with_car(frame, (9.0, 4.0, -0.98), points=10**6, noise=0.0, window=np.pi)
     for defence in (Occlusion(), Shadow()):
         assert split(attacked, forged, judged(defence, attacked).objects)[0] < 0.3
+
+
+def scattered(frame, delay):
+    """A forged car whose ranges scatter as by random delays: c J / (2 sqrt 12), 0.43 m at 10 ns."""
+    spread = METRES_PER_NS * delay / np.sqrt(12)
+    return with_car(frame, (9.0, 4.0, -0.98), points=400, noise=spread, window=np.pi)
+
+
+def test_objects_whose_ranges_scatter_by_random_firing_delays_stand_out(frame):
+    attacked, forged = scattered(frame, 5.0)
+    verdict = judged(Timing(), attacked)
+    fake, genuine = split(attacked, forged, verdict.objects)
+    assert fake > 0.5 > 100 * genuine
+    assert verdict.frame == fake
+    assert judged(Timing(), frame).frame < 0.01
+
+
+@pytest.mark.parametrize("delay", [10.0, 100.0])
+def test_returns_whose_ranges_scatter_by_random_firing_delays_stand_out(frame, delay):
+    """Scattered over 1.5 m and 15 m they are no object any more."""
+    attacked, forged = scattered(frame, delay)
+    returns = judged(Timing(), attacked).returns
+    assert returns[forged].mean() > 0.9
+    assert returns[~forged].mean() < 0.01
+
+
+def test_timing_measures_the_range_noise_of_the_scanner():
+    """A scatter of the noise alone has the suspicion of the ratio 1."""
+    settings = replace(PLAIN, range_noise="signal")
+    noisy = observed(world(*STREET), settings=settings)[0]
+    defence = Timing()
+    wall = np.abs(noisy.xyz[:, 1] - 12) < 0.2
+    assert np.median(judged(defence, noisy).returns[wall]) == pytest.approx(
+        1 / (1 + defence.half**2), rel=0.2
+    )
+
+
+def test_timing_needs_a_scanner_that_fires_at_random_times(frame):
+    scans = SimpleNamespace(sensor=frame.sensor, dataset=SimpleNamespace(path="drive"))
+    with pytest.raises(InputError, match="timing: needs random firing times, and top of drive has none"):
+        able([scans], read_defences(["timing"]))
+    guarded = SimpleNamespace(sensor=replace(frame.sensor, firing_jitter_ns=10.0), dataset=scans.dataset)
+    assert able([guarded], read_defences(["timing"]))
 
 
 def test_a_void_is_where_a_car_was_removed(frame):

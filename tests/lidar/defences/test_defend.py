@@ -29,6 +29,7 @@ name = "small"
 name = "top"
 preset = "vlp16"
 translation = [1.2, 0.0, 1.9]
+firing_jitter_ns = 10.0
 [[camera]]
 name = "front"
 translation = [1.6, 0.0, 1.5]

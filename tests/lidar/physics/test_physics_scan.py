@@ -1,5 +1,6 @@
 """Each physical setting in the returns of a scanner."""
 
+from dataclasses import replace
 from math import erfc
 
 import numpy as np
@@ -153,6 +154,15 @@ def test_interference_grows_with_the_number_of_other_scanners():
     pulses = len(firings(load_sensor("vlp16"), 0))
     assert few == pytest.approx(pulses * 100 * 5e-5, rel=0.4)
     assert many == pytest.approx(pulses * (1 - (1 - 5e-5) ** 1000), rel=0.15)
+
+
+def test_coded_pulses_keep_other_scanners_out():
+    nothing = world(box((500, 500, 500), (501, 501, 501)))
+    coded = replace(load_sensor("vlp16"), code_bits=3)
+    settings = ScannerSettings(interference=1000)
+    found = scan(coded, HERE, trajectory=STILL, world=nothing, frame=0, seed=1, settings=settings)
+    heard = len(firings(coded, 0)) * (1 - (1 - 5e-5) ** 1000)
+    assert len(found) == pytest.approx(heard / 8, rel=0.25)
 
 
 def edge(depth):

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidar.dataset.metadata import calibration
 from lidar.errors import RigError
+from lidar.rig.devices import scanners
 from lidar.rig.scanner import load_sensor, sensor_names
 from lidar.rig.specs import load_rig, rig_digest, rig_names
 
@@ -221,6 +223,25 @@ def test_a_mistake_in_a_sensor_is_named_with_file_line_and_key(tmp_path, change,
         assert word in message
     if "missing" not in words:
         assert f"line {line}" in message
+
+
+def test_a_rig_states_random_delays_and_codes_of_its_pulses(tmp_path):
+    rig = tmp_path / "rig.toml"
+    text = 'name = "a"\n[[lidar]]\nname = "top"\npreset = "vlp16"\ntranslation = [0.0, 0.0, 2.0]\n'
+    rig.write_text(text + "firing_jitter_ns = 100.0\ncode_bits = 8\n")
+    guarded = load_rig(rig)
+    (scanner,) = scanners(guarded)
+    assert (scanner.sensor.firing_jitter_ns, scanner.sensor.code_bits) == (100.0, 8)
+    stated = calibration(guarded, [scanner])["sensors"]["top"]
+    assert (stated["firing_jitter_ns"], stated["code_bits"]) == (100.0, 8)
+    digest = rig_digest(rig)
+    rig.write_text(text)
+    assert rig_digest(rig) != digest
+    plain = load_rig(rig)
+    assert not {"firing_jitter_ns", "code_bits"} & set(calibration(plain, scanners(plain))["sensors"]["top"])
+    rig.write_text(text + "code_bits = 65\n")
+    with pytest.raises(RigError, match=r"code_bits"):
+        load_rig(rig)
 
 
 def test_an_unsupported_rate_or_return_mode_is_refused():
