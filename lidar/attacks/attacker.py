@@ -150,7 +150,8 @@ class Attacker(Stage):
         )
         if not len(row):
             return None
-        power = self.power * (POWER_AT / distance[row]) ** 2
+        clear = 1.0 if at.clearness is None else at.clearness(nearest, float(distance[nearest]))
+        power = self.power * clear * (POWER_AT / distance[row]) ** 2
         return Aim(row, azimuth[row], distance[row], power)
 
     def may_reach(self, at: Situation) -> bool:

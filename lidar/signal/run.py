@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -67,21 +68,32 @@ def altered_sweep(sweep: Sweep, stages: Stages, *, at: Situation) -> Altered:
     before = stages.at("echoes", at.sensor)
     if before:
         pulses = pulses_of(sweep.sensor, sweep.sent)
-        echoes = altered_echoes(pulses, echoes, stages=stages, at=at)
+        echoes = altered_echoes(pulses, echoes, stages=stages, at=at, extinction=sweep.settings.extinction)
         last = detect(sweep, echoes, deviates=noise.again)
     reported, unaltered = cast("TracedEchoes", last.echoes), cast("TracedEchoes", first.echoes)
     cloud = linked(report(sweep, last) if before else original, reported, first=unaltered)
     return Altered(altered_cloud(cloud, stages, at=at), original)
 
 
-def altered_echoes(pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, at: Situation) -> TracedEchoes:
+def altered_echoes(
+    pulses: Pulses, echoes: TracedEchoes, *, stages: Stages, at: Situation, extinction: float = 0.0
+) -> TracedEchoes:
     """Echoes after the stages on them, sorted by pulse and range.
 
     Echoes within the sensor's echo separation are merged in pulses that have added or moved ones.
+
+    extinction : of the air, 1/m one way, beside that of the stages
     """
-    for named in stages.at("echoes", at.sensor):
+    acting = stages.at("echoes", at.sensor)
+
+    def clearness(row: int, distance: float) -> float:
+        shares = [one.stage.clearness(pulses, row, distance=distance, at=at) for one in acting]
+        return math.exp(-extinction * distance) * math.prod(shares)
+
+    situation = replace(at, clearness=clearness)
+    for named in acting:
         stage, rng = cast("EchoStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame)
-        echoes = stage.echoes(pulses, echoes, at=at, rng=rng)
+        echoes = stage.echoes(pulses, echoes, at=situation, rng=rng)
         if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
             raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)

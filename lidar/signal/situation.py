@@ -28,6 +28,8 @@ class Situation:
     utc      : of the drive's start; None for clouds without a dataset
     poses    : of the sensor in the scene frame at times (n,) in nanoseconds since the drive's start; None for
         clouds without a dataset
+    clearness : share of the light from elsewhere that reaches the sensor along a pulse (row) from a distance
+        in metres, through the stages' weather; None in clear air
     geo      : from degrees to the scene frame; None for clouds without a dataset
     world    : what rays hit; None for recorded data
     seed     : of the drive, for what lasts longer than a frame
@@ -49,3 +51,4 @@ class Situation:
     light: Light | None = None
     earlier: Callable[[int], Cloud | None] | None = None
     geo: Frame | None = None
+    clearness: Callable[[int, float], float] | None = None

@@ -77,6 +77,11 @@ class Stage:
         """Seconds before a frame whose clouds the stage asks `Situation.earlier` for."""
         return 0.0
 
+    def clearness(self, pulses: Pulses, row: int, *, distance: float, at: Situation) -> float:
+        """Share of light that reaches the sensor through the stage's air, one way, along a pulse (row)."""
+        del pulses, row, distance, at
+        return 1.0
+
 
 def _fault(declared: Any, value: Any) -> str:
     """What is wrong with the value of a parameter; empty if nothing is."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 from lidar.weather.air import through_air
 from lidar.weather.camera import weathered
-from lidar.weather.fields import field_of, spray_extinction
+from lidar.weather.fields import amounts, field_of, rays_of, spray_extinction
 from lidar.weather.glass import dazzled, through_glass
 from lidar.weather.media import Medium, medium_of, spray
 from lidar.weather.setting import WeatherSetting
@@ -41,6 +42,19 @@ class Weather(WeatherSetting):
         if self.sunlight:
             echoes = dazzled(pulses, echoes, sunlight=self.sunlight, at=at, rng=rng)
         return echoes
+
+    def clearness(self, pulses: Pulses, row: int, *, distance: float, at: Situation) -> float:
+        """Share of light that passes the medium from a distance along a pulse to the sensor."""
+        amount = self.amount_at(at.start_ns / 1e9)
+        if amount is None:
+            return 1.0
+        medium = self._medium(pulses.sensor.wavelength_nm, amount=amount)
+        column = distance
+        if medium.extinction > 0 and (field := field_of(self, pulses.sensor, at=at)) is not None:
+            one = slice(row, row + 1)
+            way = rays_of(pulses.origin[one], pulses.direction[one], time_ns=pulses.time_ns[one], at=at)
+            column = float(amounts(field, way, pulse=np.zeros(1, int), distance=np.array([distance]))[1][0])
+        return math.exp(-medium.extinction * column)
 
     def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
         """The image that the camera takes."""

@@ -20,9 +20,11 @@ from lidar.physics.settings import LEVELS, PLAIN
 from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.scan import cast
 from lidar.signal.recorded import altered_recording
-from lidar.signal.registry import Stages, read_attacks, read_stage, stages_of
+from lidar.signal.registry import NamedStage, Stages, read_attacks, read_stage, stages_of
 from lidar.signal.run import altered_sweep, cloud_truth
 from lidar.signal.situation import Situation
+from lidar.signal.stage import Stage
+from lidar.weather.media import medium_of
 
 ROOF = Mount((1.2, 0.0, 1.9))
 GEO = Frame.at(9.5, 47.1)
@@ -187,6 +189,34 @@ def test_prepared_pulses_have_the_code_by_chance(bits):
     plain, coded = (added(attacked(guarded(VLP, code_bits=k), **WALL)) for k in (0, bits))
     low, high = stats.binom(len(plain), 0.5**bits).interval(0.9999)
     assert low <= len(coded) <= high
+
+
+@pytest.mark.parametrize(
+    ("place", "column"), [({}, 20.0), ({"radius": 12.0}, 12.0)], ids=["everywhere", "around"]
+)
+def test_weather_dims_the_light_of_a_device_once_on_its_way(place, column):
+    """Beer-Lambert over the 20 m to the device, or the part of them that lies in the fog."""
+    device = read_stage({"name": "inject", "distance": 20.0, "range": 12.0, "power": 1e4}).stage
+    seen = []
+
+    class Probe(Stage):
+        def echoes(self, pulses, echoes, *, at, rng):
+            del rng
+            seen.append(device.aim(pulses, echoes, at=at).power.max())
+            return echoes
+
+    here = situation(HDL)
+    lat, lon, _ = place_of((*here.poses(np.array([here.start_ns])).position[0, :2], 0.0))
+    centre = {"latitude": lat, "longitude": lon} if place else {}
+    fog = read_stage({"name": "weather", "kind": "fog", "amount": 50.0, **place, **centre})
+    for settings, stages in ((PLAIN, ()), (PLAIN, (fog,)), (replace(PLAIN, extinction=0.02), ())):
+        sweep = replace(HDL, settings=settings)
+        altered_sweep(sweep, Stages((*stages, NamedStage("probe", Probe())), 5), at=here)
+    clear, dim, hazy = seen
+    medium = medium_of("fog", 50.0, wavelength_nm=HDL.sensor.wavelength_nm, medium=fog.stage.medium)
+    assert clear == pytest.approx(1e4 / 4)
+    assert dim / clear == pytest.approx(np.exp(-medium.extinction * column), rel=0.05)
+    assert hazy / clear == pytest.approx(np.exp(-0.02 * 20))
 
 
 def test_a_relay_has_the_sensors_own_time_and_code():
