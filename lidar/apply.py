@@ -27,7 +27,7 @@ from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file, remove_dataset
 from lidar.dataset.navigation_files import read_fixes, read_samples, record_fixes, record_samples
-from lidar.dataset.record_clouds import write_clouds
+from lidar.dataset.record_clouds import sent_pulses, write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Contents, Recording
 from lidar.dataset.situations import situation_of, situation_of_unit
@@ -35,19 +35,20 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import ApplyOptions, with_stage_settings
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
-from lidar.rig.scanner import Sensor, firings, load_sensor
+from lidar.rig.scanner import Sensor, load_sensor
 from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
 from lidar.signal.recorded import altered_recording, recorded_echoes
+from lidar.signal.recorded_pulses import completed
 from lidar.signal.registry import NO_STAGES, NamedStage, Stages
 from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES
 
 _KITTI, _NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
-_SENSORS = {"kitti": "hdl64e_s3", "nuscenes": "hdl32e"}
-"""Presets of the scanners that recorded these datasets."""
+_SENSORS = {"kitti": "hdl64e_s2", "nuscenes": "hdl32e"}
+"""Presets of the scanners that recorded these datasets; KITTI's takes 1.3 million points/s (Geiger 2013)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +192,8 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
         formats, labels = tuple(recipe["formats"]), tuple(recipe["labels"])
         contents = Contents(formats, labels, recipe["deskew"], seed, *settings, stages)
         crs = export_crs(dataset.frame, recipe["crs"])
+        on = dataset.manifest.get("scanners_on_ns")
+        scanning_ns = None if on is None else np.array(on, np.int64).reshape(-1, 2)
     return Recording(
         out,
         dataset.frame,
@@ -198,6 +201,7 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
         start=dataset.start,
         geo=Georeference(dataset.frame, crs, exact=bool(recipe.get("exact"))),
         contents=contents,
+        scanning_ns=scanning_ns,
     )
 
 
@@ -280,7 +284,14 @@ def _apply_to_frame(
 
     threshold = contents.scanner.link or contents.scanner.detection
     at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
-    altered = altered_recording(recorded, contents.stages, sensor=scanner.sensor, at=at, threshold=threshold)
+    altered = altered_recording(
+        recorded,
+        contents.stages,
+        sensor=scanner.sensor,
+        at=at,
+        threshold=threshold,
+        sent=sent_pulses(recording, scanner, frame=frame) if "column" in form.columns else None,
+    )
     truth = cloud_truth(altered, start_ns=scanner.frame_start_ns(frame))
     write_altered(
         altered, truth, dataset=dataset, recording=recording, form=form, scanner=scanner, frame=frame
@@ -337,7 +348,7 @@ def recorded_cloud(
     """A cloud of a dataset."""
     path = replace(recording, out=dataset.path).paths(scanner, frame)[form.name]
     cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(frame))
-    return _completed(cloud, scanner.sensor, columns=form.columns)
+    return completed(cloud, scanner.sensor, columns=form.columns)
 
 
 def _check_sight(
@@ -351,7 +362,8 @@ def _check_sight(
 
     def seen(scanner: Scanner, at: Situation) -> Seen:
         cloud = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=int(at.frame))
-        return (*recorded_echoes(cloud, scanner.sensor), at)
+        sent = sent_pulses(recording, scanner, frame=int(at.frame)) if "column" in form.columns else None
+        return (*recorded_echoes(cloud, scanner.sensor, sent=sent), at)
 
     places = (
         (device, situation_of(recording, device, frame=frame))
@@ -439,7 +451,7 @@ def _apply_to_clouds(
         recorded = read_foreign(path, form, device=device)
         frame = int(stem) if stem.isdigit() else stem
         at = Situation(device.name, frame, earlier=_Former(clouds, done, device=device).cloud)
-        altered = altered_recording(recorded, chosen, sensor=device, at=at)
+        altered = altered_recording(recorded, chosen, sensor=device, at=at, sent=None)
         for target in (out / place, out / "truth" / place):
             target.parent.mkdir(parents=True, exist_ok=True)
         form.write(out / place, cloud_table(altered.cloud))
@@ -455,12 +467,12 @@ def _apply_to_clouds(
 def _place_of(path: Path, form: Format, *, device: Sensor) -> tuple[Situation, Callable[[], Seen]]:
     """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
     at = Situation(device.name, path.name)
-    return at, lambda: (*recorded_echoes(read_foreign(path, form, device=device), device), at)
+    return at, lambda: (*recorded_echoes(read_foreign(path, form, device=device), device, sent=None), at)
 
 
 def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
     """A point cloud of KITTI or nuScenes."""
-    return _completed(table_cloud(form.read(path)), device, columns=form.columns)
+    return completed(table_cloud(form.read(path)), device, columns=form.columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -491,35 +503,3 @@ def select_labels(path: Path, out: Path, *, altered: Altered) -> None:
         raise DatasetError(f"{path}: {len(codes) - 1} labels for {len(altered.original)} points")
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_bytes(codes[altered.cloud.source].astype("<u4").tobytes())
-
-
-def _completed(cloud: Cloud, sensor: Sensor, *, columns: tuple[str, ...]) -> Cloud:
-    """A cloud with ring, column and time, derived from the points' directions if its format lacks them."""
-    if "column" in columns:
-        return cloud
-    pulses = firings(sensor, 0)
-    azimuth = np.arctan2(pulses.direction[:, 1], pulses.direction[:, 0])
-    own = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])
-    bottom = pulses.ring == 0
-    column, time_ns = pulses.column[bottom], pulses.time_ns[bottom]
-    nearest = _nearest(azimuth[bottom], own, period=2 * np.pi)
-    ring = cloud.ring
-    if "ring" not in columns:
-        level = np.hypot(cloud.xyz[:, 0], cloud.xyz[:, 1])
-        elevation = np.zeros(int(pulses.ring.max()) + 1)
-        elevation[pulses.ring] = np.arcsin(pulses.direction[:, 2])
-        ring = _nearest(elevation, np.arctan2(cloud.xyz[:, 2], level)).astype(np.uint16)
-    return replace(
-        cloud, ring=ring, column=column[nearest], time_ns=(time_ns[nearest] - time_ns[0]).astype(np.int32)
-    )
-
-
-def _nearest(known: NDArray[np.floating], wanted: NDArray[np.floating], *, period: float = 0.0) -> Any:
-    """Index (n,) of the nearest of known values; with a period, of angles."""
-    order = np.argsort(known)
-    values = known[order]
-    if period:
-        values = np.concatenate([values[-1:] - period, values, values[:1] + period])
-        order = np.concatenate([order[-1:], order, order[:1]])
-    right = np.clip(np.searchsorted(values, wanted), 1, len(values) - 1)
-    return order[np.where(wanted - values[right - 1] < values[right] - wanted, right - 1, right)]

@@ -483,7 +483,8 @@ def apply(
     """Apply weather, attacks or other stages to recorded data: a dataset, or clouds of KITTI or nuScenes.
 
     Stages before the detector take each recorded return as one echo, with the power that its intensity
-    implies; they add nothing to pulses without a return.
+    implies. Pulses without a return are known of datasets; in clouds of KITTI and nuScenes they fill the gaps
+    between the returns of each ring.
 
     For example:
 

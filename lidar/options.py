@@ -658,7 +658,7 @@ class ApplyOptions:
     lidar stages lists them."""
 
     sensor: str = ""
-    """Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s3 or hdl32e by default."""
+    """Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s2 or hdl32e by default."""
 
     weather: Annotated[WeatherList, _WEATHER] = ()
     """Weather for all sensors: rain=10mm/h, fog=50m (visibility), snow=2mm/h (as water), dust, spray, several

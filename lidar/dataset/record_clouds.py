@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,10 @@ from lidar.dataset.situations import situation_of
 from lidar.errors import LidarError
 from lidar.random_streams import generator
 from lidar.rig.devices import Scanner
+from lidar.rig.patterns.beams import Firings
 from lidar.sensors.cloud import Cloud, TracedCloud, no_returns
 from lidar.sensors.doppler import radial_velocity, surface_velocity
-from lidar.sensors.scan import Sweep, cast, measured
+from lidar.sensors.scan import Sweep, cast, fired, measured
 from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
 from lidar.time_scales import gps_seconds
 from lidar.world.thread_worlds import Worlds
@@ -51,7 +51,7 @@ def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World
         return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
         cloud = measured(_swept(recording, scanner, frame=frame, world=world))
-    return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, cloud))
+    return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, _times(cloud)))
 
 
 def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
@@ -72,7 +72,9 @@ def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worl
     with recording.watch.stage("scan"):
         sweep = _swept(recording, scanner, frame=frame, world=world)
         altered = altered_sweep(sweep, recording.contents.stages, at=at)
-    return altered if recording.scanning_ns is None else altered.where(partial(_while_on, recording))
+    if recording.scanning_ns is None:
+        return altered
+    return altered.where(lambda cloud: _while_on(recording, _times(cloud)))
 
 
 def _check_lookback(recording: Recording, scanner: Scanner, *, frames: int) -> None:
@@ -101,11 +103,16 @@ def _works(recording: Recording, scanner: Scanner, *, frame: int) -> bool:
     return on is None or bool(((on[:, 0] <= end) & (on[:, 1] >= start)).any())
 
 
-def _while_on(recording: Recording, cloud: Cloud) -> NDArray[np.bool_]:
-    """Mask (n,) of returns at times at which scanners work."""
+def sent_pulses(recording: Recording, scanner: Scanner, *, frame: int) -> Firings:
+    """The pulses of a frame, as far as scanners work during it."""
+    sent = fired(scanner.sensor, frame, settings=recording.contents.scanner)
+    return sent if recording.scanning_ns is None else sent.where(_while_on(recording, sent.time_ns))
+
+
+def _while_on(recording: Recording, time_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Mask (n,) of times at which scanners work."""
     on = recording.scanning_ns
     assert on is not None  # noqa: S101
-    time_ns = _times(cloud)
     first = np.searchsorted(on[:, 0], time_ns, side="right") - 1
     return (first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first])
 

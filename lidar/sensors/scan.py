@@ -112,9 +112,7 @@ def cast(
 
     pulses : (k,) ascending rows of the frame's pulses to send; all by default
     """
-    firings = fire(sensor, frame)
-    if settings.poses != "firing":
-        firings = replace(firings, time_ns=_pose_times(firings, settings.poses))
+    firings = fired(sensor, frame, settings=settings)
     if pulses is not None:
         firings = _only(firings, pulses)
     sent = firings
@@ -136,6 +134,14 @@ def cast(
         away = echoes.range + sensor.pattern.range_offset
         echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
     return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
+
+
+def fired(sensor: Sensor, frame: int, *, settings: ScannerSettings) -> Firings:
+    """The pulses of a frame, at the times whose poses they are cast from."""
+    firings = fire(sensor, frame)
+    if settings.poses == "firing":
+        return firings
+    return replace(firings, time_ns=_pose_times(firings, settings.poses))
 
 
 def _pose_times(firings: Firings, poses: str) -> NDArray[np.int64]:

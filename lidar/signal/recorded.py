@@ -11,10 +11,12 @@ from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, Origin, TracedEchoes, numbered, reported, traced
 from lidar.physics.intensity import apparent_of_code, reflectivity_code
 from lidar.physics.range_error import quantised
-from lidar.rig.scanner import Sensor, firings
+from lidar.rig.patterns.beams import Firings, T
+from lidar.rig.scanner import Sensor
 from lidar.sensors.cloud import Cloud
+from lidar.signal.recorded_pulses import recorded_pulses
 from lidar.signal.registry import Stages
-from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked
+from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked, unaltered
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses
 
@@ -24,87 +26,53 @@ _ON_STEP = 0.1  # share of the range's step by which rounded coordinates put a r
 
 
 def altered_recording(
-    cloud: Cloud, stages: Stages, *, sensor: Sensor, at: Situation, threshold: bool = True
+    cloud: Cloud,
+    stages: Stages,
+    *,
+    sensor: Sensor,
+    at: Situation,
+    sent: Firings | None,
+    threshold: bool = True,
 ) -> Altered:
     """A recorded cloud after the stages on its echoes and on the cloud itself.
 
-    Each return is one echo, with the power that its intensity and range imply; pulses without a return are
-    unknown, so that echo stages add nothing to them. Ranges get no further noise; new ranges and intensities
-    have the steps of the recorded ones.
+    Each return is one echo, with the power that its intensity and range imply; pulses without a return have
+    none. Ranges get no further noise; new ranges and intensities have the steps of the recorded ones.
 
     sensor    : the scanner that recorded the cloud
+    sent      : the pulses that it fired, by ring and column; None if these are derived from directions. The
+        pulses without a return then fill the gaps of azimuth in each ring; only spinning scanners have any
     threshold : echoes whose power falls to the detection threshold are lost
     """
-    pulses, echoes = recorded_echoes(cloud, sensor)
+    if not stages.at("echoes", at.sensor) or (sent is not None and not len(sent)):
+        return Altered(altered_cloud(unaltered(cloud).cloud, stages, at=at), cloud)
+    pulses, echoes = recorded_echoes(cloud, sensor, sent=sent)
     if threshold:
         least = pulses.apparent(np.full(len(echoes), _SEEN), echoes.range)
         echoes = replace(echoes, apparent=np.maximum(echoes.apparent, least))
-    found, result = echoes, cloud
-    if stages.at("echoes", at.sensor):
-        found = altered_echoes(pulses, echoes, stages=stages, at=at)
-        away = found.range + sensor.pattern.range_offset
-        keep = (found.source >= 0) | ((away >= sensor.min_range) & (away <= sensor.max_range))
-        if threshold:
-            keep &= pulses.received(found) > 1
-        found = found.where(keep)
-        power, (number, count) = pulses.received(found), numbered(found)
-        rows = reported(
-            found, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
-        )
-        # A pulse without added echoes has passed the return mode already.
-        keep = ~np.isin(found.pulse, found.pulse[found.source < 0])
-        keep[rows] = True
-        found, numbers = found.where(keep), (number[keep], count[keep])
-        result = _cloud(cloud, found, pulses=pulses, before=echoes, numbers=numbers)
+    found = altered_echoes(pulses, echoes, stages=stages, at=at)
+    away = found.range + sensor.pattern.range_offset
+    keep = (found.source >= 0) | ((away >= sensor.min_range) & (away <= sensor.max_range))
+    if threshold:
+        keep &= pulses.received(found) > 1
+    found = found.where(keep)
+    power, (number, count) = pulses.received(found), numbered(found)
+    rows = reported(
+        found, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
+    )
+    # A pulse without added echoes has passed the return mode already.
+    keep = ~np.isin(found.pulse, found.pulse[found.source < 0])
+    keep[rows] = True
+    found, numbers = found.where(keep), (number[keep], count[keep])
+    result = _cloud(cloud, found, pulses=pulses, before=echoes, numbers=numbers)
     linked_cloud = linked(result, found, first=echoes)
     return Altered(altered_cloud(linked_cloud, stages, at=at), cloud)
 
 
-def recorded_echoes(cloud: Cloud, sensor: Sensor) -> tuple[Pulses, TracedEchoes]:
-    """The pulses of a recorded cloud's returns, and these as their echoes."""
-    pulse = _pulse_rows(cloud)
-    return _pulses(cloud, sensor, pulse=pulse), _echoes(cloud, sensor, pulse=pulse)
-
-
-def _pulse_rows(cloud: Cloud) -> NDArray[np.int32]:
-    """Pulse (n,) of each return; returns of one pulse follow each other."""
-    if cloud.echoes.max(initial=1) == 1:
-        return np.arange(len(cloud), dtype=np.int32)
-    same = np.ones(len(cloud), bool)
-    for column in (cloud.time_ns, cloud.ring, cloud.column):
-        same &= np.diff(column.astype(np.int64), prepend=-1) == 0
-    return (np.cumsum(~same) - 1).astype(np.int32)
-
-
-def _pulses(cloud: Cloud, sensor: Sensor, *, pulse: NDArray[np.int32]) -> Pulses:
-    first = np.flatnonzero(np.diff(pulse, prepend=-1))
-    origin = _origins(cloud, sensor)[first]
-    xyz = cloud.xyz[first] - origin
-    return Pulses(
-        sensor,
-        cloud.start_ns + cloud.time_ns[first].astype(np.int64),
-        xyz / np.maximum(np.linalg.norm(xyz, axis=1, keepdims=True), 1e-9),
-        origin,
-        cloud.ring[first],
-        cloud.column[first],
-        cloud.ring[first],
-        np.ones(len(first)),
-    )
-
-
-def _origins(cloud: Cloud, sensor: Sensor) -> Float:
-    """Where the beam of each return (n, 3) starts in the sensor frame, by its ring and column."""
-    sent = firings(sensor, 0)
-    if not sent.origin.any():
-        return np.zeros((len(cloud), 3))
-    width = int(sent.column.max()) + 1
-    row = np.zeros(width * (int(sent.ring.max()) + 1), np.int64)
-    row[sent.ring.astype(np.int64) * width + sent.column] = np.arange(len(sent))
-    # The first and last firing block of a frame may be incomplete; their neighbours start within 1 mm.
-    column = np.clip(cloud.column, min(1, width - 1), max(width - 2, 0))
-    ring = np.minimum(cloud.ring, sent.ring.max()).astype(np.int64)
-    found: Float = sent.origin[row[ring * width + column]]
-    return found
+def recorded_echoes(cloud: Cloud, sensor: Sensor, *, sent: Firings | None) -> tuple[Pulses, TracedEchoes]:
+    """The pulses of a recorded frame, and its returns as their echoes; ``sent`` as of `altered_recording`."""
+    pulses, pulse = recorded_pulses(cloud, sensor, sent=sent)
+    return pulses, _echoes(cloud, sensor, pulse=pulse)
 
 
 def _echoes(cloud: Cloud, sensor: Sensor, *, pulse: NDArray[np.int32]) -> TracedEchoes:
@@ -131,32 +99,43 @@ def _cloud(
     numbers: tuple[NDArray[np.uint8], NDArray[np.uint8]],
 ) -> Cloud:
     """The cloud of echoes that are reported; columns of echoes that did not change stay as they are."""
-    sensor, first = pulses.sensor, np.flatnonzero(np.diff(before.pulse, prepend=-1))
-    is_known = echoes.source >= 0
+    sensor, is_known = pulses.sensor, echoes.source >= 0
+    first = np.full(len(pulses), len(cloud))  # past the last one for pulses without a return
+    first[before.pulse[::-1]] = np.arange(len(cloud))[::-1]
     row = np.where(is_known, echoes.source, first[echoes.pulse])
-    xyz, old = cloud.xyz[row].astype(np.float64), cloud.range[row]
+    direction = pulses.direction[echoes.pulse]
+    near = pulses.origin[echoes.pulse] - sensor.pattern.range_offset * direction
+    xyz = np.where((row < len(cloud))[:, None], _at(cloud.xyz, row), near).astype(np.float64)
+    old = _at(cloud.range, row)
     distance = echoes.range + sensor.pattern.range_offset
-    moved = ~is_known | (echoes.range != before.range[row])
+    moved = ~is_known | (echoes.range != _at(before.range, row))
     distance = np.where(moved, _stepped(distance, cloud.range, step=sensor.range_quantum), old)
-    xyz += (distance - old)[:, None] * pulses.direction[echoes.pulse]
-    brighter = ~is_known | (echoes.apparent != before.apparent[row])
+    xyz += (distance - old)[:, None] * direction
+    brighter = ~is_known | (echoes.apparent != _at(before.apparent, row))
     code = _coded(reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code), cloud.intensity)
     number, count = numbers
     return replace(
         cloud,
         xyz=xyz.astype(np.float32),
-        time_ns=cloud.time_ns[row],
-        ring=cloud.ring[row],
-        column=cloud.column[row],
+        time_ns=(pulses.time_ns[echoes.pulse] - cloud.start_ns).astype(np.int32),
+        ring=pulses.ring[echoes.pulse],
+        column=pulses.column[echoes.pulse],
         range=distance,
-        intensity=np.where(brighter, code, cloud.intensity[row]),
+        intensity=np.where(brighter, code, _at(cloud.intensity, row)),
         klass=echoes.klass,
         feature=echoes.feature,
-        incidence=np.where(is_known, cloud.incidence[row], np.float32(0)),
-        true_range=np.where(is_known, cloud.true_range[row], 0.0),
-        echo=np.where(is_known, cloud.echo[row], number),
-        echoes=np.where(is_known, cloud.echoes[row], count),
+        incidence=np.where(is_known, _at(cloud.incidence, row), np.float32(0)),
+        true_range=np.where(is_known, _at(cloud.true_range, row), 0.0),
+        echo=np.where(is_known, _at(cloud.echo, row), number),
+        echoes=np.where(is_known, _at(cloud.echoes, row), count),
     )
+
+
+def _at(column: NDArray[T], row: NDArray[np.integer]) -> NDArray[T]:
+    """Rows of a column; 0 for the one past the last."""
+    padded: NDArray[T] = np.concatenate([column, np.zeros((1, *column.shape[1:]), column.dtype)])
+    found: NDArray[T] = padded[row]
+    return found
 
 
 def _stepped(distance: Float, recorded: Float, *, step: float) -> Float:

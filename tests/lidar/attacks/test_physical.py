@@ -326,11 +326,11 @@ def test_recorded_clouds_tell_what_stands_before_the_device():
     sensor, cloud = VLP.sensor, recorded(VLP)
     for distance, seen in ((20.0, True), (60.0, False)):
         stages = stages_of([{"name": "inject", "shape": "random", "distance": distance}], seed=5)
-        found = altered_recording(cloud, stages, sensor=sensor, at=Situation("vlp16", 2))
+        found = altered_recording(cloud, stages, sensor=sensor, at=Situation("vlp16", 2), sent=VLP.firings)
         assert bool(len(added(found))) is seen
     fixed = stages_of([{"name": "inject", "place": "47.1,9.5,2"}])
     with pytest.raises(InputError, match="give `bearing` and `distance`"):
-        altered_recording(cloud, fixed, sensor=sensor, at=Situation("vlp16", 2))
+        altered_recording(cloud, fixed, sensor=sensor, at=Situation("vlp16", 2), sent=VLP.firings)
 
 
 def test_replay_sends_an_earlier_frame():
@@ -370,7 +370,8 @@ def test_no_column_gives_injected_returns_away(table, on):
         if on == "rounded recording":
             cloud = replace(cloud, intensity=np.round(cloud.intensity))
         at = Situation("hdl64e_s3", 2, earlier=lambda _: earlier)
-        found = altered_recording(cloud, stages, sensor=sweep.sensor, at=at)
+        sent = sweep.firings if on == "recording" else None
+        found = altered_recording(cloud, stages, sensor=sweep.sensor, at=at, sent=sent)
     cloud, fake = found.cloud, found.cloud.source < 0
     assert fake.sum() > 20
     for column in cloud.columns().values():
@@ -448,7 +449,7 @@ def test_truth_of_every_example_is_the_original_cloud(path, on):
         found = altered_sweep(VLP, stages, at=situation(VLP, earlier=lambda _: original))
     else:
         at = Situation("vlp16", 2, earlier=lambda _: original)
-        found = altered_recording(original, stages, sensor=VLP.sensor, at=at)
+        found = altered_recording(original, stages, sensor=VLP.sensor, at=at, sent=VLP.firings)
     truth = cloud_truth(found, start_ns=0)
     kept = truth["source"][truth["source"] >= 0]
     rows = np.sort(np.concatenate([kept, truth["removed"]]))

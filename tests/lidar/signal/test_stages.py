@@ -14,7 +14,7 @@ from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.physics.echoes import Origin, joined
 from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
-from lidar.rig.scanner import load_sensor
+from lidar.rig.scanner import firings, load_sensor
 from lidar.sensors.cloud import Cloud
 from lidar.sensors.scan import cast, scan
 from lidar.signal.dropped_packets import DroppedPackets
@@ -304,11 +304,13 @@ def test_every_listed_stage_is_documented():
 
 @pytest.mark.parametrize("effects", [PLAIN, NOISY])
 @pytest.mark.parametrize("mode", ["strongest", "dual"])
-def test_recorded_clouds_stay_the_same_without_an_effect(effects, mode):
+@pytest.mark.parametrize("known", [True, False])
+def test_recorded_clouds_stay_the_same_without_an_effect(effects, mode, known):
     recorded = plain(effects, return_mode=mode)
     sensor = load_sensor("vlp16", return_mode=mode)
     idle = read_stages(["cover_glass:transmission=1", "dropped_packets:loss=0"])
-    found = altered_recording(recorded, idle, sensor=sensor, at=Situation(sensor.name, 2))
+    sent = firings(sensor, 2) if known else None
+    found = altered_recording(recorded, idle, sensor=sensor, at=Situation(sensor.name, 2), sent=sent)
     assert_same(found.cloud, recorded)
     assert np.array_equal(found.cloud.source, np.arange(len(recorded)))
 
@@ -317,7 +319,7 @@ def test_dropped_packets_of_a_recorded_cloud_are_those_of_the_drive():
     stages = read_stages(["dropped_packets:loss=0.3,burst=4"], seed=5)
     driven_cloud = altered(SWEPT, stages).cloud
     recorded = altered_recording(
-        PLAIN_CLOUD, stages, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2)
+        PLAIN_CLOUD, stages, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2), sent=SWEPT.firings
     ).cloud
     assert_same(recorded, driven_cloud)
     assert np.array_equal(recorded.source, driven_cloud.source)
@@ -327,17 +329,27 @@ def test_echo_stages_treat_recorded_returns_as_echoes():
     effects = ScannerSettings(link=True)
     glass = read_stages(["cover_glass:transmission=0.5"])
     simulated = altered(swept(effects), glass)
-    recorded = altered_recording(plain(effects), glass, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2))
+    recorded = altered_recording(
+        plain(effects), glass, sensor=load_sensor("vlp16"), at=Situation("vlp16", 2), sent=SWEPT.firings
+    )
     assert np.array_equal(recorded.cloud.source, simulated.cloud.source)
     assert recorded.cloud.intensity == pytest.approx(simulated.cloud.intensity, rel=1e-4)
     assert np.array_equal(recorded.cloud.xyz, simulated.cloud.xyz)
     near = altered_recording(
-        PLAIN_CLOUD, chain(Injected(3.0)), sensor=load_sensor("vlp16"), at=Situation("vlp16", 2)
+        PLAIN_CLOUD,
+        chain(Injected(3.0)),
+        sensor=load_sensor("vlp16"),
+        at=Situation("vlp16", 2),
+        sent=SWEPT.firings,
     )
     injected = near.cloud.origin == Origin.INJECTED
     assert injected.sum() > 5000
     assert np.linalg.norm(near.cloud.xyz[injected], axis=1) == pytest.approx(3.0, abs=0.1)
-    assert (near.cloud.hidden[injected] >= 0).all()
+    drive = altered(SWEPT, chain(Injected(3.0))).cloud
+    assert injected.sum() == (drive.origin == Origin.INJECTED).sum() > len(PLAIN_CLOUD)
+    for name in ("ring", "column", "time_ns", "origin", "source", "hidden", "echo", "echoes"):
+        assert np.array_equal(getattr(near.cloud, name), getattr(drive, name)), name
+    assert near.cloud.xyz == pytest.approx(drive.xyz, abs=1e-3)
 
 
 def test_a_rule_selects_returns_of_both_clouds():

@@ -223,10 +223,26 @@ def test_a_pulse_of_no_length_sees_the_lidar_equation():
     assert soft.power[-1] == pytest.approx(np.pi * medium.backscatter * length * white[0], rel=0.05)
 
 
-def test_weather_on_recorded_clouds_leaves_what_it_cannot_know():
-    original = altered(SWEEP, "clear").original
-    stages = stages_of([s.table() for s in read_weather("snow=5")])
+@pytest.mark.parametrize("weather", ["snow=5", "fog=20", "rain=25"])
+def test_weather_on_recorded_clouds_is_that_of_the_drive(weather):
+    """Where the sensor saw sky, too."""
+    simulated = altered(SWEEP, weather)
+    original = simulated.original
+    stages = stages_of([s.table() for s in read_weather(weather)])
     at = Situation(SWEEP.sensor.name, 2)
-    found = altered_recording(original, stages, sensor=SWEEP.sensor, at=at).cloud
-    assert 0 < np.sum(found.origin == Origin.WEATHER) < len(original)
-    assert len(found) <= len(original)
+    found = altered_recording(original, stages, sensor=SWEEP.sensor, at=at, sent=SWEEP.firings).cloud
+    cloud = simulated.cloud
+    for origin in (Origin.SURFACE, Origin.WEATHER):
+        counts = [np.sum(one.origin == origin) for one in (found, cloud)]
+        assert counts[0] == pytest.approx(counts[1], rel=0.02, abs=20)
+    known = places(original)
+    weather_before_sky = [
+        np.sum(one.origin[~np.isin(places(one), known)] == Origin.WEATHER) for one in (found, cloud)
+    ]
+    assert weather_before_sky[0] == pytest.approx(weather_before_sky[1], rel=0.05, abs=20)
+    if weather == "snow=5":
+        assert weather_before_sky[0] > 1000
+
+
+def places(cloud):
+    return cloud.column.astype(int) * 1000 + cloud.ring
