@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,7 +93,9 @@ class Attacker(Stage):
     and a height from it.
     """
 
-    place: str = parameter("", "LAT,LON,HEIGHT: degrees, and metres of the scene; empty: moves along")
+    place: str = parameter(
+        "", "LAT,LON,HEIGHT: degrees, and metres above the ground there; empty: moves along"
+    )
     bearing: float = parameter(0.0, "without place: degrees from forward to the left", low=-360, high=360)
     distance: float = parameter(10.0, "without place: metres from the sensor", low=0.5, high=500)
     height: float = parameter(0.0, "without place: metres above the sensor", low=-50, high=50)
@@ -184,14 +188,10 @@ class Attacker(Stage):
             return np.tile([level * np.cos(angle), level * np.sin(angle), self.height], (len(time_ns), 1))
         if at.poses is None or at.geo is None:
             raise InputError("`place` needs a dataset with poses; give `bearing` and `distance` instead")
+        point = point_of(self.place, geo=at.geo, at=at)
         knots = np.unique(np.linspace(time_ns[0], time_ns[-1], _KNOTS).astype(np.int64))
-        vectors = in_body(at.poses(knots), point=self._point(at.geo))
+        vectors = in_body(at.poses(knots), point=point)
         return np.stack([np.interp(time_ns, knots, column) for column in vectors.T], axis=1)
-
-    def _point(self, geo: Frame) -> Float:
-        lat, lon, height = degrees_of(self.place)
-        x, y = geo.from_geographic(lon, lat)
-        return np.array([float(x), float(y), height])
 
     def _in_sight(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, row: int, towards: Float
@@ -267,6 +267,21 @@ def degrees_of(place: str) -> tuple[float, float, float]:
     if not (abs(lat) <= 90 and abs(lon) <= 180 and abs(height) < 1e4):
         raise InputError(f"place = {place!r} is not LAT,LON,HEIGHT in degrees and metres")
     return lat, lon, height
+
+
+def point_of(place: str, *, geo: Frame, at: Situation) -> Float:
+    """The point (3,) in the scene frame of a place as `degrees_of` reads it, its height above the ground."""
+    lat, lon, height = degrees_of(place)
+    x, y = (float(axis) for axis in geo.from_geographic(lon, lat))
+    return np.array([x, y, height + (0.0 if at.ground is None else at.ground(x, y))])
+
+
+def file_digest(file: str, *, known: str) -> str:
+    """Digest of a file's bytes, empty without a file; raises InputError if another one is known."""
+    found = hashlib.blake2b(Path(file).read_bytes(), digest_size=6).hexdigest() if file else ""
+    if known and found != known:
+        raise InputError(f"{file}: has changed since the drive (digest {found}, was {known})")
+    return found
 
 
 def in_body(poses: Poses, *, point: Float) -> Float:

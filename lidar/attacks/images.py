@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.attacks.attacker import degrees_of
+from lidar.attacks.attacker import degrees_of, file_digest, point_of
 from lidar.camera.render import Frame
 from lidar.camera.shade import linear_table
 from lidar.errors import InputError
@@ -70,11 +70,14 @@ class Patch(Stage):
     """
 
     file: str = parameter("", "picture (PNG, JPEG); a chequerboard by default")
+    digest: str = parameter("", "of the picture's file, which the program fills in; another one is refused")
     on: str = parameter("image", "pasted on the image, or in the world", among=("image", "world"))
     x: float = parameter(0.5, "of its middle: share of the image's width from the left", low=0, high=1)
     y: float = parameter(0.6, "of its middle: share of the image's height from the top", low=0, high=1)
     size: float = parameter(0.2, "share of the image's width that it covers", low=0.001, high=1)
-    place: str = parameter("", "in the world: LAT,LON,HEIGHT of its middle; empty: moves along")
+    place: str = parameter(
+        "", "in the world: LAT,LON,HEIGHT of its middle above the ground; empty: moves along"
+    )
     facing: float = parameter(0.0, "of a place: degrees clockwise from north", low=-360, high=360)
     ahead: float = parameter(10.0, "without place: metres in front of the camera", low=0.2, high=500)
     left: float = parameter(0.0, "without place: metres to its left", low=-500, high=500)
@@ -87,6 +90,7 @@ class Patch(Stage):
         """Validate the parameters; the picture must be readable."""
         super().__post_init__()
         _picture(self.file)
+        object.__setattr__(self, "digest", file_digest(self.file, known=self.digest))
         if self.place:
             degrees_of(self.place)
 
@@ -145,11 +149,9 @@ class Patch(Stage):
             return np.array([-self.left, -self.up, self.ahead]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0])
         if at.poses is None or at.geo is None:
             raise InputError("`place` needs a dataset with poses; give `ahead`, `left` and `up` instead")
-        lat, lon, height = degrees_of(self.place)
-        x, y = at.geo.from_geographic(lon, lat)
         pose = at.poses(np.array([at.start_ns]))
         turn, facing = pose.rotation[0], np.radians(self.facing)
-        middle = (np.array([float(x), float(y), height]) - pose.position[0]) / pose.scale[0]
+        middle = (point_of(self.place, geo=at.geo, at=at) - pose.position[0]) / pose.scale[0]
         right = np.array([-np.cos(facing), np.sin(facing), 0.0])  # seen by who looks against the facing
         return middle @ turn, right @ turn, np.array([0.0, 0.0, 1.0]) @ turn
 

@@ -14,11 +14,12 @@ from geoscene.errors import need
 from geoscene.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
+from lidar.attacks.attacker import file_digest
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.signal.registry import Stages
 from lidar.signal.stage import Stage, parameter
-from lidar.traffic.ground import ground_heights
+from lidar.traffic.ground import ground_height, ground_heights
 from lidar.traffic.populate import first_feature
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, joined
@@ -28,7 +29,6 @@ _CLASSES = (
     *(Class.CYCLIST, Class.PEDESTRIAN, Class.MOTORCYCLIST, Class.TRAFFIC_SIGN, Class.POLE, Class.BOLLARD),
 )
 _KNOT_S = 0.05  # seconds between poses of an object that moves along
-_SKY = 1e4  # metres above and below zero within which the ground is searched
 _LARGEST = 100.0  # metres, longest side of an object
 
 
@@ -62,6 +62,7 @@ class PlacedObject(Stage):
     )
     size: float = parameter(1.0, "factor of the mesh's size", low=1e-4, high=1e4)
     material: str = parameter("metal", "material of all faces", among=(*materials(),))
+    digest: str = parameter("", "of the mesh's file, which the program fills in; another one is refused")
     klass: str = parameter(
         "other_structure", "class in labels", among=tuple(klass.name.lower() for klass in _CLASSES)
     )
@@ -70,6 +71,7 @@ class PlacedObject(Stage):
         """Validate the parameters and read the mesh."""
         super().__post_init__()
         _read_mesh(self.mesh)
+        object.__setattr__(self, "digest", file_digest(self.mesh, known=self.digest))
         if self.place:
             _position(self.place)
 
@@ -127,8 +129,7 @@ class PlacedObject(Stage):
         if self.place:
             lat, lon = _position(self.place)
             x, y = scene.frame.from_geographic(lon, lat)
-            point = np.array([[float(x), float(y), 0.0]])
-            point[:, 2] = ground_heights(scene, point, above=_SKY, below=_SKY)
+            point = np.array([[float(x), float(y), ground_height(scene, x=float(x), y=float(y))]])
             if not np.isfinite(point).all():
                 raise InputError(f"place = {self.place!r} has no ground in the scene")
             return np.zeros(1, np.int64), point, np.array([turn])

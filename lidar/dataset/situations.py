@@ -20,6 +20,7 @@ from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.devices import Camera, Scanner
 from lidar.sensors.cloud import Cloud
 from lidar.signal.situation import Situation
+from lidar.traffic.ground import ground_height
 from lidar.world.world import World
 
 _SUN_NS = 10_000_000_000
@@ -49,6 +50,11 @@ def situation_of(
         return cloud_of(frame - frames) if 1 <= frames <= frame else None
 
     start_ns = device.frame_start_ns(frame)
+
+    def ground(x: float, y: float) -> float:
+        height = np.nan if world is None else ground_height(world.scene, x=x, y=y)
+        return height if np.isfinite(height) else float(recording.trajectory.at([start_ns]).position[0, 2])
+
     camera = device.spec if isinstance(device, Camera) else None
     return Situation(
         device.name,
@@ -62,6 +68,7 @@ def situation_of(
         light=None if camera is None else light_during(recording, start_ns),
         earlier=None if cloud_of is None else earlier,
         geo=recording.frame,
+        ground=ground,
     )
 
 

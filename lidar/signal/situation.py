@@ -31,6 +31,8 @@ class Situation:
     clearness : share of the light from elsewhere that reaches the sensor along a pulse (row) from a distance
         in metres, through the stages' weather; None in clear air
     geo      : from degrees to the scene frame; None for clouds without a dataset
+    ground   : height of the ground at x and y of the scene frame, same frame; of recorded data that under the
+        vehicle. None for clouds without a dataset
     world    : what rays hit; None for recorded data
     seed     : of the drive, for what lasts longer than a frame
     camera   : the camera that takes an image; None of other sensors
@@ -52,3 +54,4 @@ class Situation:
     earlier: Callable[[int], Cloud | None] | None = None
     geo: Frame | None = None
     clearness: Callable[[int, float], float] | None = None
+    ground: Callable[[float, float], float] | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from geoscene.classes import Class
@@ -15,6 +17,9 @@ _GROUND = (
 )
 _ABOVE, _BELOW = 1.5, 6.0
 """Metres above and below the expected height within which the ground is looked for."""
+_SKY = 1e4
+"""Metres above and below zero within which the ground is looked for whose height is not known."""
+_KNOWN: dict[tuple[Path, float, float], float] = {}
 _BORDER = 1e-3
 """Metres from the border of a tile's ground, where rays may miss it, at which heights are taken."""
 
@@ -43,3 +48,11 @@ def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: fl
         found = np.isfinite(hits.range)
         z[rows[found]] = xyz[rows[found], 2] + above - hits.range[found]
     return z
+
+
+def ground_height(scene: Scene, *, x: float, y: float) -> float:
+    """Height of the ground at a place, whatever it is; NaN where there is none. Kept for the next call."""
+    key = scene.path, x, y
+    if key not in _KNOWN:
+        _KNOWN[key] = float(ground_heights(scene, np.array([[x, y, 0.0]]), above=_SKY, below=_SKY)[0])
+    return _KNOWN[key]

@@ -313,6 +313,15 @@ def test_a_device_behind_a_wall_does_nothing():
     assert not len(added(altered_sweep(sweep, far, at=situation(sweep))))
 
 
+def test_the_height_of_a_place_is_above_the_ground_there():
+    here = situation(VLP)
+    lat, lon, _ = place_of((20.0, 5.0, 0.0))
+    device = read_stage({"name": "inject", "place": f"{lat},{lon},1.5"}).stage
+    hill = replace(here, ground=lambda x, y: 100.0 + round(x) + round(y))
+    (flat,), (raised,) = (device.towards(np.array([here.start_ns]), at=at) for at in (here, hill))
+    assert raised - flat == pytest.approx([0, 0, 125.0], abs=1e-6)
+
+
 def place_of(point):
     lon, lat = GEO.to_geographic(point[0], point[1])
     return float(lat), float(lon), point[2]

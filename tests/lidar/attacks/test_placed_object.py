@@ -100,3 +100,25 @@ def test_faulty_objects_are_refused_in_one_line(table, message):
 def test_an_object_cannot_be_put_into_recorded_data():
     with pytest.raises(InputError, match="stage placed_object acts on a scene, and there is none"):
         stages_of([{"name": "placed_object"}]).check({"top": "lidar"})
+
+
+def test_a_drive_notices_that_a_mesh_has_changed(scene, tmp_path):
+    mesh, other = tmp_path / "a.stl", trimesh.creation.box((1.0, 1.0, 2.0))
+    trimesh.creation.box((1.0, 1.0, 1.0)).export(mesh)
+    (tmp_path / "one.toml").write_text(RIG, "utf-8")
+
+    def driven():
+        attacks = read_attacks([f"placed_object:mesh={mesh}"])
+        return DriveOptions(
+            rig=str(tmp_path / "one.toml"), duration=0.2, seed=2, formats=("pcd",), attacks=attacks
+        )
+
+    drive(scene, tmp_path / "drive", options=driven())
+    table = open_dataset(tmp_path / "drive").manifest["recipe"]["stages"][0]
+    assert read_stage(table).to_json() == table
+    drive(scene, tmp_path / "drive", options=driven())  # the same mesh
+    other.export(mesh)
+    with pytest.raises(InputError):
+        drive(scene, tmp_path / "drive", options=driven())
+    with pytest.raises(InputError, match=r"a\.stl: has changed since the drive"):
+        read_stage(table)
