@@ -20,9 +20,10 @@ from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
 from lidar.pipeline import chunks, drive, recording_chunks
 from lidar.plan import plan_drive
-from lidar.signal.registry import NamedStage, read_stages
+from lidar.signal.registry import NamedStage, numbered, read_stage, read_stages
 from lidar.signal.stage import Stage, parameter
 from lidar.traffic.populate import TrafficOptions
+from lidar.weather.setting import read_weather
 
 RIG = """
 name = "small"
@@ -141,6 +142,23 @@ def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered
     assert summary.points == sum(opened.manifest["points"].values()) < summary.points_in
     with pytest.raises(DatasetError, match="has stages already"):
         apply_stages(tmp_path / "a", tmp_path / "b", options=ApplyOptions(STAGES))
+
+
+def test_no_return_is_added_while_scanners_are_off(plain, tmp_path):
+    """As in the turns of surveys from the air."""
+    shutil.copytree(plain, tmp_path / "in")
+    manifest = json.loads((plain / "dataset.json").read_text())
+    manifest["scanners_on_ns"] = [[0, 150_000_000]]
+    (tmp_path / "in" / "dataset.json").write_text(json.dumps(manifest))
+    snow = read_weather("snow=10")
+    stages = numbered(read_stage(one.table()) for one in snow)
+    apply_stages(tmp_path / "in", tmp_path / "a", options=ApplyOptions(stages))
+    for frame, cloud in enumerate(sorted((tmp_path / "a" / "top" / "pcd").glob("*.pcd"))):
+        with np.load(tmp_path / "a" / "top" / "truth" / f"{cloud.stem}.npz") as truth:
+            rows = (truth["origin"] == Origin.WEATHER) & (truth["hidden"] < 0)
+        added = read_cloud(cloud).time_ns[rows] + 100_000_000 * frame
+        assert (len(added) > 50) is (frame < 2)
+        assert (added <= 150_000_000).all()
 
 
 def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
