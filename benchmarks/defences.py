@@ -14,6 +14,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+from geoscene.scene.layout import SceneFiles
+from lidar.defences.calibration import Calibration, calibration_text, read_calibration
+
 RIG = """
 name = "probe"
 vehicle = "car"
@@ -24,6 +27,7 @@ name = "top"
 preset = "hdl32e"
 translation = [0.76, 0.0, 1.73]
 rate_hz = 10.0
+firing_jitter_ns = 10.0
 
 [[camera]]
 name = "front"
@@ -76,13 +80,44 @@ def main() -> None:
     drives = []
     for name, seeds in DRIVES.items():
         scene = given.folder / name
-        if not (scene / "scene.json").exists():
+        if not SceneFiles(scene).manifest.exists():
             run("geoscene", "build", "--osm", given.extracts / f"{name}.osm.pbf", "-o", scene)
         for seed, traffic in seeds.items():
             drives.append(given.folder / f"{name}_{seed}")
             words = ("--route", "random", "--duration", 6, "--seed", seed, "--rig", rig, "--traffic", traffic)
             run("lidar", "drive", scene, *words, "--fidelity", "survey", "--format", "pcd", "-o", drives[-1])
-    run("lidar", "defend", *drives, "--defence", "all", "--calibrate", "-o", OUT, "--overwrite")
+    shared = given.folder / "all.toml"
+    run("lidar", "defend", *drives, "--defence", "all", "--calibrate", "-o", shared, "--overwrite")
+    OUT.write_text(calibration_text(joined(shared, watermark_calibration(drives))), "utf-8")
+
+
+def watermark_calibration(drives: list[Path]) -> Path:
+    """The calibration of the watermark on signed copies of drives, which the other defences cannot share."""
+    key = drives[0].with_name("secret.key")
+    key.write_text("00" * 16, "utf-8")
+    signed = [drive.with_name(f"{drive.name}_signed") for drive in drives]
+    for drive, copy in zip(drives, signed, strict=True):
+        run("lidar", "sign", drive, "--watermark", key, "-o", copy, "--overwrite")
+    out = key.with_name("watermark.toml")
+    run(
+        "lidar",
+        "defend",
+        *signed,
+        "--defence",
+        f"watermark:key={key}",
+        "--calibrate",
+        "-o",
+        out,
+        "--overwrite",
+    )
+    return out
+
+
+def joined(*files: Path) -> Calibration:
+    """One calibration of several files."""
+    parts = [read_calibration(file) for file in files]
+    tails = {key: tail for part in parts for key, tail in part.tails.items()}
+    return Calibration(dict(sorted(tails.items())), "; ".join(part.note for part in parts))
 
 
 if __name__ == "__main__":
