@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.defences.defence import Defence
 from lidar.defences.observation import Observation
-from lidar.defences.verdict import Verdict, greatest, of_members
+from lidar.defences.verdict import Verdict, of_objects
 from lidar.signal.stage import parameter
 from lidar.world.world import World
 
@@ -73,8 +73,7 @@ class Occlusion(Defence):
         del scene, rng
         frame = frames[-1]
         objects = np.array([self._suspicion(frame, row) for row in range(len(frame.objects))])
-        returns = of_members(len(frame), frame.members, objects=objects)
-        return Verdict(returns, objects, greatest(objects))
+        return of_objects(len(frame), frame.members, objects=objects)
 
     def _suspicion(self, frame: Observation, row: int) -> float:
         """Laser penetration decides where it is clear; free space decides between the two bounds."""

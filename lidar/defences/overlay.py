@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull, QhullError
 from geoscene.typing import Float
 from lidar.defences.defence import Defence
 from lidar.defences.observation import Observation, Picture, pixels_of
-from lidar.defences.verdict import Verdict, greatest, of_members
+from lidar.defences.verdict import Verdict, of_objects
 from lidar.rig.camera_model import project
 from lidar.signal.stage import parameter
 from lidar.world.world import World
@@ -70,8 +70,7 @@ class Overlay(Defence):
             found = [e for picture in frame.pictures if (e := self.evidence(frame, row, picture=picture))]
             if found:
                 objects[row] = min(suspicion_of(one) for one in found)
-        returns = of_members(len(frame), frame.members, objects=objects)
-        return Verdict(returns, objects, greatest(objects))
+        return of_objects(len(frame), frame.members, objects=objects)
 
     def pictures(
         self, frame: Observation, verdict: Verdict, *, threshold: float

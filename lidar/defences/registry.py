@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
-from math import isfinite
 from typing import Any, cast
 
 from lidar.defences.defence import Defence
 from lidar.errors import InputError
+from lidar.signal.stage import parameter_rows
 
 _DEFENCES = {
     "occlusion": "occlusion.Occlusion",
@@ -99,22 +99,13 @@ def defence_rows() -> list[dict[str, Any]]:
     rows = []
     for name in _DEFENCES:
         kind = defence_class(name)
-        parameters = [
-            {
-                "name": f.name,
-                "default": f.default,
-                **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
-                "meaning": f.metadata["meaning"],
-            }
-            for f in fields(kind)
-        ]
         rows.append(
             {
                 "name": name,
                 "meaning": (kind.__doc__ or "").partition("\n")[0],
                 "needs": sorted(kind.needs),
                 "history": kind.history,
-                "parameters": parameters,
+                "parameters": parameter_rows(kind),
             }
         )
     return rows

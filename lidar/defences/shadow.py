@@ -10,7 +10,7 @@ import numpy as np
 from geoscene.typing import Float
 from lidar.defences.defence import Defence
 from lidar.defences.observation import Observation
-from lidar.defences.verdict import Verdict, greatest, of_members
+from lidar.defences.verdict import Verdict, of_objects
 from lidar.signal.stage import parameter
 from lidar.world.world import World
 
@@ -37,8 +37,7 @@ class Shadow(Defence):
         del scene, rng
         frame = frames[-1]
         objects = np.array([self._suspicion(frame, row) for row in range(len(frame.objects))])
-        returns = of_members(len(frame), frame.members, objects=objects)
-        return Verdict(returns, objects, greatest(objects))
+        return of_objects(len(frame), frame.members, objects=objects)
 
     def _suspicion(self, frame: Observation, row: int) -> float:
         """Weight of the returns in the shadow over that of all within the object's outline."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.defences.defence import Defence
 from lidar.defences.observation import Observation
-from lidar.defences.verdict import Verdict, greatest, of_members
+from lidar.defences.verdict import Verdict, of_objects
 from lidar.signal.stage import parameter
 from lidar.world.world import World
 
@@ -50,8 +50,7 @@ class Temporal(Defence):
         objects = np.array(
             [self._suspicion(frame, row, earlier=earlier, rng=rng) for row in range(len(frame.objects))]
         )
-        returns = of_members(len(frame), frame.members, objects=objects)
-        return Verdict(returns, objects, greatest(objects))
+        return of_objects(len(frame), frame.members, objects=objects)
 
     def _suspicion(
         self, frame: Observation, row: int, *, earlier: Sequence[Observation], rng: np.random.Generator

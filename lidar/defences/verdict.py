@@ -66,9 +66,13 @@ def greatest(column: Float, *, count: int = 1) -> float:
     return float(np.partition(column, len(column) - count)[len(column) - count])
 
 
-def of_members(n: int, members: tuple[NDArray[np.intp], ...], *, objects: Float) -> Float:
-    """Suspicion (n,) of returns: that of the most suspicious object that they are in."""
+def of_objects(n: int, members: tuple[NDArray[np.intp], ...], *, objects: Float) -> Verdict:
+    """The verdict of a defence that judges boxes alone.
+
+    Each of the n returns has the suspicion of the most suspicious box that it is in, and the frame the
+    greatest of all boxes.
+    """
     returns = np.zeros(n)
     for rows, suspicion in zip(members, objects, strict=True):
         returns[rows] = np.maximum(returns[rows], suspicion)
-    return returns
+    return Verdict(returns, objects, greatest(objects))

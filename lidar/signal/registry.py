@@ -15,7 +15,7 @@ import numpy as np
 
 from lidar.errors import InputError
 from lidar.random_streams import generator
-from lidar.signal.stage import Stage
+from lidar.signal.stage import Stage, parameter_rows
 
 _STAGES = {
     "cover_glass": "signal.cover_glass.CoverGlass",
@@ -254,17 +254,7 @@ def stage_rows() -> list[dict[str, Any]]:
     rows = []
     for name in _STAGES:
         kind = stage_class(name)
-        parameters = [
-            {
-                "name": f.name,
-                "default": f.default,
-                **{end: f.metadata[end] for end in ("low", "high") if math.isfinite(f.metadata[end])},
-                **({"among": f.metadata["among"]} if f.metadata["among"] else {}),
-                "meaning": f.metadata["meaning"],
-            }
-            for f in fields(kind)
-        ]
         seams = [seam for seam in SEAMS if hasattr(kind, seam)]
         meaning = (kind.__doc__ or "").partition("\n")[0]
-        rows.append({"name": name, "acts_on": seams, "meaning": meaning, "parameters": parameters})
+        rows.append({"name": name, "acts_on": seams, "meaning": meaning, "parameters": parameter_rows(kind)})
     return rows

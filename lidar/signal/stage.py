@@ -45,6 +45,20 @@ def parameter(
     return field(default=default, metadata=bounds)
 
 
+def parameter_rows(kind: type[Stage]) -> list[dict[str, Any]]:
+    """Name, default, bounds or words, and meaning of each parameter of a class."""
+    return [
+        {
+            "name": f.name,
+            "default": f.default,
+            **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
+            **({"among": f.metadata["among"]} if f.metadata["among"] else {}),
+            "meaning": f.metadata["meaning"],
+        }
+        for f in fields(kind)
+    ]
+
+
 @dataclass(frozen=True)
 class Stage:
     """Base of all stages; its fields are made by `parameter`.
