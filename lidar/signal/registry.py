@@ -231,11 +231,16 @@ def _text_table(text: str) -> Mapping[str, Any]:
         "sensor": str,
     }
     table: dict[str, Any] = {"name": name.strip()}
+    key = ""
     for pair in filter(None, rest.split(",")):
-        key, equals, value = (part.strip() for part in pair.partition("="))
-        if not equals:
+        left, equals, value = (part.strip() for part in pair.partition("="))
+        if equals:
+            key = left
+            table[key] = _value(value, kinds.get(key, str))
+        elif key and kinds.get(key) is str:
+            table[key] += f",{left}"  # a value with commas, such as a place
+        else:
             raise InputError(f"stage {text}: give NAME:KEY=VALUE,KEY=VALUE")
-        table[key] = _value(value, kinds.get(key, str))
     return table
 
 

@@ -110,6 +110,13 @@ def test_the_recipe_lists_weather_and_attacks_as_stages(scene):
     assert not {"weather", "attacks"} & recipe.keys()
 
 
+def test_a_value_of_an_attack_may_have_commas():
+    (attack,) = read_attacks(["inject:place=40.7195,-73.9877,1.5,range=9"])
+    assert (attack.stage.place, attack.stage.range) == ("40.7195,-73.9877,1.5", 9.0)
+    with pytest.raises(InputError, match="KEY=VALUE"):
+        read_attacks(["inject:range=9,1.5"])
+
+
 @pytest.mark.usefixtures("_known")
 def test_files_of_attacks_hold_attacks_only(tmp_path):
     file = tmp_path / "a.toml"
