@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,10 +20,11 @@ from lidar.attacks.sight import Seen, check_sight
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.camera.render import Frame as Image
 from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file, remove_dataset
+from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples, record_fixes, record_samples
 from lidar.dataset.record_clouds import sent_pulses, write_clouds
 from lidar.dataset.recorded import cloud_points
@@ -36,7 +35,7 @@ from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import ApplyOptions, with_stage_settings
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.scanner import Sensor, load_sensor
-from lidar.rig.specs import GnssSpec, ImuSpec, Rig, load_rig, rig_digest
+from lidar.rig.specs import GnssSpec, ImuSpec, Rig, rig_of
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
 from lidar.signal.recorded import altered_recording, recorded_echoes
@@ -85,15 +84,11 @@ def apply_stages(
     Raises InputError for stages that cannot act on the data, and DatasetError for data that cannot be read.
     """
     source, out = Path(source), Path(out)
-    here, there = source.resolve(), out.resolve()
-    if here == there or here in there.parents or there in here.parents:
-        raise InputError(f"{out}: give a directory outside of {source}")
+    check_target(out, source=source, overwrite=overwrite)
     is_dataset = Paths(source).manifest.exists()
     clouds = [] if is_dataset else foreign_clouds(source)
     if not is_dataset and not clouds:
         raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
-        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
     if is_dataset and options.sensor:
         raise InputError("`sensor`: a dataset has its own sensors; leave it out")
     with complete_folder(out) as part:
@@ -103,33 +98,6 @@ def apply_stages(
         else:
             done = _apply_to_clouds(clouds, source, out=part, options=options, progress=progress)
     return replace(done, path=out)
-
-
-@contextmanager
-def complete_folder(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files become those of ``out`` unless the block raises.
-
-    They replace a former dataset there; other files stay.
-    """
-    place = out.resolve()
-    part = place.with_name(f"{place.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        yield part
-        if Paths(out).manifest.exists():
-            remove_dataset(out)
-        if not place.exists() or not any(place.iterdir()):
-            part.replace(place)
-            return
-        manifest = Paths(part).manifest
-        files = [path for path in part.rglob("*") if path.is_file() and path != manifest]
-        for path in (*files, *([manifest] if manifest.exists() else [])):
-            target = place / path.relative_to(part)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _apply_to_dataset(
@@ -205,17 +173,6 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
     )
 
 
-def rig_of(rig: str) -> Rig:
-    """A rig as a recipe names it: its name or file, and a digest.
-
-    Raises InputError if the rig has changed since.
-    """
-    name = rig.rpartition(" (")[0]
-    if f"{name} ({rig_digest(name)})" != rig:
-        raise InputError(f"rig {name}: has changed since the drive")
-    return load_rig(name)
-
-
 def _altered_units(rig: Rig, stages: Stages) -> list[GnssSpec | ImuSpec]:
     """Receivers and inertial units whose measurements stages change."""
     return [
@@ -260,16 +217,6 @@ def richest_format(contents: Contents) -> Format:
             f"clouds are in the world frame ({','.join(contents.formats)}); record the sensor frame too"
         )
     return max(found, key=lambda form: len(form.columns))
-
-
-def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:
-    """Copy a directory but for some files, named as in ``out``."""
-
-    def skip(folder: str, names: list[str]) -> list[str]:
-        place = out / Path(folder).relative_to(source)
-        return [name for name in names if place / name in leave_out]
-
-    shutil.copytree(source, out, ignore=skip, dirs_exist_ok=True)
 
 
 def _apply_to_frame(

@@ -12,7 +12,8 @@ import numpy as np
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import complete_folder, copy_dataset, recording_again, rig_of
+from lidar.apply import recording_again
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset
@@ -31,6 +32,7 @@ from lidar.integrity.merkle import (
 )
 from lidar.integrity.watermark import Cells, Watermark
 from lidar.rig.devices import Scanner, scanners
+from lidar.rig.specs import rig_of
 from lidar.sensors.cloud import Cloud
 
 SCHEMA = 1
@@ -95,11 +97,7 @@ def sign_dataset(
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
         return _chained(dataset, signer, summary=SignSummary(source), progress=progress)
     out = Path(out)
-    here, there = source.resolve(), out.resolve()
-    if here == there or here in there.parents or there in here.parents:
-        raise InputError(f"{out}: give a directory outside of {source}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
-        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
+    check_target(out, source=source, overwrite=overwrite)
     with complete_folder(out) as part:
         summary = SignSummary(part)
         if watermark is None:

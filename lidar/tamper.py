@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.csv_tables import write_columns
-from lidar.apply import complete_folder
+from lidar.dataset.derived import check_target, complete_folder
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
-from lidar.errors import DatasetError, InputError
+from lidar.errors import InputError
 from lidar.sign import signed_files
 from lidar.time_scales import iso_times
 
@@ -98,11 +98,7 @@ def tamper(
     source, out, moved = Path(source), Path(out), dict(shifts)
     if not replacements and not moved:
         raise InputError("give `replace`, `shift` or both")
-    here, there = source.resolve(), out.resolve()
-    if here == there or here in there.parents or there in here.parents:
-        raise InputError(f"{out}: give a directory outside of {source}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
-        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
+    check_target(out, source=source, overwrite=overwrite)
     dataset = open_dataset(source)
     other = open_dataset(by) if str(by) else dataset
     copies = _copies(dataset, other, replacements=replacements, freeze=freeze)

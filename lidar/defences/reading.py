@@ -14,11 +14,11 @@ from lidar.dataset.formats import FORMATS
 from lidar.dataset.layout import Dataset, opened_rows, reading_file
 from lidar.dataset.recorded import Stream, cloud_points, clouds_in, color_images
 from lidar.defences.observation import Navigation, Observation, Picture
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.devices import Scanner, cameras, scanners
 from lidar.rig.scanner import Sensor
-from lidar.rig.specs import CameraSpec, load_rig, rig_digest
+from lidar.rig.specs import CameraSpec, rig_of
 
 SEEN = ("x", "y", "z", "intensity", "time_ns", "ring", "column", "range", "echo", "echoes")
 """Columns of a recorded cloud that come from the scanner; the others are ground truth."""
@@ -88,10 +88,7 @@ def read_scans(dataset: Dataset) -> list[Scans]:
     the sensor frame with ring, column and time.
     """
     with reading_file(dataset.paths.manifest):
-        name, _, digest = str(dataset.manifest["recipe"]["rig"]).rpartition(" (")
-    if f"{rig_digest(name)})" != digest:
-        raise InputError(f"rig {name}: has changed since the drive")
-    rig = load_rig(name)
+        rig = rig_of(str(dataset.manifest["recipe"]["rig"]))
     trajectory = dataset.trajectory()
     pictures = _pictures(dataset, {camera.name: camera.spec for camera in cameras(rig)})
     navigation = _navigation(dataset)

@@ -14,24 +14,18 @@ from numpy.typing import NDArray
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import (
-    copy_dataset,
-    foreign_clouds,
-    recorded_cloud,
-    recording_again,
-    richest_format,
-    rig_of,
-    write_altered,
-)
+from lidar.apply import foreign_clouds, recorded_cloud, recording_again, richest_format, write_altered
 from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.formats import Format, read_table
-from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file, remove_dataset
+from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.denoise.filters import Bools, Filter
 from lidar.denoise.scores import Tally
 from lidar.errors import DatasetError, InputError
 from lidar.physics.echoes import Origin
 from lidar.rig.devices import Scanner, scanners
+from lidar.rig.specs import rig_of
 from lidar.signal.run import Altered, unaltered, write_truth
 
 _BYTES = {"kitti": 16, "nuscenes": 20}
@@ -92,11 +86,21 @@ def denoise(
     Raises InputError for several filters with ``out``, and DatasetError for data that cannot be read.
     """
     source = Path(source)
-    if out is not None:
-        out = Path(out)
-        _check_target(source, out, overwrite=overwrite)
-        if len(methods) > 1:
-            raise InputError(f"`out` takes the clouds of one method, not of {len(methods)}")
+    if out is None:
+        return Denoised(source, None, _scores(source, methods, out=None, progress=progress))
+    out = Path(out)
+    check_target(out, source=source, overwrite=overwrite)
+    if len(methods) > 1:
+        raise InputError(f"`out` takes the clouds of one method, not of {len(methods)}")
+    with complete_folder(out) as part:
+        scores = _scores(source, methods, out=part, progress=progress)
+    return Denoised(source, out, scores)
+
+
+def _scores(
+    source: Path, methods: Mapping[str, Filter], *, out: Path | None, progress: Progress
+) -> dict[str, dict[str, Tally]]:
+    """Scores by filter and scanner; with ``out`` the clouds are written."""
     frames: Iterator[_Frame]
     if Paths(source).manifest.exists():
         job = _DatasetJob(open_dataset(source), out)
@@ -118,16 +122,7 @@ def denoise(
     progress("frames", count, total=count)
     if job is not None and out is not None:
         job.finish(next(iter(methods)))
-    return Denoised(source, out, scores)
-
-
-def _check_target(source: Path, out: Path, *, overwrite: bool) -> None:
-    """Raise for a directory that cannot be written to."""
-    here, there = source.resolve(), out.resolve()
-    if here == there or here in there.parents or there in here.parents:
-        raise InputError(f"{out}: give a directory outside of {source}")
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
-        raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
+    return scores
 
 
 class _Frame:
@@ -167,8 +162,6 @@ class _DatasetJob:
         """The frames in order."""
         if self.out is not None:
             written = {path for job in self.jobs for path in self.recording.paths(*job).values()}
-            if Paths(self.out).manifest.exists():  # a former dataset, to be replaced
-                remove_dataset(self.out)
             left_out = written | {Paths(self.out).manifest, Paths(self.out).journal}
             copy_dataset(self.dataset.path, self.out, leave_out=left_out)
         for scanner, number in self.jobs:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar.errors import RigError
+from lidar.errors import InputError, RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount
 from lidar.rig.imu_grades import PRESETS
@@ -305,6 +305,17 @@ def load_rig(name: str | Path) -> Rig:
     root.close()
     _check_names(tables)
     return rig
+
+
+def rig_of(rig: str) -> Rig:
+    """A rig as a recipe names it: its name or file, and a digest.
+
+    Raises InputError if the rig has changed since.
+    """
+    name = rig.rpartition(" (")[0]
+    if f"{name} ({rig_digest(name)})" != rig:
+        raise InputError(f"rig {name}: has changed since the drive")
+    return load_rig(name)
 
 
 def rig_digest(name: str | Path) -> str:

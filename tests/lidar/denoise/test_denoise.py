@@ -1,6 +1,7 @@
 """Filters against the returns of rain and snow, and their scores."""
 
 import json
+import shutil
 from math import isnan
 
 import numpy as np
@@ -13,7 +14,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.denoise.denoise import denoise
 from lidar.denoise.filters import METHODS, Ddior, Dror, Dsor, Lior, Statistical, read_methods
 from lidar.denoise.scores import Tally
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
 from lidar.pipeline import drive
@@ -220,6 +221,19 @@ def test_what_cannot_be_filtered_is_refused_with_nothing_written(snowy, tmp_path
         denoise(snowy, methods, out=tmp_path / "full")
     assert not (tmp_path / "out").exists()
     assert not (tmp_path.parent / "out").exists()
+
+
+def test_a_damaged_later_cloud_leaves_what_was_there(snowy, tmp_path):
+    source, out = tmp_path / "snowy", tmp_path / "out"
+    shutil.copytree(snowy, source)
+    denoise(source, {"lior": Lior()}, out=out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    max(source.rglob("*.pcd")).write_bytes(b"no cloud")
+    for target in (out, tmp_path / "new"):
+        with pytest.raises(LidarError):
+            denoise(source, {"dror": Dror()}, out=target, overwrite=True)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert {path.name for path in tmp_path.iterdir()} == {"snowy", "out"}
 
 
 def test_the_program_prints_a_table_or_json(snowy, tmp_path):
