@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,17 +95,18 @@ def _through_air(
     camera = at.camera
     added = _exposed(at, lambda sources: sources.mean)
     path = np.where(np.isfinite(distance), distance, _to_sky(camera, pose, top=_TOP[setting.kind]))
-    field, here = place_field(setting, FARTHEST, at=at), 1.0
+    field = place_field(setting, FARTHEST, at=at)
     if field is not None:
-        path, here = _path_through(field, path, camera=camera, pose=pose)
+        path = _path_through(field, path, camera=camera, pose=pose)
     clear = np.exp(-air.extinction * path).astype(np.float32)[..., None]
     light = light * clear + added * (1 - clear)
     particles = falling(setting, air)
-    if particles is None or here <= 0:
+    if particles is None:
         return light
     cover = streak_cover(
         camera,
-        replace(particles, density=particles.density * here),
+        particles,
+        share=None if field is None else partial(_share_at, field, pose=pose),
         exposure=(camera.exposure_ns or EXPOSURE_NS) / 1e9,
         down=-pose.rotation[0, 2],
         air=(_wind(setting) - _velocity(at)) @ pose.rotation[0],
@@ -175,17 +177,24 @@ def _to_sky(camera: CameraSpec, pose: Poses, *, top: float) -> NDArray[np.float3
 
 def _path_through(
     field: Field, path: NDArray[np.float32], *, camera: CameraSpec, pose: Poses
-) -> tuple[NDArray[np.float32], float]:
-    """Metres (h, w) through an even medium of the same optical depth, and the share of it at the camera.
+) -> NDArray[np.float32]:
+    """Metres (h, w) through an even medium of the same optical depth.
 
     path : (h, w) metres along each pixel's ray
     """
     direction = pose.directions(np.nan_to_num(pixel_rays(camera)))
     rays = Rays(np.broadcast_to(pose.position, direction.shape), direction)
-    pulse, far = np.arange(len(direction)), np.minimum(path.ravel(), FARTHEST).astype(np.float64)
-    _, column = amounts(field, rays, pulse=pulse, distance=far)
-    here, _ = amounts(field, rays, pulse=pulse[:1], distance=np.zeros(1))
-    return column.astype(np.float32).reshape(path.shape), float(here[0])
+    whole = path.ravel().astype(np.float64)
+    far = np.minimum(whole, FARTHEST)
+    _, column = amounts(field, rays, pulse=np.arange(len(direction)), distance=far)
+    through: NDArray[np.float32] = (column + field.beyond * (whole - far)).astype(np.float32)
+    return through.reshape(path.shape)
+
+
+def _share_at(field: Field, position: Float, *, pose: Poses) -> Float:
+    """The share (n,) of a medium at places (n, 3), camera frame."""
+    rays = Rays(np.broadcast_to(pose.position, position.shape), pose.directions(position))
+    return amounts(field, rays, pulse=np.arange(len(position)), distance=np.ones(len(position)))[0]
 
 
 def _wind(setting: WeatherSetting) -> Float:

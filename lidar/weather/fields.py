@@ -19,6 +19,7 @@ from lidar.raycast.memory import inlined
 from lidar.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 from lidar.weather.setting import WeatherSetting
+from lidar.world.shelter import CELL
 
 FARTHEST = 300.0
 """Metres from a sensor up to which weather differs from place to place."""
@@ -30,6 +31,9 @@ _PLUME_HEIGHT = 5.0  # metres over which dust thins out, assumed
 _PLUME_SIZES = (8.0, 60.0)  # metres, wavelengths of the pattern of dust, assumed
 _PLUME_WAVES = 40
 _PLUME_SHARE = 0.4  # of the ground under dust, assumed
+_DRIFT, _DRIFT_LENGTH = 10.0, 20.0
+"""Metres from the open to which fog and dust fill it, and over which they thin out beyond; assumed."""
+
 _SPRAY_FAST = 50 / 3.6  # m/s, from which on tyres throw up spray behind a vehicle, typical value
 _SPRAY_TIME, _SPRAY_LENGTH = 1.0, 4.0  # s, decay of spray, and after which it is gone; typical values
 _SPRAY_HEIGHT = 0.5  # metres over which spray thins out, typical value
@@ -41,6 +45,23 @@ visibility in it is 50 m at a height of 0.7 m."""
 
 
 @dataclass(frozen=True, slots=True)
+class Cover:
+    """How much of a medium is left under roofs, bridges and in tunnels.
+
+    corner : (2,) scene metres of the corner of the first cell
+    roof   : (ny, nx) height below which air is covered, scene metres; -inf in the open
+    share  : (ny, nx) of the medium below it
+    """
+
+    corner: tuple[float, float]
+    roof: Float
+    share: Float
+
+
+_OPEN = Cover((0.0, 0.0), np.empty((0, 0)), np.empty((0, 0)))
+
+
+@dataclass(frozen=True, slots=True)
 class Field:
     """How much of a medium there is, from place to place.
 
@@ -48,12 +69,16 @@ class Field:
     share  : (ny, nx) of the medium in the sample's surroundings; none beyond
     ground : height above which it thins out, scene metres
     height : metres over which it falls to 1/e; infinite for none
+    beyond : share where there are no samples
+    cover  : what of it is under roofs; None for all
     """
 
     corner: tuple[float, float]
     share: Float
     ground: float
     height: float
+    beyond: float = 0.0
+    cover: Cover | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +113,9 @@ def place_field(setting: WeatherSetting, far: float, *, at: Situation) -> Field 
     """
     has_place = bool(setting.radius or setting.polygon)
     plumes = setting.medium == "plumes"
+    cover = _cover(setting, at=at)
     if not (has_place or plumes):
-        return None
+        return None if cover is None else Field((0.0, 0.0), np.ones((1, 1)), 0.0, inf, 1.0, cover)
     if at.poses is None or at.geo is None:
         raise InputError("weather with a place or plumes needs poses, which these clouds do not have")
     position = at.poses(np.array([at.start_ns])).position[0]
@@ -97,10 +123,28 @@ def place_field(setting: WeatherSetting, far: float, *, at: Situation) -> Field 
     share = np.ones((count, count))
     if has_place:
         share = _place_share(setting, at.geo, corner=corner, count=count)
-    if not plumes:
-        return None if np.all(share == 1) else Field(corner, share, 0.0, inf)
-    share = share * plume_pattern(setting, at.start_ns / 1e9, seed=at.seed, corner=corner, count=count)
-    return Field(corner, share, float(position[2]) - _ABOVE, _PLUME_HEIGHT)
+    if plumes:
+        share = share * plume_pattern(setting, at.start_ns / 1e9, seed=at.seed, corner=corner, count=count)
+        return Field(corner, share, float(position[2]) - _ABOVE, _PLUME_HEIGHT, cover=cover)
+    everywhere = cover is None and np.all(share == 1)
+    return None if everywhere else Field(corner, share, 0.0, inf, cover=cover)
+
+
+def _cover(setting: WeatherSetting, *, at: Situation) -> Cover | None:
+    """What of a setting's weather is left under roofs around a sensor; None for all and if none is known.
+
+    Rain and snow fall straight down. Fog and dust drift in.
+    """
+    if at.world is None or at.poses is None:
+        return None
+    shelter = at.world.shelter(at.poses(np.array([at.start_ns])).position[0])
+    if shelter is None:
+        return None
+    share = np.zeros_like(shelter.way)
+    if setting.kind not in ("rain", "snow"):
+        share = np.exp(-np.maximum(shelter.way - _DRIFT, 0.0) / _DRIFT_LENGTH)
+    covered = np.isfinite(shelter.roof)
+    return Cover(shelter.corner, shelter.roof, share) if np.any(share[covered] < 1) else None
 
 
 @functools.lru_cache(maxsize=8)
@@ -199,41 +243,45 @@ def amounts(field: Field, rays: Rays, *, pulse: NDArray[np.integer], distance: F
 
 
 def _packed(field: Field) -> tuple[Any, ...]:
-    return field.share, (*field.corner, field.ground, field.height)
+    cover = field.cover or _OPEN
+    frame = *field.corner, field.ground, field.height, field.beyond, *cover.corner
+    return field.share, frame, cover.roof, cover.share
 
 
 @inlined
-def _share(grid: Any, frame: Any, start: Any, way: Any, pulse: Any, distance: Any) -> Any:
-    """The share of the medium at a range along a pulse; frame: corner, ground and height of the field."""
-    x0, y0, ground, height = frame
+def _share(field: Any, rays: Any, pulse: Any, distance: Any) -> Any:
+    """The share of the medium at a range along a pulse."""
+    grid, frame, roof, left = field
+    start, way = rays
+    x0, y0, ground, height, share, cx, cy = frame
     x, y = start[pulse, 0] + distance * way[pulse, 0], start[pulse, 1] + distance * way[pulse, 1]
     u, v = (x - x0) / _STEP, (y - y0) / _STEP
-    if not (0.0 <= u < grid.shape[1] - 1 and 0.0 <= v < grid.shape[0] - 1):
-        return 0.0
-    column, row = int(u), int(v)
-    u, v = u - column, v - row
-    share = (1 - v) * ((1 - u) * grid[row, column] + u * grid[row, column + 1])
-    share += v * ((1 - u) * grid[row + 1, column] + u * grid[row + 1, column + 1])
+    if 0.0 <= u < grid.shape[1] - 1 and 0.0 <= v < grid.shape[0] - 1:
+        column, row = int(u), int(v)
+        u, v = u - column, v - row
+        share = (1 - v) * ((1 - u) * grid[row, column] + u * grid[row, column + 1])
+        share += v * ((1 - u) * grid[row + 1, column] + u * grid[row + 1, column + 1])
     if share <= 0.0:
         return 0.0
-    above = start[pulse, 2] + distance * way[pulse, 2] - ground
-    return share * np.exp(-above / height) if above > 0.0 else share
+    z = start[pulse, 2] + distance * way[pulse, 2]
+    u, v = (x - cx) / CELL, (y - cy) / CELL
+    if 0.0 <= u < roof.shape[1] and 0.0 <= v < roof.shape[0] and z < roof[int(v), int(u)]:
+        share *= left[int(v), int(u)]
+    return share * np.exp(-(z - ground) / height) if z > ground else share
 
 
 @njit(cache=True, nogil=True)
 def _amounts(field: Any, rays: Any, places: Any, here: Any, column: Any) -> None:
     """Fill the share at places and its integral up to them, by the midpoint rule."""
-    start, way = rays
     pulse, distance = places
-    grid, frame = field
     for i in range(len(pulse)):
         steps = max(1, int(np.ceil(distance[i])))
         step = distance[i] / steps
         total = 0.0
         for k in range(steps):
-            total += _share(grid, frame, start, way, pulse[i], (k + 0.5) * step)
+            total += _share(field, rays, pulse[i], (k + 0.5) * step)
         column[i] = total * step
-        here[i] = _share(grid, frame, start, way, pulse[i], distance[i])
+        here[i] = _share(field, rays, pulse[i], distance[i])
 
 
 def strongest_response(
@@ -256,7 +304,9 @@ def strongest_response(
     least : power of responses that are not worth looking for
     """
     place, power = np.empty(len(end)), np.zeros(len(end))
-    beyond = np.maximum.accumulate(white[::-1])[::-1] * (shape.sum() * field.share.max())
+    beyond = np.maximum.accumulate(white[::-1])[::-1] * (
+        shape.sum() * max(field.beyond, float(field.share.max()))
+    )
     air = end, white, beyond, extinction, shape, step, near, least
     _strongest(_packed(field), (rays.start, rays.way), air, place, power)
     return place, power
@@ -265,8 +315,6 @@ def strongest_response(
 @njit(cache=True, nogil=True)
 def _strongest(field: Any, rays: Any, air: Any, place: Any, power: Any) -> None:
     """Fill range and power of the strongest response of each pulse."""
-    start, way = rays
-    grid, frame = field
     end, white, beyond, extinction, shape, step, near, least = air
     taps = len(shape)
     sent = np.zeros(len(white) + 2 * taps)  # back by each step of range, after as many zeros as the pulse has
@@ -278,7 +326,7 @@ def _strongest(field: Any, rays: Any, air: Any, place: Any, power: Any) -> None:
             if k < len(white) and r < end[i]:
                 if live == 0 and beyond[k] * passed < max(best, least):
                     break
-                share = _share(grid, frame, start, way, i, r)
+                share = _share(field, rays, i, r)
                 if share > 0.0:
                     within = np.exp(-extinction * share * step)
                     new = share * white[k] * passed * within

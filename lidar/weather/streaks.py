@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,7 @@ def streak_cover(
     air: Float,
     distance: NDArray[np.float32],
     rng: np.random.Generator,
+    share: Callable[[Float], Float] | None = None,
 ) -> NDArray[np.float32]:
     """Share (h, w) of each pixel's light that comes from particles in front of the surface seen.
 
@@ -58,6 +60,7 @@ def streak_cover(
     down     : (3,) unit vector of the fall, camera frame
     air      : (3,) m/s of the air relative to the camera, camera frame
     distance : (h, w) metres along each pixel's ray, inf for sky
+    share    : share (n,) of the particles that there are at places (n, 3), camera frame; all by default
     """
     cover = np.zeros((camera.height, camera.width), np.float32)
     pixels = math.sqrt(camera.fx * camera.fy)
@@ -67,9 +70,12 @@ def streak_cover(
         path = speed * exposure
         far = _visible_distance(float(diameter), across=fall * exposure, pixels=pixels)
         position = _positions(camera, density=float(density), far=far, margin=path, rng=rng)
+        swing = particles.swing * rng.standard_normal(position.shape)
+        if share is not None:
+            there = _drawn(share(position), rng=rng)
+            position, swing = position[there], swing[there]
         if not len(position):
             continue
-        swing = particles.swing * rng.standard_normal(position.shape)
         half = (drift + swing) * exposure / 2
         begin, end = position - half, position + half
         if camera.model == "pinhole":
@@ -83,6 +89,14 @@ def streak_cover(
         edge = np.maximum(np.minimum(width, blur), 1.0)
         draw(cover, distance, np.hstack([first, last]), np.stack([away, width, size, edge], axis=1))
     return cover
+
+
+def _drawn(share: Float, *, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """Which of particles there are, by their shares (n,); shares of 0 and 1 need no random numbers."""
+    there = share >= 1
+    partly = (share > 0) & ~there
+    there[partly] = rng.random(int(partly.sum())) < share[partly]
+    return there
 
 
 def _visible_distance(diameter: float, *, across: float, pixels: float) -> float:

@@ -19,6 +19,7 @@ from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 from lidar.world.settings import PLAIN, WorldSettings
+from lidar.world.shelter import CELL, Shelter, shelter_of
 from lidar.world.tile_selection import selected_tile
 
 Region = tuple[float, float, float, float]
@@ -41,6 +42,9 @@ _BARE = ("glass", "water", "skin", "retroreflector")
 _SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
 OVERHANG = 50.0
 """Metres by which a building may extend beyond its tile and still be loaded."""
+_WITHIN = 160.0  # metres around a place within which shelter is known, at most
+_MOVED = 32.0  # metres between places that share a shelter
+_KEPT = 4  # shelters that are kept
 _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
@@ -182,6 +186,7 @@ class World:
         self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
+        self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
         self._concatenate_tables()
 
@@ -262,6 +267,27 @@ class World:
         found.feature[copied] = self._feature[hits.instance[copied]]
         return found
 
+    def shelter(self, position: Float) -> Shelter | None:
+        """The air under roofs, bridges and in tunnels around a place; None if there is none.
+
+        It is known within the margin of the world, and at most within 160 m, whatever else is loaded. Trees,
+        furniture and actors shelter nothing.
+
+        position : (3,) scene metres
+        """
+        half = np.floor((min(self.margin, _WITHIN) - _MOVED / 2) / CELL)
+        x, y = np.round(position[:2] / _MOVED) * _MOVED
+        if half < 1:
+            return None
+        if (place := (float(x), float(y))) not in self._sheltered:
+            corner = float(x - half), float(y - half)
+            parts = (
+                p for t in self._tiles.values() for p in t.parts.values() if p.mask & (SOLID | GLASS | WATER)
+            )
+            found = shelter_of(parts, origin=self.caster.origin, corner=corner, count=int(2 * half / CELL))
+            self._sheltered = dict([*self._sheltered.items(), (place, found)][-_KEPT:])
+        return self._sheltered[place]
+
     @property
     def reach(self) -> float:
         """Metres from a sensor beyond which nothing is hit."""
@@ -310,7 +336,7 @@ class World:
             return
         start = np.concatenate([tile.centre for tile in self._tiles.values()])[row] + [0.0, 0.0, _ABOVE]
         up = np.broadcast_to([0.0, 0.0, 1.0], start.shape)
-        covered = row[self.caster.occluded(start, up, far=_CEILING, mask=SOLID)]
+        covered = row[self.caster.occluded(start, up, far=_CEILING, mask=SOLID | GLASS)]
         self._surfaces.material[covered] &= ~np.uint8(OPEN)
         self._packed[covered] &= ~np.int64(OPEN)
         self._index_instances()

@@ -8,7 +8,9 @@ from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
+from lidar.raycast.geometry import split
 from lidar.world.settings import PLAIN, WorldSettings
+from lidar.world.shelter import shelter_of
 from lidar.world.world import Faces, Surfaces, packed, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
@@ -32,6 +34,12 @@ class MeshWorld:
 
     def __post_init__(self):
         self.caster = Caster(self.mesh.vertices, self.mesh.faces)
+
+    def shelter(self, position):
+        """The covered air within 60 m."""
+        x, y = np.floor(position[:2]) - 60.0
+        parts = split(self.mesh.vertices, self.mesh.faces)
+        return shelter_of(parts, origin=np.zeros(3), corner=(x, y), count=120)
 
     @property
     def faces(self):
