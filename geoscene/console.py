@@ -208,9 +208,8 @@ def _exit_interrupted(app: App, number: int) -> NoReturn:
 
 
 def _command(app: App) -> str:
-    """The command named on the command line, followed by a space; empty if there is none."""
-    name = sys.argv[1] if len(sys.argv) > 1 else ""
-    return f"{name} " if name in app else ""
+    """The command on the command line with the commands that it is nested in, each followed by a space."""
+    return "".join(f"{name} " for name in app.parse_commands(sys.argv[1:])[0])
 
 
 def with_flags(app: App, text: str) -> str:
@@ -219,9 +218,13 @@ def with_flags(app: App, text: str) -> str:
     Parameters that the command does not have keep their name.
     """
     flags = {}
-    if "`" in text and (command := _command(app).strip()):
-        arguments = app[command].assemble_argument_collection()
-        flags = {argument.field_info.name: argument.name for argument in arguments}
+    if "`" in text and (words := app.parse_commands(sys.argv[1:])[0]):
+        command = app
+        for word in words:
+            command = command[word]
+        if command.default_command is not None:  # not a group of commands
+            arguments = command.assemble_argument_collection()
+            flags = {argument.field_info.name: argument.name for argument in arguments}
     return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
 
 
