@@ -16,12 +16,25 @@ from geoscene.classes import Class
 from geoscene.csv_tables import write_columns
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
+from lidar.attacks.attacker import Attacker
 from lidar.attacks.sight import Seen, check_sight
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.camera.render import Frame as Image
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
-from lidar.dataset.formats import FORMATS, Format
+from lidar.dataset.foreign import (
+    KITTI,
+    Former,
+    foreign_clouds,
+    foreign_labels,
+    foreign_truth,
+    read_foreign,
+    read_foreign_past,
+    read_foreign_stages,
+    select_labels,
+    write_foreign_stages,
+)
+from lidar.dataset.formats import Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
@@ -29,7 +42,8 @@ from lidar.dataset.navigation_files import read_fixes, read_samples, record_fixe
 from lidar.dataset.record_clouds import sent_pulses, write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Contents, Recording
-from lidar.dataset.situations import situation_of, situation_of_unit
+from lidar.dataset.situations import Surroundings, situation_of, situation_of_unit, surroundings_of
+from lidar.dataset.truth_files import read_past, read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import ApplyOptions, with_stage_settings
@@ -38,14 +52,14 @@ from lidar.rig.scanner import Sensor, load_sensor
 from lidar.rig.specs import GnssSpec, ImuSpec, Rig, rig_of
 from lidar.sensors.cloud import Cloud
 from lidar.settings import settings_of
+from lidar.signal.past import Past, truth_since
 from lidar.signal.recorded import altered_recording, recorded_echoes
 from lidar.signal.recorded_pulses import completed
-from lidar.signal.registry import NO_STAGES, NamedStage, Stages
-from lidar.signal.run import Altered, altered_image, cloud_truth, image_truth, write_truth
+from lidar.signal.registry import NO_STAGES, NamedStage, Stages, acts_on, dimming, numbered
+from lidar.signal.run import Altered, altered_image, image_past, image_truth, write_truth
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES
 
-_KITTI, _NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
 _SENSORS = {"kitti": "hdl64e_s2", "nuscenes": "hdl32e"}
 """Presets of the scanners that recorded these datasets; KITTI's takes 1.3 million points/s (Geiger 2013)."""
 
@@ -57,12 +71,15 @@ class ApplySummary:
     files          : point clouds and images that were written
     points_in      : returns before the stages
     points         : returns after them
+    sight          : what told whether devices of attackers are in sight: rays in the ``scene``, or recorded
+        ``returns``; empty without any
     """
 
     path: Path
     files: int
     points_in: int
     points: int
+    sight: str = ""
 
 
 def apply_stages(
@@ -106,11 +123,11 @@ def _apply_to_dataset(
     recipe = dataset.manifest["recipe"]
     if dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{dataset.path}: the drive was not finished; finish it first")
-    if {"stages", "applied_stages"} & recipe.keys():
-        raise DatasetError(f"{dataset.path}: has stages already; apply all to the original")
     with reading_file(dataset.paths.manifest):
         rig = rig_of(recipe["rig"])
-        chosen = Stages(stages, int(dataset.manifest["seed"]))
+        acted = acted_stages(dataset)
+        names = [str(table["name"]) for table in acted]
+        chosen = Stages(numbered(stages, after=names), int(dataset.manifest["seed"]), dimming(acted))
         chosen.check(sensor_kinds(rig), known=(POSES,))
         _check_images(chosen, rig)
         points = dict(dataset.manifest["points"])
@@ -124,8 +141,10 @@ def _apply_to_dataset(
         for frame in range(len(dataset.sample_times(s.name)))
     ]
     form = richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
+    has_devices = any(isinstance(named.stage, Attacker) for named in stages)
+    around = surroundings_of(dataset) if has_devices else None
     if form is not None:
-        _check_sight(dataset, recording, form=form, jobs=jobs)
+        _check_sight(dataset, recording, form=form, jobs=jobs, around=around)
     written = {path for job in jobs for path in recording.paths(*job).values()}
     written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
     copy_dataset(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
@@ -136,15 +155,44 @@ def _apply_to_dataset(
         if isinstance(device, Camera):
             _apply_to_image(dataset, recording, camera=device, frame=frame)
         elif form is not None:
-            points[device.name] += _apply_to_frame(dataset, recording, form=form, scanner=device, frame=frame)
+            points[device.name] += _apply_to_frame(
+                dataset, recording, form=form, scanner=device, frame=frame, around=around
+            )
     progress("stages", len(jobs), total=len(jobs))
     for unit in _altered_units(rig, chosen):
         _apply_to_unit(dataset, recording, spec=unit)
     if Paths(out).boxes.exists():
         merge_box_files(out)
-    applied = {"applied_stages": [stage.to_json() for stage in stages]}
-    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe | applied, "points": points})
-    return ApplySummary(out, len(jobs), before, sum(points.values()))
+    applied = [*recipe.get("applied_stages", ()), *(listed(s, seed=chosen.seed) for s in chosen.stages)]
+    recipe |= {"applied_stages": applied, "settings": with_stage_settings(recipe["settings"], stages)}
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points})
+    sight = ("returns" if around is None else "scene") if has_devices else ""
+    return ApplySummary(out, len(jobs), before, sum(points.values()), sight)
+
+
+def acted_stages(dataset: Dataset) -> list[dict[str, Any]]:
+    """The stages that have acted on a dataset, in order, as `NamedStage.to_json` writes them."""
+    recipe = dataset.manifest["recipe"]
+    return [*recipe.get("stages", ()), *recipe.get("applied_stages", ())]
+
+
+def listed(named: NamedStage, *, seed: int) -> dict[str, Any]:
+    """A stage in the list of those that were applied, with its seed; ``seed`` is the data's."""
+    return {"seed": seed} | named.to_json()
+
+
+def truth_of_past(dataset: Dataset, device: Scanner | Camera, *, frame: int) -> Path:
+    """Truth file of a frame that stages may have changed already.
+
+    Raises DatasetError if they have and the file is missing.
+    """
+    path = dataset.paths.truth(device.name, frame)
+    kind = "camera" if isinstance(device, Camera) else "lidar"
+    with reading_file(dataset.paths.manifest):
+        needed = any(acts_on(table, device.name, kind=kind) for table in acted_stages(dataset))
+    if needed and not path.exists():
+        raise DatasetError(f"{path}: missing; without the truth of earlier stages no others can be applied")
+    return path
 
 
 def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) -> Recording:
@@ -187,12 +235,14 @@ def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | I
     at = situation_of_unit(
         spec.name, spec.mount, trajectory=recording.trajectory, start=start, seed=recording.contents.seed
     )
+    truth = dataset.paths.measurements_truth(spec.name)
+    past = truth if truth.exists() else None
     if isinstance(spec, ImuSpec):
         path = dataset.paths.measurements(spec.name)
-        record_samples(out, partial(read_samples, path), at=at, stages=stages, start=start)
+        record_samples(out, partial(read_samples, path), at=at, stages=stages, start=start, past=past)
         return
     fixes, heights = read_fixes(dataset.paths, spec.name, vertical=dataset.frame.vertical)
-    record_fixes(out, fixes, at=at, stages=stages, start=start, heights=heights)
+    record_fixes(out, fixes, at=at, stages=stages, start=start, heights=heights, past=past)
 
 
 def _check_images(stages: Stages, rig: Rig) -> None:
@@ -220,26 +270,40 @@ def richest_format(contents: Contents) -> Format:
 
 
 def _apply_to_frame(
-    dataset: Dataset, recording: Recording, *, form: Format, scanner: Scanner, frame: int
+    dataset: Dataset,
+    recording: Recording,
+    *,
+    form: Format,
+    scanner: Scanner,
+    frame: int,
+    around: Surroundings | None,
 ) -> int:
     """Write a cloud after the stages with its labels, boxes and truth; return the number of points."""
     contents = recording.contents
-    recorded = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=frame)
 
-    def cloud_of(earlier: int) -> Cloud:
-        return recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=earlier)
+    def past_of(number: int) -> Past:
+        cloud = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=number)
+        return read_past(truth_of_past(dataset, scanner, frame=number), cloud)
+
+    past = past_of(frame)
 
     threshold = contents.scanner.link or contents.scanner.detection
-    at = situation_of(recording, scanner, frame=frame, cloud_of=cloud_of)
+    at = situation_of(
+        recording,
+        scanner,
+        frame=frame,
+        cloud_of=lambda earlier: past_of(earlier).original,
+        surroundings=around,
+    )
     altered = altered_recording(
-        recorded,
+        past.cloud,
         contents.stages,
         sensor=scanner.sensor,
         at=at,
         threshold=threshold,
         sent=sent_pulses(recording, scanner, frame=frame) if "column" in form.columns else None,
     )
-    truth = cloud_truth(altered, start_ns=scanner.frame_start_ns(frame))
+    truth = truth_since(past, altered, start_ns=scanner.frame_start_ns(frame))
     write_altered(
         altered, truth, dataset=dataset, recording=recording, form=form, scanner=scanner, frame=frame
     )
@@ -304,6 +368,7 @@ def _check_sight(
     *,
     form: Format,
     jobs: Sequence[tuple[Scanner | Camera, int]],
+    around: Surroundings | None,
 ) -> None:
     """Raise InputError for an attacker that no scanner sees in any of the frames."""
 
@@ -313,7 +378,7 @@ def _check_sight(
         return (*recorded_echoes(cloud, scanner.sensor, sent=sent), at)
 
     places = (
-        (device, situation_of(recording, device, frame=frame))
+        (device, situation_of(recording, device, frame=frame, surroundings=around))
         for device, frame in jobs
         if isinstance(device, Scanner)
     )
@@ -350,25 +415,15 @@ def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, f
     for path in (paths["rgb"], paths["truth"]):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_png(paths["rgb"], found.rgb)
-    write_truth(paths["truth"], image_truth(found, image))
+    truth = truth_of_past(dataset, camera, frame=frame)
+    with reading_file(truth):
+        original = image_past(image, read_truth(truth))
+    write_truth(paths["truth"], image_truth(found, original))
     for kind in _IMAGES & source.keys():
         shutil.copyfile(source[kind], paths[kind])
 
 
 _IMAGES = {"depth", "semantic", "instance"}
-
-
-def foreign_clouds(source: Path) -> list[tuple[Path, Format]]:
-    """Point clouds of KITTI and nuScenes in a folder, in order."""
-    found = []
-    for path in sorted(source.rglob("*.bin")):
-        if path.name.endswith(_NUSCENES.suffix):
-            found.append((path, _NUSCENES))
-        elif path.parent == source or any(
-            part.startswith("velodyne") for part in path.relative_to(source).parts[:-1]
-        ):
-            found.append((path, _KITTI))
-    return found
 
 
 def _apply_to_clouds(
@@ -384,7 +439,9 @@ def _apply_to_clouds(
         key = path.parent.name, form.name
         if key not in devices:
             devices[key] = load_sensor(options.sensor or _SENSORS[form.name], name=key[0])
-    chosen = Stages(options.all_stages)
+    acted = read_foreign_stages(source)
+    names = [str(table["name"]) for table in acted]
+    chosen = Stages(numbered(options.all_stages, after=names), before=dimming(acted))
     chosen.check({name: "lidar" for name, _ in devices})
     check_sight(
         chosen, (_place_of(path, form, device=devices[path.parent.name, form.name]) for path, form in clouds)
@@ -395,58 +452,25 @@ def _apply_to_clouds(
         place = path.relative_to(source)
         stem = path.name.removesuffix(form.suffix)
         device = devices[path.parent.name, form.name]
-        recorded = read_foreign(path, form, device=device)
+        past = read_foreign_past(path, form, source=source, device=device)
         frame = int(stem) if stem.isdigit() else stem
-        at = Situation(device.name, frame, earlier=_Former(clouds, done, device=device).cloud)
-        altered = altered_recording(recorded, chosen, sensor=device, at=at, sent=None)
-        for target in (out / place, out / "truth" / place):
+        at = Situation(device.name, frame, earlier=Former(clouds, done, source=source, device=device).cloud)
+        altered = altered_recording(past.cloud, chosen, sensor=device, at=at, sent=None)
+        truth = foreign_truth(out, place, form=form)
+        for target in (out / place, truth):
             target.parent.mkdir(parents=True, exist_ok=True)
         form.write(out / place, cloud_table(altered.cloud))
-        write_truth((out / "truth" / place).with_name(f"{stem}.npz"), cloud_truth(altered, start_ns=0))
-        labels = path.parent.parent / "labels" / f"{stem}.label"
-        if form is _KITTI and labels.is_file():
+        write_truth(truth, truth_since(past, altered, start_ns=0))
+        if form is KITTI and (labels := foreign_labels(path)).is_file():
             select_labels(labels, out / labels.relative_to(source), altered=altered)
-        before, after = before + len(recorded), after + len(altered.cloud)
+        before, after = before + len(past.cloud), after + len(altered.cloud)
+    write_foreign_stages(out, [*acted, *(listed(stage, seed=chosen.seed) for stage in chosen.stages)])
     progress("stages", len(clouds), total=len(clouds))
-    return ApplySummary(out, len(clouds), before, after)
+    has_devices = any(isinstance(named.stage, Attacker) for named in chosen.stages)
+    return ApplySummary(out, len(clouds), before, after, "returns" if has_devices else "")
 
 
 def _place_of(path: Path, form: Format, *, device: Sensor) -> tuple[Situation, Callable[[], Seen]]:
     """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
     at = Situation(device.name, path.name)
     return at, lambda: (*recorded_echoes(read_foreign(path, form, device=device), device, sent=None), at)
-
-
-def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
-    """A point cloud of KITTI or nuScenes."""
-    return completed(table_cloud(form.read(path)), device, columns=form.columns)
-
-
-@dataclass(frozen=True, slots=True)
-class _Former:
-    """The point clouds before one in the order of names, of the same folder.
-
-    clouds : all files
-    row    : of the one
-    """
-
-    clouds: Sequence[tuple[Path, Format]]
-    row: int
-    device: Sensor
-
-    def cloud(self, frames: int) -> Cloud | None:
-        """The cloud a number of frames before; None before the first."""
-        path, form = self.clouds[self.row]
-        row = self.row - frames
-        if row < 0 or self.clouds[row][0].parent != path.parent:
-            return None
-        return read_foreign(self.clouds[row][0], form, device=self.device)
-
-
-def select_labels(path: Path, out: Path, *, altered: Altered) -> None:
-    """Write labels of SemanticKITTI for the returns after stages; added ones are unlabelled (0)."""
-    codes = np.append(np.fromfile(path, "<u4"), np.uint32(0))
-    if len(codes) != len(altered.original) + 1:
-        raise DatasetError(f"{path}: {len(codes) - 1} labels for {len(altered.original)} points")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_bytes(codes[altered.cloud.source].astype("<u4").tobytes())

@@ -511,6 +511,9 @@ def apply(
         print_json({**asdict(summary), "path": str(out)})
     else:
         print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
+        if summary.sight:
+            by = {"scene": "rays in the scene", "returns": "recorded returns, without the scene"}
+            print(f"line of sight to devices: by {by[summary.sight]}")
     return 0
 
 

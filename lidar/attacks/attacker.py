@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
@@ -19,7 +20,7 @@ from lidar.physics.pulse_identity import METRES_PER_NS
 from lidar.raycast.geometry import ALL
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter
-from lidar.world.world import GLASS
+from lidar.world.world import GLASS, World
 
 POWER_AT = 10.0
 """Metres from the sensor at which the parameter ``power`` holds."""
@@ -34,6 +35,7 @@ _KNOTS = 11  # moments of a frame at which the direction to a fixed attacker is 
 _PER_FRAME = 100.0  # metres by which a vehicle moves within a frame, at most
 _BESIDE = np.radians(1.5)  # angle around the attacker within which recorded returns tell what is in between
 _FOUND_BEFORE = 1.0  # metres before the attacker at which such a return blocks its light
+_NOT_IN_SCENES = [Class.UNLABELED, *(k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST)]  # road users
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,26 +200,42 @@ class Attacker(Stage):
     ) -> bool:
         """Whether light from the device reaches the sensor when it fires a pulse (row) towards it.
 
-        In recorded data what lies in between is known from returns beside the device: it is hidden if all
-        of them are nearer.
+        In recorded data whose scene is there, rays tell what of the scene is in between, and returns beside
+        the device which road users are; without the scene, returns tell all.
         """
         away = float(np.linalg.norm(towards))
         if at.world is not None and at.poses is not None:
-            pose, way = at.poses(pulses.time_ns[row : row + 1]), (towards / away)[None]
             start, stop = pulses.sensor.window_ns(int(at.frame))
-            moment = (pulses.time_ns[row] - start) / (stop - start)
-            hidden = at.world.caster.occluded(
-                pose.position,
-                pose.directions(way),
-                near=min(0.05, away / 2),
-                far=max(away - 0.05, away / 2),
-                mask=ALL & ~GLASS,
-                time=np.array([moment]),
-            )
-            return not hidden[0]
+            moment = np.array([(pulses.time_ns[row] - start) / (stop - start)])
+            return not _occluded(at.world, at.poses(pulses.time_ns[[row]]), towards=towards, moment=moment)
         beside = np.flatnonzero(pulses.direction @ (towards / away) > np.cos(_BESIDE))
-        found = echoes.range[np.isin(echoes.pulse, beside)]
-        return not len(found) or bool(found.max() > away - _FOUND_BEFORE)
+        found = np.isin(echoes.pulse, beside)
+        hidden = found.any() and bool(echoes.range[found].max() <= away - _FOUND_BEFORE)
+        if at.surroundings is None or at.poses is None:
+            return not hidden
+        pose = at.poses(pulses.time_ns[[row]])
+        world = at.surroundings(np.concatenate([pose.position, pose.place(towards[None])]))
+        if _occluded(world, pose, towards=towards):
+            return False
+        return not (hidden and bool(np.isin(echoes.klass[found], _NOT_IN_SCENES).any()))
+
+
+def _occluded(world: World, pose: Poses, *, towards: Float, moment: Float | None = None) -> bool:
+    """Whether anything but glass is between a sensor at a pose and a device.
+
+    towards : (3,) from the sensor to the device, metres in the sensor frame
+    moment  : (1,) time of the ray within those of the world's motion, 0 to 1
+    """
+    away = float(np.linalg.norm(towards))
+    hidden = world.caster.occluded(
+        pose.position,
+        pose.directions((towards / away)[None]),
+        near=min(0.05, away / 2),
+        far=max(away - 0.05, away / 2),
+        mask=ALL & ~GLASS,
+        time=moment,
+    )
+    return bool(hidden[0])
 
 
 @dataclass(frozen=True)

@@ -241,7 +241,7 @@ def _false_returns(
         true_range=np.zeros(k),
         origin=np.full(k, Origin.INJECTED, np.uint8),
         source=np.full(k, -1, np.int32),
-        hidden=twin.source,
+        hidden=np.where(twin.source >= 0, twin.source, twin.hidden),
     )
 
 

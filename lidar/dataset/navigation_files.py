@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice
@@ -79,12 +80,24 @@ def observed_fixes(
 
 
 def record_fixes(
-    paths: Paths, fixes: Fixes, *, at: Situation, stages: Stages, start: datetime, heights: Heights
+    paths: Paths,
+    fixes: Fixes,
+    *,
+    at: Situation,
+    stages: Stages,
+    start: datetime,
+    heights: Heights,
+    past: Path | None = None,
 ) -> None:
-    """Write the fixes of the receiver ``at.sensor`` after the stages on them, with the truth of changes."""
+    """Write the fixes of the receiver ``at.sensor`` after the stages on them, with the truth of changes.
+
+    past : truth file of the fixes, if stages changed them already
+    """
     if stages.at("fixes", at.sensor):
         original, fixes = fixes, altered_fixes(fixes, stages, at=at)
-        write_columns(paths.measurements_truth(at.sensor), fixes_truth(fixes, original))
+        with _opened_past(past) as rows:
+            before = _next_past(rows, past, count=len(fixes))
+        write_columns(paths.measurements_truth(at.sensor), fixes_truth(fixes, original, past=before))
     _write_fixes(paths, at.sensor, fixes=fixes, start=start, heights=heights)
 
 
@@ -167,21 +180,62 @@ def _state(quality: NDArray[np.int8]) -> NDArray[np.int8]:
     return np.array(table, np.int8)[np.searchsorted((0, 1, 2, 4, 5), quality)]
 
 
+@contextmanager
+def _opened_past(path: Path | None) -> Iterator[Iterator[dict[str, str]]]:
+    """Yield the rows of a truth file of earlier stages, if there is one."""
+    if path is None:
+        yield iter(())
+        return
+    with opened_rows(path) as rows:
+        yield rows
+
+
+def _next_past(
+    rows: Iterator[dict[str, str]], path: Path | None, *, count: int
+) -> dict[str, NDArray[Any]] | None:
+    """The measurements in the next rows of a truth file; None without one.
+
+    Raises DatasetError for fewer rows.
+    """
+    if path is None:
+        return None
+    block = list(islice(rows, count))
+    with reading_file(path):
+        if len(block) < count:
+            raise ValueError("is of fewer measurements")
+        kinds = {"time_ns": np.int64, "quality": np.int8, "satellites": np.int8}
+        names = [name for name in (block[0] if block else ()) if name != "changed"]
+        return {
+            name: np.array([row[name] for row in block]).astype(kinds.get(name, np.float64)) for name in names
+        }
+
+
 def record_samples(
-    paths: Paths, samples: Callable[[], Iterator[Inertial]], *, at: Situation, stages: Stages, start: datetime
+    paths: Paths,
+    samples: Callable[[], Iterator[Inertial]],
+    *,
+    at: Situation,
+    stages: Stages,
+    start: datetime,
+    past: Path | None = None,
 ) -> None:
     """Write the samples of the inertial unit ``at.sensor`` after the stages, with the truth of changes.
 
     samples : the unit's samples in blocks, as without stages; called twice if there are stages
+    past    : truth file of the samples, if stages changed them already
     """
     path = paths.measurements(at.sensor)
     if not stages.at("samples", at.sensor):
         write_blocks(path, (_sample_columns(rows, start) for rows in samples()))
         return
-    write_blocks(
-        paths.measurements_truth(at.sensor),
-        (samples_truth(*pair) for pair in altered_samples(samples(), stages, at=at)),
-    )
+    with _opened_past(past) as rows:
+        write_blocks(
+            paths.measurements_truth(at.sensor),
+            (
+                samples_truth(*pair, past=_next_past(rows, past, count=len(pair[0])))
+                for pair in altered_samples(samples(), stages, at=at)
+            ),
+        )
     write_blocks(
         path, (_sample_columns(rows, start) for rows, _ in altered_samples(samples(), stages, at=at))
     )

@@ -9,11 +9,14 @@ from datetime import datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import GeosceneError
 from geoscene.frames import Frame
+from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.camera.light import Light
 from lidar.camera.render import light_of
 from lidar.camera.sun import sun_direction
+from lidar.dataset.layout import Dataset
 from lidar.dataset.recording import Recording
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
@@ -26,6 +29,9 @@ from lidar.world.world import World
 _SUN_NS = 10_000_000_000
 """Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
 
+_AROUND = 20.0
+"""Metres around points within which their surroundings are loaded."""
+
 
 def situation_of(
     recording: Recording,
@@ -34,11 +40,13 @@ def situation_of(
     frame: int,
     world: World | None = None,
     cloud_of: Callable[[int], Cloud] | None = None,
+    surroundings: Surroundings | None = None,
 ) -> Situation:
     """Where and when a sensor takes a frame.
 
     world    : what rays hit during it; None for recorded data
     cloud_of : the cloud of a frame of the same scanner, as without stages
+    surroundings : the scene of recorded data, if it is there
     """
     mount = device.spec.mount
 
@@ -50,9 +58,11 @@ def situation_of(
         return cloud_of(frame - frames) if 1 <= frames <= frame else None
 
     start_ns = device.frame_start_ns(frame)
+    known = world or surroundings
+    scene = None if known is None else known.scene
 
     def ground(x: float, y: float) -> float:
-        height = np.nan if world is None else ground_height(world.scene, x=x, y=y)
+        height = np.nan if scene is None else ground_height(scene, x=x, y=y)
         return height if np.isfinite(height) else float(recording.trajectory.at([start_ns]).position[0, 2])
 
     camera = device.spec if isinstance(device, Camera) else None
@@ -69,7 +79,35 @@ def situation_of(
         earlier=None if cloud_of is None else earlier,
         geo=recording.frame,
         ground=ground,
+        surroundings=None if surroundings is None else surroundings.around,
     )
+
+
+class Surroundings:
+    """The scene that recorded data were driven in, of which the part around points is loaded."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._world: World | None = None
+
+    def around(self, points: Float) -> World:
+        """The scene around points (k, 3) in its frame, without road users."""
+        low, high = points[:, :2].min(axis=0) - _AROUND, points[:, :2].max(axis=0) + _AROUND
+        region = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        if self._world is None:
+            self._world = World(self.scene)
+        self._world.follow(region)
+        return self._world
+
+
+def surroundings_of(dataset: Dataset) -> Surroundings | None:
+    """The scene that a dataset was driven in; None if it is not there, or another one by now."""
+    try:
+        scene = open_scene(dataset.scene_path)
+    except (GeosceneError, OSError):
+        return None
+    same = scene.manifest.get("fingerprint", scene.path.name) == dataset.manifest["recipe"].get("scene")
+    return Surroundings(scene) if same else None
 
 
 def situation_of_unit(

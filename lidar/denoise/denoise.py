@@ -14,19 +14,27 @@ from numpy.typing import NDArray
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import foreign_clouds, recorded_cloud, recording_again, richest_format, write_altered
+from lidar.apply import recorded_cloud, recording_again, richest_format, write_altered
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.foreign import (
+    foreign_clouds,
+    foreign_labels,
+    foreign_truth,
+    read_foreign_stages,
+    write_foreign_stages,
+)
 from lidar.dataset.formats import Format, read_table
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.recorded import cloud_points
+from lidar.dataset.truth_files import read_truth
 from lidar.denoise.filters import Bools, Filter
 from lidar.denoise.scores import Tally
 from lidar.errors import DatasetError, InputError
 from lidar.physics.echoes import Origin
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.specs import rig_of
-from lidar.signal.run import Altered, unaltered, write_truth
+from lidar.signal.run import Altered, cloud_truth, unaltered, write_truth
 
 _BYTES = {"kitti": 16, "nuscenes": 20}
 """Bytes of a return in the files of these formats."""
@@ -120,8 +128,11 @@ def _scores(
                 scores[text][name] = tally.with_frame(kept, frame.weather)
             frame.write(kept)
     progress("frames", count, total=count)
-    if job is not None and out is not None:
-        job.finish(next(iter(methods)))
+    if out is not None:
+        if job is not None:
+            job.finish(next(iter(methods)))
+        elif acted := read_foreign_stages(source):
+            write_foreign_stages(out, acted)
     return scores
 
 
@@ -185,7 +196,7 @@ class _DatasetFrame(_Frame):
         path = replace(job.recording, out=job.dataset.path).paths(scanner, number)[job.form.name]
         table = cloud_points(path)
         xyz = np.column_stack([table["x"], table["y"], table["z"]]).astype(np.float64)
-        self._truth = _read_truth(job.dataset.paths.truth(scanner.name, number), count=len(xyz))
+        self._truth = read_truth(job.dataset.paths.truth(scanner.name, number), count=len(xyz))
         weather = None if job.has_stages else np.zeros(len(xyz), bool)
         if self._truth is not None:
             weather = self._truth["origin"] == Origin.WEATHER
@@ -198,11 +209,7 @@ class _DatasetFrame(_Frame):
             return
         cloud = recorded_cloud(job.dataset, job.recording, form=job.form, scanner=device, frame=self._number)
         altered = Altered(unaltered(cloud).cloud.where(kept), cloud)
-        truth = self._truth or {
-            "origin": np.full(len(cloud), Origin.SURFACE, np.uint8),
-            "source": np.arange(len(cloud), dtype=np.int32),
-            "hidden": np.full(len(cloud), -1, np.int32),
-        }
+        truth = self._truth or cloud_truth(unaltered(cloud), start_ns=cloud.start_ns)
         write_altered(
             altered,
             _filtered_truth(truth, kept),
@@ -213,20 +220,6 @@ class _DatasetFrame(_Frame):
             frame=self._number,
         )
         job.points[device.name] += int(np.count_nonzero(kept))
-
-
-def _read_truth(path: Path, *, count: int) -> dict[str, NDArray[Any]] | None:
-    """A truth file of a cloud; None if there is none.
-
-    Raises DatasetError for a file that is damaged or of another cloud.
-    """
-    if not path.exists():
-        return None
-    with reading_file(path), np.load(path) as file:
-        truth: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
-        if len(truth["origin"]) != count:
-            raise ValueError(f"is of {len(truth['origin'])} returns, the cloud has {count}")
-    return truth
 
 
 def _filtered_truth(truth: dict[str, NDArray[Any]], kept: Bools) -> dict[str, NDArray[Any]]:
@@ -251,9 +244,7 @@ class _ForeignFrame(_Frame):
         table = read_table(path, form.name)
         xyz = np.column_stack([table["x"], table["y"], table["z"]]).astype(np.float64)
         self._place = path.relative_to(source)
-        self._stem = path.name.removesuffix(form.suffix)
-        truth_path = (source / "truth" / self._place).with_name(f"{self._stem}.npz")
-        self._truth = _read_truth(truth_path, count=len(xyz))
+        self._truth = read_truth(foreign_truth(source, self._place, form=form), count=len(xyz))
         weather = None if self._truth is None else self._truth["origin"] == Origin.WEATHER
         super().__init__(
             path.parent.name, xyz, intensity=table["intensity"].astype(np.float64), weather=weather
@@ -264,11 +255,11 @@ class _ForeignFrame(_Frame):
         if self._out is None:
             return
         _write_rows(self._path, self._out / self._place, kept=kept, size=_BYTES[self._form.name])
-        labels = self._path.parent.parent / "labels" / f"{self._stem}.label"
+        labels = foreign_labels(self._path)
         if self._form.name == "kitti" and labels.is_file():
             _write_rows(labels, self._out / labels.relative_to(self._source), kept=kept, size=4)
         if self._truth is not None:
-            target = (self._out / "truth" / self._place).with_name(f"{self._stem}.npz")
+            target = foreign_truth(self._out, self._place, form=self._form)
             target.parent.mkdir(parents=True, exist_ok=True)
             write_truth(target, _filtered_truth(self._truth, kept))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -46,14 +46,21 @@ def altered_samples(
         yield replace(found, true_gyro=original.true_gyro, true_accel=original.true_accel), original
 
 
-def fixes_truth(fixes: Fixes, original: Fixes) -> dict[str, NDArray[Any]]:
-    """Columns of the truth file of a receiver, see `_truth`."""
-    return _truth(gnss_columns(fixes), gnss_columns(original))
+def fixes_truth(
+    fixes: Fixes, original: Fixes, *, past: Mapping[str, NDArray[Any]] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Columns of the truth file of a receiver, see `_truth`.
+
+    past : columns of the truth file of ``original``, if stages changed that already
+    """
+    return _truth(gnss_columns(fixes), gnss_columns(original) | dict(past or {}))
 
 
-def samples_truth(samples: Inertial, original: Inertial) -> dict[str, NDArray[Any]]:
-    """Columns of the truth file of an inertial unit, see `_truth`."""
-    return _truth(imu_columns(samples), imu_columns(original))
+def samples_truth(
+    samples: Inertial, original: Inertial, *, past: Mapping[str, NDArray[Any]] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Columns of the truth file of an inertial unit, as of `fixes_truth`."""
+    return _truth(imu_columns(samples), imu_columns(original) | dict(past or {}))
 
 
 def _truth(altered: dict[str, NDArray[Any]], original: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

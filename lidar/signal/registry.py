@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
 from importlib import import_module
@@ -83,10 +83,15 @@ class NamedStage:
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """Stages in the order in which they act; ``seed`` is the drive's."""
+    """Stages in the order in which they act.
+
+    seed   : of the drive
+    before : stages that have acted on recorded data, as far as they take light from what is sent now
+    """
 
     stages: tuple[NamedStage, ...] = ()
     seed: int = 0
+    before: tuple[NamedStage, ...] = ()
 
     def at(self, seam: str, sensor: str) -> list[NamedStage]:
         """The stages that act on a seam of a sensor."""
@@ -181,12 +186,36 @@ def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
     return Stages(numbered(map(read_stage, tables)), seed)
 
 
-def numbered(stages: Iterable[NamedStage]) -> tuple[NamedStage, ...]:
-    """Stages in the order in which they act, each with the number of earlier ones of the same name."""
+def numbered(stages: Iterable[NamedStage], *, after: Sequence[str] = ()) -> tuple[NamedStage, ...]:
+    """Stages in the order in which they act, each with the number of earlier ones of the same name.
+
+    after : names of stages that have acted on the data before
+    """
     found: list[NamedStage] = []
+    names = list(after)
     for named in stages:
-        found.append(replace(named, number=sum(other.name == named.name for other in found)))
+        found.append(replace(named, number=names.count(named.name)))
+        names.append(named.name)
     return tuple(found)
+
+
+def dimming(tables: Iterable[Mapping[str, Any]]) -> tuple[NamedStage, ...]:
+    """Those of some stages, as `NamedStage.to_json` writes them, that take light: weather."""
+    known = [table for table in tables if table["name"] in _STAGES]
+    return tuple(
+        read_stage(table)
+        for table in known
+        if hasattr(stage_class(table["name"]), "echoes")
+        and stage_class(table["name"]).clearness is not Stage.clearness
+    )
+
+
+def acts_on(table: Mapping[str, Any], sensor: str, *, kind: str) -> bool:
+    """Whether a stage, as `NamedStage.to_json` writes it, acts on a sensor of a kind of `SEAMS`."""
+    if table.get("sensor", "") not in ("", sensor) or table["name"] not in _STAGES:
+        return False
+    stage = stage_class(table["name"])
+    return any(hasattr(stage, seam) for seam, of in SEAMS.items() if of == kind)
 
 
 def _read_all(texts: Iterable[str], kind: str) -> list[NamedStage]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -86,8 +86,10 @@ def altered_echoes(
     """
     acting = stages.at("echoes", at.sensor)
 
+    in_between = [one for one in (*stages.before, *acting) if one.sensor in ("", at.sensor)]
+
     def clearness(row: int, distance: float) -> float:
-        shares = [one.stage.clearness(pulses, row, distance=distance, at=at) for one in acting]
+        shares = [one.stage.clearness(pulses, row, distance=distance, at=at) for one in in_between]
         return math.exp(-extinction * distance) * math.prod(shares)
 
     situation = replace(at, clearness=clearness)
@@ -182,8 +184,12 @@ class _RepeatedNoise:
         return np.where(np.isnan(known), rng.standard_normal(len(echoes)), known)
 
 
-def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
+def cloud_truth(
+    altered: Altered, *, start_ns: int, rows: NDArray[np.integer] | None = None
+) -> dict[str, NDArray[Any]]:
     """Columns of a truth file; ``removed_time_ns`` counts from ``start_ns``.
+
+    rows : (m,) of the original, which ``altered.original`` holds; by default all
 
     origin, source, hidden : (n,) of the recorded returns, as in `TracedCloud`
     removed                : (k,) int32, rows of the original returns that are not among them, or were moved
@@ -191,15 +197,16 @@ def cloud_truth(altered: Altered, *, start_ns: int) -> dict[str, NDArray[Any]]:
     """
     cloud, original = altered.cloud, altered.original
     kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
-    removed = _others(kept, len(original)).astype(np.int32)
-    removed_columns = original.take(removed).columns()
+    rows = np.arange(len(original)) if rows is None else rows
+    is_lost = ~np.isin(rows, kept)
+    removed_columns = original.take(np.flatnonzero(is_lost)).columns()
     time_ns = original.start_ns - start_ns + removed_columns["time_ns"].astype(np.int64)
     removed_columns["time_ns"] = time_ns.astype(np.int64)
     return {
         "origin": cloud.origin,
         "source": cloud.source,
         "hidden": cloud.hidden,
-        "removed": removed,
+        "removed": rows[is_lost].astype(np.int32),
         **{f"removed_{name}": column for name, column in removed_columns.items()},
     }
 
@@ -214,6 +221,18 @@ def image_truth(image: Frame, original: Frame) -> dict[str, NDArray[Any]]:
     assert original.rgb is not None  # noqa: S101
     changed = (image.rgb != original.rgb).any(axis=2)
     return {"changed": changed, "removed": original.rgb[changed]}
+
+
+def image_past(image: Frame, truth: Mapping[str, NDArray[Any]] | None) -> Frame:
+    """A recorded image without the stages that its truth file tells of.
+
+    Raises ValueError for the truth of another image.
+    """
+    if truth is None or image.rgb is None:
+        return image
+    rgb = image.rgb.copy()
+    rgb[truth["changed"]] = truth["removed"]
+    return replace(image, rgb=rgb)
 
 
 def write_truth(path: Path, columns: dict[str, NDArray[Any]]) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.frames import Frame
+from geoscene.typing import Float
 from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
 from lidar.rig.specs import CameraSpec
@@ -31,9 +32,11 @@ class Situation:
     clearness : share of the light from elsewhere that reaches the sensor along a pulse (row) from a distance
         in metres, through the stages' weather; None in clear air
     geo      : from degrees to the scene frame; None for clouds without a dataset
-    ground   : height of the ground at x and y of the scene frame, same frame; of recorded data that under the
-        vehicle. None for clouds without a dataset
+    ground   : height of the ground at x and y of the scene frame, same frame; of recorded data whose scene is
+        not there that under the vehicle. None for clouds without a dataset
     world    : what rays hit; None for recorded data
+    surroundings : the scene around points (k, 3), without road users, of recorded data whose scene is there;
+        else None
     seed     : of the drive, for what lasts longer than a frame
     camera   : the camera that takes an image; None of other sensors
     light    : sun and sky of an image; None of other sensors
@@ -55,3 +58,4 @@ class Situation:
     geo: Frame | None = None
     clearness: Callable[[int, float], float] | None = None
     ground: Callable[[float, float], float] | None = None
+    surroundings: Callable[[Float], World] | None = None

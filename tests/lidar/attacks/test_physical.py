@@ -342,6 +342,39 @@ def test_recorded_clouds_tell_what_stands_before_the_device():
         altered_recording(cloud, fixed, sensor=sensor, at=Situation("vlp16", 2), sent=VLP.firings)
 
 
+def seen_from_record(cloud, point, *, scene):
+    """Whether a device at a point reaches a recorded cloud; without a scene, as the returns tell."""
+    table = {"name": "inject", "shape": "wall", "range": 5.0, "place": ",".join(map(str, place_of(point)))}
+    at = replace(situation(VLP), world=None, surroundings=None if scene is None else lambda _: scene)
+    stages = stages_of([table], seed=5)
+    found = altered_recording(cloud, stages, sensor=VLP.sensor, at=at, sent=VLP.firings)
+    return len(added(found)) > 0
+
+
+def test_rays_in_the_scene_tell_more_than_returns_about_recorded_data():
+    """A device over a fence is seen, as in a drive, though all returns beside it are of the fence."""
+    fence = world(ROAD, *WALLS, box((9, -8, 0), (9.3, 8, 2.05), feature=12))
+    cloud = recorded(swept(place=fence))
+    over, behind = (20.0, 0.5, 2.35), (20.0, 0.5, 1.0)
+    near = recorded(swept(place=world(ROAD, *WALLS, box((9, -8, 0), (9.3, 8, 5), feature=12))))
+    assert seen_from_record(cloud, over, scene=fence)
+    assert not seen_from_record(near, over, scene=None)
+    assert seen_from_record(near, over, scene=fence)  # returns of what is no road user do not count
+    assert not seen_from_record(cloud, behind, scene=fence)
+    assert not seen_from_record(recorded(VLP), (60.0, 0.5, 2.0), scene=ROOM)
+
+
+@pytest.mark.parametrize(
+    ("klass", "seen"), [(Class.CAR, False), (Class.NOISE, True), (Class.UNLABELED, False)]
+)
+def test_road_users_of_recorded_data_are_known_by_their_returns(klass, seen):
+    """They are not in the scene; flakes do not hide a device, and unknown returns count as solid."""
+    truck = box((9, -8, 0), (12, 8, 5), feature=12, klass=klass)
+    cloud = recorded(swept(place=world(ROAD, *WALLS, truck)))
+    assert seen_from_record(cloud, (20.0, 0.5, 2.35), scene=ROOM) is seen
+    assert seen_from_record(recorded(VLP), (20.0, 0.5, 2.35), scene=ROOM)
+
+
 def test_replay_sends_an_earlier_frame():
     before = recorded(swept(place=world(ROAD, plate(15.0)), frame=1))
     known = {"earlier": lambda frames: before if frames == 10 else None}

@@ -140,8 +140,6 @@ def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered
     opened = open_dataset(tmp_path / "a")
     assert opened.manifest["points"] == open_dataset(altered).manifest["points"]
     assert summary.points == sum(opened.manifest["points"].values()) < summary.points_in
-    with pytest.raises(DatasetError, match="has stages already"):
-        apply_stages(tmp_path / "a", tmp_path / "b", options=ApplyOptions(STAGES))
 
 
 def test_no_return_is_added_while_scanners_are_off(plain, tmp_path):
