@@ -71,8 +71,10 @@ def reading(
     """
     try:
         yield
-    except (known, MemoryError, PermissionError, IsADirectoryError):
+    except (known, MemoryError, PermissionError):
         raise
+    except IsADirectoryError as cause:
+        raise error(f"{path}: is a directory, not a file; {remedy}") from cause
     except FileNotFoundError as cause:
         raise error(f"{path}: is missing; {remedy}") from cause
     except Exception as cause:

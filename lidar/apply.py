@@ -34,7 +34,7 @@ from lidar.dataset.foreign import (
     select_labels,
     write_foreign_stages,
 )
-from lidar.dataset.formats import Format
+from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
@@ -58,7 +58,7 @@ from lidar.signal.recorded_pulses import completed
 from lidar.signal.registry import NO_STAGES, NamedStage, Stages, acts_on, dimming, numbered
 from lidar.signal.run import Altered, altered_image, image_past, image_truth, write_truth
 from lidar.signal.situation import Situation
-from lidar.signal.stage import POSES
+from lidar.signal.stage import LABELS, POSES
 
 _SENSORS = {"kitti": "hdl64e_s2", "nuscenes": "hdl32e"}
 """Presets of the scanners that recorded these datasets; KITTI's takes 1.3 million points/s (Geiger 2013)."""
@@ -68,7 +68,7 @@ _SENSORS = {"kitti": "hdl64e_s2", "nuscenes": "hdl32e"}
 class ApplySummary:
     """What stages did to recorded data.
 
-    files          : point clouds and images that were written
+    files          : point clouds, images and measurements of receivers and inertial units, as written
     points_in      : returns before the stages
     points         : returns after them
     sight          : what told whether devices of attackers are in sight: rays in the ``scene``, or recorded
@@ -128,7 +128,9 @@ def _apply_to_dataset(
         acted = acted_stages(dataset)
         names = [str(table["name"]) for table in acted]
         chosen = Stages(numbered(stages, after=names), int(dataset.manifest["seed"]), dimming(acted))
-        chosen.check(sensor_kinds(rig), known=(POSES,))
+        columns = {name for form in recipe["formats"] for name in FORMATS[form].columns}
+        labelled = dataset.paths.boxes.exists() and {"label", "instance"} <= columns
+        chosen.check(sensor_kinds(rig), known=(POSES, LABELS) if labelled else (POSES,))
         _check_images(chosen, rig)
         points = dict(dataset.manifest["points"])
     sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
@@ -146,7 +148,8 @@ def _apply_to_dataset(
     if form is not None:
         _check_sight(dataset, recording, form=form, jobs=jobs, around=around)
     written = {path for job in jobs for path in recording.paths(*job).values()}
-    written |= {Paths(out).measurements(unit.name) for unit in _altered_units(rig, chosen)}
+    units = _altered_units(rig, chosen)
+    written |= {Paths(out).measurements(unit.name) for unit in units}
     copy_dataset(dataset.path, out, leave_out=written | {Paths(out).manifest, Paths(out).journal})
     before = sum(points.values())
     points |= dict.fromkeys((s.name for s, _ in jobs if isinstance(s, Scanner)), 0)
@@ -159,7 +162,7 @@ def _apply_to_dataset(
                 dataset, recording, form=form, scanner=device, frame=frame, around=around
             )
     progress("stages", len(jobs), total=len(jobs))
-    for unit in _altered_units(rig, chosen):
+    for unit in units:
         _apply_to_unit(dataset, recording, spec=unit)
     if Paths(out).boxes.exists():
         merge_box_files(out)
@@ -167,7 +170,7 @@ def _apply_to_dataset(
     recipe |= {"applied_stages": applied, "settings": with_stage_settings(recipe["settings"], stages)}
     write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points})
     sight = ("returns" if around is None else "scene") if has_devices else ""
-    return ApplySummary(out, len(jobs), before, sum(points.values()), sight)
+    return ApplySummary(out, len(jobs) + len(units), before, sum(points.values()), sight)
 
 
 def acted_stages(dataset: Dataset) -> list[dict[str, Any]]:

@@ -69,6 +69,7 @@ app.register_install_completion_command()
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
 Reporting = Annotated[Report, Parameter(group=OUTPUT)]
 JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
+QuietFlag = Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)]
 
 
 @app.command
@@ -642,8 +643,11 @@ def defend(
         raise InputError("`calibrate`: give `out`, the file to write")
     if out is not None:
         note_new_folder(out)
-        if out.exists() and (out.is_file() or any(out.iterdir())) and not report.overwrite:
-            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    if options.calibrate and out is not None and (out.is_dir() or (out.exists() and not report.overwrite)):
+        what = (
+            "is a directory; give a file" if out.is_dir() else "exists already; set `overwrite` to replace it"
+        )
+        raise InputError(f"{out}: {what}")
     chosen = read_defences(options.defences)
     opened = [open_dataset(path) for path in datasets]
     scene = None if options.scene is None else open_scene(options.scene)
@@ -663,6 +667,7 @@ def defend(
             rule=options.fuse,
             scene=scene,
             out=out,
+            overwrite=report.overwrite,
             seed=options.seed,
             progress=progress,
         )
@@ -700,7 +705,10 @@ def defences(*, json: JsonFlag = False) -> int:
             ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
             cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
     print(columns(cells))
-    print("\nlidar defend DATASET --defence NAME:KEY=VALUE,... judges recorded data (see docs/defences.md).")
+    print(
+        "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE:KEY=VALUE judges recorded data"
+        "\n(docs/defences.md)."
+    )
     return 0
 
 
@@ -815,7 +823,8 @@ def verify(
     options: SignOptions = SignOptions(),
     noise: float = 0.001,
     false_alarms: float = 0.01,
-    report: Reporting = Report(),
+    json: JsonFlag = False,
+    quiet: QuietFlag = False,
 ) -> int:
     """Find what was tampered with in a signed dataset: files, frames, blocks of a ring by 10 degrees, points.
 
@@ -833,6 +842,10 @@ def verify(
         Standard deviation in metres that coordinates got since the watermark, such as by another format.
     false_alarms
         Blocks a cloud that the watermark's test may report without tampering, on average.
+    json
+        Print all findings as JSON.
+    quiet
+        Show no progress bars.
     """
     from lidar.integrity.keys import read_secret, read_signer  # noqa: PLC0415
     from lidar.integrity.watermark import Watermark  # noqa: PLC0415
@@ -840,7 +853,7 @@ def verify(
 
     mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
     signer = None if options.chain is None else read_signer(options.chain)
-    with progress_bar(quiet=report.quiet) as progress:
+    with progress_bar(quiet=quiet) as progress:
         found = verify_dataset(
             dataset,
             watermark=mark,
@@ -849,7 +862,7 @@ def verify(
             false_alarms=false_alarms,
             progress=progress,
         )
-    if report.json:
+    if json:
         print_json(found.to_json())
     else:
         print("\n".join(found.to_text(str(dataset))))
@@ -858,7 +871,7 @@ def verify(
 
 @app.command
 def stages(*, json: JsonFlag = False) -> int:
-    """List the stages that change echoes, point clouds or images, with their parameters.
+    """List the stages, weather and attacks among them, that change what sensors measure: their parameters.
 
     Parameters
     ----------
@@ -882,7 +895,9 @@ def stages(*, json: JsonFlag = False) -> int:
     print(columns(cells))
     print(
         "\nEvery stage also takes seed (of its random numbers; the drive's by default) and sensor (the only"
-        "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE (see docs/stages.md)."
+        "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE"
+        "\n(docs/stages.md). Attacks, from inject to patch, are also values of --attack (docs/attacks.md);"
+        "\nweather has shorter texts for --weather (docs/weather.md)."
     )
     return 0
 
@@ -997,7 +1012,7 @@ def selftest(
     full: bool = False,
     json: JsonFlag = False,
     markdown: bool = False,
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)] = False,
+    quiet: QuietFlag = False,
 ) -> int:
     """Check on this machine that errors stay within documented bounds in extreme cases.
 

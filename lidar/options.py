@@ -95,6 +95,15 @@ def _lower(_: object, tokens: Sequence[Token]) -> str:
     return tokens[0].value.lower()
 
 
+def _named(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    """Names in lower case, each with parameters as they are: values may be paths."""
+    pairs = (text.strip().partition(":") for text in tokens[0].value.split(",") if text.strip())
+    return tuple(name.lower() + colon + rest for name, colon, rest in pairs)
+
+
+NAMED = Parameter(converter=_named, n_tokens=1, metavar="NAME,...")
+
+
 def _settings(_: object, tokens: Sequence[Token]) -> tuple[tuple[str, str], ...]:
     return tuple(_pair(token.value) for token in tokens)
 
@@ -684,7 +693,7 @@ class ApplyOptions:
 class DefendOptions:
     """Options of defences on recorded data."""
 
-    defences: Annotated[tuple[str, ...], Parameter(name="--defence"), WORDS]
+    defences: Annotated[tuple[str, ...], Parameter(name="--defence"), NAMED]
     """Defences, separated by commas: NAME or NAME:KEY=VALUE:KEY=VALUE, or all that the data allow; lidar
     defences lists them."""
 
@@ -736,7 +745,7 @@ class SignOptions:
 class DenoiseOptions:
     """Options of filters on recorded clouds."""
 
-    methods: Annotated[tuple[str, ...], Parameter(name="--method"), WORDS]
+    methods: Annotated[tuple[str, ...], Parameter(name="--method"), NAMED]
     """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE:KEY=VALUE.
     docs/weather.md lists their parameters."""
 

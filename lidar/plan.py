@@ -31,7 +31,7 @@ from lidar.planning.road_drive import RoadPlan, plan_road_drive
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.specs import Rig, load_rig
 from lidar.rig.vehicle import Vehicle, load_vehicle
-from lidar.signal.stage import POSES, ROAD_USERS
+from lidar.signal.stage import LABELS, POSES, ROAD_USERS
 from lidar.time_scales import check_start
 from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
 from lidar.traffic.fcd import TrafficFile
@@ -270,8 +270,10 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
-    known = (POSES,) if options.traffic is None else (POSES, ROAD_USERS)
-    options.contents().stages.check({**sensor_kinds(rig), "scene": "scene"}, known=known)
+    stages = options.contents().stages
+    known = {POSES: True, ROAD_USERS: options.traffic is not None}
+    known[LABELS] = known[ROAD_USERS] or bool(stages.at("scene", "scene"))
+    stages.check({**sensor_kinds(rig), "scene": "scene"}, known=[need for need, has in known.items() if has])
     return sensors
 
 

@@ -12,7 +12,7 @@ from geoscene.typing import Float, Ints
 from lidar.physics.echoes import Origin
 from lidar.sensors.cloud import TracedCloud
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import LABELS, Stage, parameter
 
 _LEAST = 10
 """Returns of a road user that counts as a target."""
@@ -76,6 +76,11 @@ class Target(Region):
     target: str = parameter(
         "box", "returns in the box, or of the nearest road user", among=("box", "road_user")
     )
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Labels, by which road users are known."""
+        return (LABELS,) if self.target == "road_user" else ()
 
     def rows(self, cloud: TracedCloud, *, rng: np.random.Generator) -> Ints:
         """The returns (k,) to change; those of a road user are known by their labels."""

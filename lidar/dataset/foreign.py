@@ -28,7 +28,7 @@ KITTI, NUSCENES = FORMATS["kitti"], FORMATS["nuscenes"]
 def foreign_clouds(source: Path) -> list[tuple[Path, Format]]:
     """Point clouds of KITTI and nuScenes in a folder, in order."""
     found = []
-    for path in sorted(source.rglob("*.bin")):
+    for path in sorted(filter(Path.is_file, source.rglob("*.bin"))):
         if path.name.endswith(NUSCENES.suffix):
             found.append((path, NUSCENES))
         elif path.parent == source or any(

@@ -101,7 +101,11 @@ def read_calibration(path: Path | None = None) -> Calibration:
             for level, row in levels.items():
                 tails[defence, level] = _tail(row)
         return Calibration(tails, str(document["note"]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except FileNotFoundError:
+        raise InputError(f"{file}: is missing; lidar defend --calibrate makes one") from None
+    except KeyError as error:
+        raise InputError(f"{file}: is no calibration of defences ({error.args[0]} is missing)") from None
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{file}: is no calibration of defences ({error})") from None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,16 +19,18 @@ from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.camera.png import write_png
+from lidar.dataset.derived import check_target, complete_folder
 from lidar.dataset.layout import Dataset
 from lidar.defences.calibration import Calibration, calibration_text, tail_of
 from lidar.defences.fusion import FUSED, fused, fused_threshold
+from lidar.defences.observation import Observation
 from lidar.defences.reading import Scans, read_scans
 from lidar.defences.registry import NamedDefence
 from lidar.defences.run import Judged, able, judged_frames
 from lidar.defences.scores import FALSE_ALARMS, LEVELS, Samples, Score, score
-from lidar.defences.truth import FrameTruth, frame_truth
+from lidar.defences.truth import FrameTruth, attack_truth
 from lidar.defences.verdict import Verdict
-from lidar.errors import DatasetError
+from lidar.errors import DatasetError, InputError
 from lidar.random_streams import generator
 
 _Pairs = list[tuple[Float, NDArray[np.bool_]]]
@@ -88,15 +91,44 @@ def defend(
     rule: str = "",
     scene: Scene | None = None,
     out: Path | None = None,
+    overwrite: bool = False,
     seed: int = 0,
     progress: Progress = silent,
 ) -> Defended:
-    """Judge datasets by defences, score the verdicts and write them to ``out``.
+    """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
 
-    rule : of `lidar.defences.fusion.FUSIONS`, by which the verdicts are also fused; none if empty
+    rule      : of `lidar.defences.fusion.FUSIONS`, by which the verdicts are also fused; none if empty
+    overwrite : write to a directory that is not empty
 
-    Raises InputError if the data lack what a defence needs, before anything is written.
+    Raises InputError if the data lack what a defence needs, before anything is judged.
     """
+    for dataset in datasets:
+        if out is not None:
+            check_target(out, source=dataset.path, overwrite=overwrite)
+    with nullcontext() if out is None else complete_folder(out) as part:
+        return _defended(
+            datasets,
+            defences,
+            calibration=calibration,
+            rule=rule,
+            scene=scene,
+            out=part,
+            seed=seed,
+            progress=progress,
+        )
+
+
+def _defended(
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    calibration: Calibration,
+    rule: str,
+    scene: Scene | None,
+    out: Path | None,
+    seed: int,
+    progress: Progress,
+) -> Defended:
     job = _job(datasets, defences, scene=scene, seed=seed)
     defences = job.defences
     for named in defences:
@@ -114,7 +146,7 @@ def defend(
         if rule:
             judged.verdicts[FUSED] = fused(dict(judged.verdicts), calibration, rule=rule)
         frame = judged.frame
-        truth = frame_truth(scans.dataset, scans.sensor.name, frame=frame.number, count=len(frame))
+        truth = _truth_of(scans, frame)
         tally.add(judged, truth)
         if out is not None:
             tables.add(place, judged, truth=truth, thresholds=thresholds)
@@ -172,7 +204,7 @@ def calibrate(
     job, tally, names = _job(datasets, defences, scene=scene, seed=seed), Tally(), []
     for _, scans, judged in job.judged(progress):
         frame = judged.frame
-        truth = frame_truth(scans.dataset, scans.sensor.name, frame=frame.number, count=len(frame))
+        truth = _truth_of(scans, frame)
         if truth.attacked:
             raise DatasetError(f"{scans.dataset.path}: was attacked; calibrate on genuine data")
         tally.add(judged, truth)
@@ -196,11 +228,15 @@ class Job:
     def judged(self, progress: Progress) -> Iterator[tuple[Path, Scans, Judged]]:
         """The frames in order."""
         for place, scans in self.scans:
-            scene = self.scene
-            if any("scene" in named.defence.needs for named in self.defences) and scene is None:
-                scene = open_scene(scans.dataset.scene_path)
+            scene = self.scene_of(scans.dataset)
             for one in judged_frames(scans, self.defences, scene=scene, seed=self.seed, progress=progress):
                 yield place, scans, one
+
+    def scene_of(self, dataset: Dataset) -> Scene | None:
+        """The scene that a dataset is compared with; None if no defence needs one."""
+        if not any("scene" in named.defence.needs for named in self.defences):
+            return None
+        return open_scene(dataset.scene_path) if self.scene is None else self.scene
 
 
 def _job(
@@ -211,7 +247,21 @@ def _job(
     for k, dataset in enumerate(datasets):
         name = dataset.path.name if len(datasets) == 1 else f"{k}_{dataset.path.name}"
         scans += [(Path(name) / each.sensor.name, each) for each in read_scans(dataset)]
-    return Job(tuple(scans), tuple(able([each for _, each in scans], defences)), scene, seed)
+    job = Job(tuple(scans), tuple(able([each for _, each in scans], defences, scene=scene)), scene, seed)
+    for _, each in scans:
+        if (seen := job.scene_of(each.dataset)) is not None and seen.frame != each.dataset.frame:
+            raise InputError(
+                f"{seen.path}: is in another frame (CRS and origin) than {each.dataset.path};"
+                " give the scene that was driven in, or one in its frame"
+            )
+    return job
+
+
+def _truth_of(scans: Scans, frame: Observation) -> FrameTruth:
+    """What attacks did to a frame."""
+    seconds = frame.start_ns * 1e-9
+    name, count = scans.sensor.name, len(frame)
+    return attack_truth(scans.dataset, name, frame=frame.number, count=count, seconds=seconds)
 
 
 def _write_returns(path: Path, verdicts: dict[str, Verdict]) -> None:

@@ -84,6 +84,8 @@ def _read(text: str) -> NamedDefence:
             raise InputError(f"defence {text}: give NAME:KEY=VALUE:KEY=VALUE")
         if key not in known:
             raise InputError(f"defence {name}: no parameter {key!r} (known are {', '.join(known) or 'none'})")
+        if key in values:
+            raise InputError(f"defence {name}: {key} is given twice")
         try:
             values[key] = known[key](value)
         except ValueError:

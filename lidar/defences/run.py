@@ -11,6 +11,7 @@ import numpy as np
 
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.storage import url_of
 from lidar.defences.observation import Observation
 from lidar.defences.reading import Scans
 from lidar.defences.registry import NamedDefence
@@ -36,14 +37,17 @@ class Judged:
     seconds: dict[str, float]
 
 
-def able(scans: Sequence[Scans], defences: Sequence[NamedDefence]) -> list[NamedDefence]:
-    """The defences that the data of all scanners allow.
+def able(
+    scans: Sequence[Scans], defences: Sequence[NamedDefence], *, scene: Scene | None = None
+) -> list[NamedDefence]:
+    """The defences that the data of all scanners allow, and ``scene`` or those that they were driven in.
 
     Raises InputError if they lack what a defence needs that the user named, or if none is left.
     """
     found = []
     for named in defences:
-        texts = (_lacks(each, needs=named.defence.needs) for each in scans)
+        needs = named.defence.needs if scene is None else named.defence.needs - {"scene"}
+        texts = (_lacks(each, needs=needs) for each in scans)
         lacks = [text for text in (named.defence.lacks, *texts) if text]
         if lacks and named.named:
             raise InputError(f"defence {named.name}: {lacks[0]}")
@@ -61,6 +65,9 @@ def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
         return f"needs colour images, and {path} has none"
     if "navigation" in needs and scans.navigation is None:
         return f"needs a GNSS receiver and an inertial unit, and the rig of {path} lacks one"
+    place = scans.dataset.scene_path
+    if "scene" in needs and not (url_of(place) or place.exists()):
+        return f"needs the scene {place} of {path}, which is missing; give `scene`"
     if "watermark" in needs and "watermark" not in scans.dataset.manifest["recipe"]:
         return f"needs clouds with a watermark (lidar sign), and {path} has none"
     if "firing_jitter" in needs and not scans.sensor.firing_jitter_ns:

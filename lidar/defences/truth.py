@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from geoscene.typing import Float
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
 from lidar.physics.echoes import Origin
+from lidar.signal.registry import acts_on, attack_names
 
 ATTACKS = (Origin.INJECTED, Origin.REPLAYED, Origin.MOVED)
 """Causes of returns that an attack gives."""
@@ -42,6 +43,26 @@ class FrameTruth:
         return np.array(
             [len(rows) > 0 and self.returns[rows].mean() >= FORGED_SHARE for rows in members], bool
         )
+
+
+def attack_truth(dataset: Dataset, sensor: str, *, frame: int, count: int, seconds: float) -> FrameTruth:
+    """As `frame_truth`; returns that are missing count only while an attack on the sensor's returns goes on.
+
+    Weather, lost packets and dirt take returns, too, and are no attacks.
+
+    seconds : of the frame's start since the drive's start
+    """
+    truth = frame_truth(dataset, sensor, frame=frame, count=count)
+    recipe = dataset.manifest["recipe"]
+    with reading_file(dataset.paths.manifest):
+        stages = [table for key in ("stages", "applied_stages") for table in recipe.get(key, ())]
+        goes_on = any(
+            table["name"] in attack_names()
+            and acts_on(table, sensor, kind="lidar")
+            and table["start"] <= seconds < table["stop"]
+            for table in stages
+        )
+    return truth if goes_on else replace(truth, removed_xyz=truth.removed_xyz[:0])
 
 
 def frame_truth(dataset: Dataset, sensor: str, *, frame: int, count: int) -> FrameTruth:

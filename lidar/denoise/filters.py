@@ -133,9 +133,14 @@ METHODS: dict[str, type[Filter]] = {
 def read_methods(texts: Iterable[str]) -> dict[str, Filter]:
     """Filters by their text ``NAME`` or ``NAME:KEY=VALUE:KEY=VALUE``.
 
-    Raises InputError for a filter or parameter that is unknown, a value out of its bounds, or no text.
+    Raises InputError for a filter or parameter that is unknown or given twice, a value out of its bounds, or
+    no text.
     """
-    found = {text.strip(): _read(text.strip()) for text in texts}
+    found: dict[str, Filter] = {}
+    for text in map(str.strip, texts):
+        if text in found:
+            raise InputError(f"method {text}: given twice")
+        found[text] = _read(text)
     if not found:
         raise InputError(f"`method`: give one or more of {', '.join(METHODS)}")
     return found
@@ -155,6 +160,8 @@ def _read(text: str) -> Filter:
             raise InputError(f"method {text}: give NAME:KEY=VALUE:KEY=VALUE")
         if key not in known:
             raise InputError(f"method {name}: no parameter {key!r} (known are {', '.join(known)})")
+        if key in values:
+            raise InputError(f"method {name}: {key} is given twice")
         try:
             values[key] = known[key](value)
         except ValueError:

@@ -110,7 +110,7 @@ class Stages:
         """Raise InputError for a stage that acts on none of the sensors, or needs what is not known.
 
         sensors : kind by name
-        known   : of `POSES` and `ROAD_USERS`
+        known   : of `POSES`, `ROAD_USERS` and `LABELS`
         """
         for named in self.stages:
             if missing := [need for need in named.stage.requires if need not in known]:
@@ -137,6 +137,11 @@ def stage_class(name: str) -> type[Stage]:
         raise InputError(f"stage {name!r} is unknown{hint} (known are {', '.join(_STAGES)})")
     module, _, kind = _STAGES[name].rpartition(".")
     return cast("type[Stage]", getattr(import_module(f"lidar.{module}"), kind))
+
+
+def attack_names() -> list[str]:
+    """Names of the stages that are attacks."""
+    return [name for name, place in _STAGES.items() if place.startswith("attacks.")]
 
 
 def read_stage(table: Mapping[str, Any]) -> NamedStage:
@@ -236,9 +241,8 @@ def _read_all(texts: Iterable[str], kind: str) -> list[NamedStage]:
 def _read_kind(table: Mapping[str, Any], kind: str) -> NamedStage:
     """A stage from a table; raises InputError, also for a stage that is no attack where attacks are read."""
     named = read_stage(table)
-    attacks = [name for name, place in _STAGES.items() if place.startswith("attacks.")]
-    if kind == "attack" and named.name not in attacks:
-        raise InputError(f"stage {named.name} is no attack (attacks are {', '.join(attacks)})")
+    if kind == "attack" and named.name not in attack_names():
+        raise InputError(f"stage {named.name} is no attack (attacks are {', '.join(attack_names())})")
     return named
 
 
@@ -265,6 +269,8 @@ def _text_table(text: str) -> Mapping[str, Any]:
         left, equals, value = (part.strip() for part in pair.partition("="))
         if equals:
             key = left
+            if key in table:
+                raise InputError(f"stage {text}: {key} is given twice")
             table[key] = _value(value, kinds.get(key, str))
         elif key and kinds.get(key) is str:
             table[key] += f",{left}"  # a value with commas, such as a place

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
     from lidar.navigation.gnss import Fixes
     from lidar.navigation.imu import Inertial
 
-POSES, ROAD_USERS = "poses and time", "road users"
+POSES = "poses and time"
+ROAD_USERS = "road users (lidar drive --traffic)"
+LABELS = "labelled road users (lidar drive --traffic, in a format with classes and instances)"
 """What some drives and recorded data know, and others do not."""
 
 T = TypeVar("T", bool, int, float, str)
@@ -70,6 +72,9 @@ class Stage:
         """Validate the parameters, all faults in one message."""
         if faults := [fault for f in fields(self) if (fault := _fault(f, getattr(self, f.name)))]:
             raise InputError("; ".join(faults))
+        start, stop = getattr(self, "start", -inf), getattr(self, "stop", inf)
+        if stop <= start:
+            raise InputError(f"stop = {stop:g} is not after start = {start:g}")
 
     @property
     def settings(self) -> tuple[tuple[str, str], ...]:
@@ -83,7 +88,7 @@ class Stage:
 
     @property
     def requires(self) -> tuple[str, ...]:
-        """What the stage must know of a drive: `POSES`, `ROAD_USERS`."""
+        """What the stage must know of a drive: `POSES`, `ROAD_USERS`, `LABELS`."""
         return ()
 
     @property
@@ -109,8 +114,15 @@ def _fault(declared: Any, value: Any) -> str:
     if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
         return f"{name} = {value!r} is not {'a whole number' if kind is int else 'a number'}"
     if not (isfinite(value) and bounds["low"] <= value <= bounds["high"]):
-        return f"{name} = {value:g} is not within {bounds['low']:g} to {bounds['high']:g}"
+        return f"{name} = {value:g} is not {_interval(bounds['low'], bounds['high'])}"
     return ""
+
+
+def _interval(low: float, high: float) -> str:
+    """The bounds of a parameter in words."""
+    if isfinite(high):
+        return f"within {low:g} to {high:g}"
+    return f"a finite number of {low:g} or more" if isfinite(low) else "a finite number"
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,6 +77,7 @@ _UNITS = {
     "mm": {"mm": 1.0, "cm": 10.0},
     "": {},
 }
+_CENTRE = {"longitude", "latitude", "radius"}
 _AMOUNT = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\S*)\s*")
 
 
@@ -186,8 +187,9 @@ def _faults(setting: WeatherSetting, kind: Kind) -> list[str]:
     amounts = {"amount": setting.amount}
     if setting.amount_to != -1:
         amounts["amount_to"] = setting.amount_to
+    bounds = f"within {kind.low:g} to {kind.high:g}" if kind.high else "0: it has no amount"
     faults += [
-        f"{name} = {value:g} {kind.unit} of {setting.kind} is not within {kind.low:g} to {kind.high:g}"
+        f"{name} = {value:g} {kind.unit}".rstrip() + f" of {setting.kind} is not {bounds}"
         for name, value in amounts.items()
         if not kind.low <= value <= kind.high
     ]
@@ -202,6 +204,8 @@ def _faults(setting: WeatherSetting, kind: Kind) -> list[str]:
         faults.append("amount_to needs an end")
     if setting.polygon and setting.radius:
         faults.append("a place is a polygon or a centre with radius, not both")
+    if setting.edge and not (setting.radius or setting.polygon):
+        faults.append("edge belongs to a place: a polygon or a centre with radius")
     if setting.polygon:
         faults += _polygon_faults(setting)
     return faults
@@ -240,6 +244,8 @@ def read_weather(text: str) -> tuple[WeatherSetting, ...]:
         if name in KINDS:
             tables.append({"kind": name} | ({"amount": value} if equals else {}))
         elif tables and equals:
+            if name in tables[-1]:
+                raise InputError(f"weather {text!r}: {name} is given twice")
             tables[-1][name] = _number(value)
         else:
             known = ", ".join(KINDS)
@@ -269,6 +275,10 @@ def _of_file(path: Path) -> tuple[WeatherSetting, ...]:
 
 def _row(table: Mapping[str, Any]) -> dict[str, Any]:
     """A table of a file with the names of `WeatherSetting`."""
+    names = [{"start": "from", "end": "to"}.get(f.name, f.name) for f in fields(WeatherSetting)]
+    if unknown := [key for key in table if key not in (*names, "start", "end", "centre", "interpolation")]:
+        known = ", ".join([*names, "centre", "interpolation"])
+        raise InputError(f"no parameter {unknown[0]!r} (known are {known})")
     row = {{"from": "start", "to": "end"}.get(key, key): value for key, value in table.items()}
     if "kind" not in row:
         raise InputError("kind is missing")
@@ -299,6 +309,8 @@ def _setting(table: Mapping[str, Any]) -> WeatherSetting:
     known = [f.name for f in fields(WeatherSetting)]
     if unknown := [key for key in table if key not in known]:
         raise InputError(f"no parameter {unknown[0]!r} (known are {', '.join(known)})")
+    if missing := _CENTRE - table.keys() if _CENTRE & table.keys() else ():
+        raise InputError(f"a centre needs longitude, latitude and radius; {min(missing)} is missing")
     values = dict(table)
     kind = KINDS.get(values["kind"]) if isinstance(values["kind"], str) else None
     if kind is None:

@@ -154,12 +154,15 @@ def point_labels(cloud: Cloud, actors: Actors | None) -> PointLabels:
 def read_rows(path: Path, columns: int) -> NDArray[np.float32]:
     """The rows (n, columns) of a file of little-endian float32 without a header.
 
-    Raises FormatError for a file whose length does not fit.
+    Raises FormatError for a file whose length does not fit, or with numbers that are not finite.
     """
     data = path.read_bytes()
     if len(data) % (4 * columns):
         raise FormatError(f"{path}: {len(data)} bytes are not rows of {columns} float32")
-    return np.frombuffer(data, "<f4").reshape(-1, columns).astype(np.float32)
+    found = np.frombuffer(data, "<f4").reshape(-1, columns).astype(np.float32)
+    if len(bad := np.flatnonzero(~np.isfinite(found).all(axis=1))):
+        raise FormatError(f"{path}: row {bad[0]} has a number that is not finite, as have {len(bad)} in all")
+    return found
 
 
 def number_in_header(path: Path, start: bytes) -> int:

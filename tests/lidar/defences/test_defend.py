@@ -13,6 +13,7 @@ from lidar.dataset.formats import FORMATS, read_table
 from lidar.dataset.layout import open_dataset
 from lidar.defences.calibration import read_calibration
 from lidar.defences.defend import calibrate, defend
+from lidar.defences.physics import Physics
 from lidar.defences.reading import SEEN, read_scans
 from lidar.defences.registry import defence_names, read_defences
 from lidar.defences.run import DETECTOR
@@ -182,6 +183,91 @@ def test_calibration_takes_genuine_data_alone(plain, attacked, tmp_path):
     assert not (tmp_path / "d.toml").exists()
 
 
+def test_verdicts_are_written_whole_or_not_at_all_and_never_into_the_data(attacked, tmp_path, monkeypatch):
+    dataset, chosen = open_dataset(attacked), read_defences(["physics"])
+    before = sorted(attacked.rglob("*"))
+    for inside in (attacked, attacked / "verdicts"):
+        with pytest.raises(InputError, match="give a directory outside of"):
+            defend([dataset], chosen, calibration=CALIBRATION, out=inside, overwrite=True)
+    judge, seen = Physics.judge, []
+
+    def judge_or_fail(self, frames, **given):
+        seen.append(frames)
+        if len(seen) == 3:
+            raise OSError("the disk is gone")
+        return judge(self, frames, **given)
+
+    monkeypatch.setattr(Physics, "judge", judge_or_fail)
+    with pytest.raises(OSError, match="the disk is gone"):
+        defend([dataset], chosen, calibration=CALIBRATION, out=tmp_path / "out")
+    assert sorted(attacked.rglob("*")) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_map_of_another_place_is_refused(attacked, scene, tmp_path):
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(attacked, elsewhere)
+    document = json.loads((elsewhere / "dataset.json").read_text())
+    document["frame"]["origin"][0] += 1000.0
+    (elsewhere / "dataset.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"is in another frame \(CRS and origin\) than .*elsewhere"):
+        defend(
+            [open_dataset(elsewhere)],
+            read_defences(["map"]),
+            calibration=CALIBRATION,
+            scene=scene,
+            out=tmp_path / "out",
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def test_all_leaves_the_map_out_where_the_scene_is_gone(attacked, scene, tmp_path):
+    moved = tmp_path / "moved"
+    shutil.copytree(attacked, moved)
+    document = json.loads((moved / "dataset.json").read_text())
+    document["scene"]["path"] = "gone"
+    (moved / "dataset.json").write_text(json.dumps(document))
+    chosen, lone = read_defences(["all"]), read_defences(["map"])
+    found = defend([open_dataset(moved)], chosen, calibration=CALIBRATION)
+    assert {*UNSIGNED, DETECTOR} - set(found.seconds) == {"map"}
+    with pytest.raises(InputError, match=r"defence map: needs the scene .*gone.*, which is missing"):
+        defend([open_dataset(moved)], lone, calibration=CALIBRATION)
+    assert defend([open_dataset(moved)], lone, calibration=CALIBRATION, scene=scene).frames == 5
+
+
+def test_what_fog_takes_is_no_attack(plain, tmp_path):
+    physics, fog = read_defences(["physics"]), "weather:kind=fog,amount=50,sensor=top"
+    for name, attacks, expected in (
+        ("foggy", (), "00000"),
+        ("removed", ("remove:start=0.2,stop=0.4",), "00110"),
+    ):
+        apply_stages(plain, tmp_path / name, options=ApplyOptions(read_stages([fog, *attacks]).stages))
+        dataset = open_dataset(tmp_path / name)
+        assert len(np.load(dataset.paths.truth("top", 0))["removed"]) > 100
+        defend([dataset], physics, calibration=CALIBRATION, out=tmp_path / "verdicts", overwrite=True)
+        with (tmp_path / "verdicts" / "frames.csv").open() as file:
+            assert "".join(row["attacked"] for row in csv.DictReader(file)) == expected
+    calibrate([open_dataset(tmp_path / "foggy")], physics, out=tmp_path / "foggy.toml")
+    with pytest.raises(DatasetError, match="was attacked"):
+        calibrate([open_dataset(tmp_path / "removed")], physics, out=tmp_path / "removed.toml")
+
+
+def test_names_of_defences_have_any_case_and_their_values_keep_it(attacked, tmp_path):
+    (tmp_path / "Secret.KEY").write_text("00112233445566778899aabbccddeeff")
+    refused = run_program(
+        "lidar", "defend", attacked, "--defence", f"Physics,watermark:key={tmp_path / 'Secret.KEY'}", "-q"
+    )
+    assert "watermark: needs clouds with a watermark" in refused.stderr
+
+
+def test_a_file_that_is_no_calibration_says_why(tmp_path):
+    (tmp_path / "c.toml").write_text('note = "x"')
+    with pytest.raises(InputError, match=r"no calibration of defences \(defence is missing\)"):
+        read_calibration(tmp_path / "c.toml")
+    with pytest.raises(InputError, match=r"nowhere.toml: is missing; lidar defend --calibrate"):
+        read_calibration(tmp_path / "nowhere.toml")
+
+
 def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
     listed = json.loads(run_program("lidar", "defences", "--json").stdout)
     assert [row["name"] for row in listed["defences"]] == defence_names()
@@ -191,7 +277,7 @@ def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
     assert json.loads((tmp_path / "out" / "defend.json").read_text())["options"][0]["cell"] == 0.5
     for extra, message in {
         ("--defence", "oclusion"): "is occlusion meant",
-        ("--defence", "physics", "-o", str(tmp_path / "out")): "exists already",
+        ("--defence", "physics", "-o", str(tmp_path / "out")): "is not empty",
         ("--defence", "physics", "--fuse", "mean"): "max or fisher",
         ("--defence", "physics", "--calibrate"): "give --out",
         ("--defence", "physics", "--calibration", str(attacked / "dataset.json")): "no calibration",

@@ -114,6 +114,7 @@ def test_scores_of_counts():
         ("dror:angel=1", "no parameter 'angel'"),
         ("lior:neighbours=2.5", "not a whole number"),
         ("lior:5", "give NAME:KEY=VALUE"),
+        ("lior:range=5:range=6", "method lior: range is given twice"),
     ],
 )
 def test_faulty_methods_end_in_one_line(text, match, tmp_path):
@@ -211,6 +212,8 @@ def test_what_cannot_be_filtered_is_refused_with_nothing_written(snowy, tmp_path
     methods = read_methods(["dror"])
     with pytest.raises(DatasetError, match="no velodyne"):
         denoise(tmp_path, methods, out=tmp_path.parent / "out")
+    with pytest.raises(InputError, match="method dror: given twice"):
+        read_methods(["dror", "dror"])
     with pytest.raises(InputError, match="one method, not of 2"):
         denoise(snowy, read_methods(["dror", "lior"]), out=tmp_path / "out")
     with pytest.raises(InputError, match="outside of"):

@@ -109,7 +109,7 @@ def test_measurements_change_and_the_truth_of_both_stays(plain, altered):
 
 
 def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered, tmp_path):
-    apply_stages(plain, tmp_path / "a", options=ApplyOptions(STAGES))
+    assert apply_stages(plain, tmp_path / "a", options=ApplyOptions(STAGES)).files == 2
     for name in ("roof.csv", "roof.nmea", "roof.truth.csv", "unit.csv", "unit.truth.csv"):
         assert (tmp_path / "a" / name).read_bytes() == (altered / name).read_bytes(), name
     apply_stages(plain, tmp_path / "b", options=ApplyOptions(STAGES[1:]))

@@ -212,6 +212,41 @@ def test_stages_refuse_data_without_clouds_or_matching_sensors(plain, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_road_users_are_a_target_only_where_labels_tell_of_them(scene, plain, tmp_path):
+    attack = ("--attack", "delete:target=road_user", "-o", tmp_path / "out", "-q")
+    (tmp_path / "kitti" / "velodyne").mkdir(parents=True)
+    np.ones((5, 4), "<f4").tofile(tmp_path / "kitti" / "velodyne" / "000000.bin")
+    shutil.copytree(plain, tmp_path / "alone")
+    (tmp_path / "alone" / "boxes.csv").unlink(missing_ok=True)
+    for words in (
+        ("apply", tmp_path / "kitti"),
+        ("apply", tmp_path / "alone"),
+        ("drive", scene.path, "--route", "random", "--duration", "0.5"),
+    ):
+        refused = program(*words, *attack)
+        assert refused.returncode == 2
+        assert "stage delete needs labelled road users (lidar drive --traffic" in refused.stderr
+        assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("name", "columns"), [("velodyne/000000.bin", 4), ("LIDAR_TOP/a.pcd.bin", 5)])
+def test_clouds_with_numbers_that_are_not_finite_name_the_file_and_the_row(name, columns, tmp_path):
+    rows = np.ones((9, columns), "<f4")
+    rows[4, 2], rows[7, 3] = np.nan, np.inf
+    path = tmp_path / "in" / name
+    path.parent.mkdir(parents=True)
+    rows.tofile(path)
+    for words in (
+        ("apply", tmp_path / "in", "--weather", "fog=50m"),
+        ("denoise", tmp_path / "in", "--method", "dror"),
+    ):
+        refused = program(*words, "-o", tmp_path / "out", "-q")
+        assert refused.returncode == 2
+        assert f"{path}: row 4 has a number that is not finite, as have 2 in all" in refused.stderr
+        assert refused.stderr.count("\n") == 1
+        assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     "name",
     ["top/labels/000001.label", "top/boxes/000001.csv", "front/boxes/000000.csv", "top/pcd/000000.pcd"],

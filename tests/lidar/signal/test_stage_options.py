@@ -132,6 +132,8 @@ def test_files_of_attacks_hold_attacks_only(tmp_path):
         file.write_text(text)
         with pytest.raises(InputError, match=match):
             read_attacks([str(file)])
+    with pytest.raises(InputError, match="power is given twice"):
+        read_attacks(["blinding:power=3,power=4"])
     with pytest.raises(InputError, match="give one or more of `stages`, `weather` and `attacks`"):
         ApplyOptions()
 

@@ -36,6 +36,11 @@ def test_texts_give_kind_and_amount_in_its_unit():
         ("rain=3,gust=5", "no parameter 'gust' (known are kind, amount"),
         ("rain=3,start=9,end=4", "end = 4 is not after start = 9"),
         ("rain=3,amount_to=4", "amount_to needs an end"),
+        ("clear=3", "amount = 3 of clear is not 0: it has no amount"),
+        ("rain=3,wind=1,wind=2", "wind is given twice"),
+        ("fog=50m,radius=10", "a centre needs longitude, latitude and radius; latitude is missing"),
+        ("fog=50m,longitude=7,latitude=50", "radius is missing"),
+        ("fog=50m,edge=10", "edge belongs to a place"),
         ("nowhere.toml", "nowhere.toml: cannot be read as TOML"),
     ],
 )
@@ -84,7 +89,11 @@ def test_files_have_weather_over_time_and_place(tmp_path):
         ('kind = "fog"\namount = 9\npolygon = [[7.0, 50.0], [7.1]]', "polygon is [[longitude, latitude]"),
         ('kind = "fog"\namount = 9\npolygon = "0 0, 1 1, 1 0, 0 1"', "its sides may not cross"),
         ('kind = "fog"\namount = 9\ninterpolation = "cubic"', "interpolation is step, or linear"),
-        ('kind = "fog"\namount = nan', "amount = nan"),
+        ('kind = "fog"\namount = nan', "amount = nan is not a finite number"),
+        (
+            'kind = "fog"\namount = 9\nfog = 3',
+            "no parameter 'fog' (known are kind, amount, amount_to, from, to",
+        ),
     ],
 )
 def test_bad_files_name_the_table(tmp_path, table, message):
