@@ -47,12 +47,16 @@ def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, devi
     power = received(sensor, echoes)
     measured = power
     if settings.detection:
-        noise = daylight_noise(sensor.noise_ratio, settings.daylight_lux)
-        sigma = noise_of(power, noise, signal_noise=sensor.signal_noise)
+        sigma = noise_of(power, added_noise(sensor, settings), signal_noise=sensor.signal_noise)
         measured = power + sigma * deviates("detection", echoes)
     seen = measured > 1
     apparent = echoes.apparent * measured / np.maximum(power, 1e-300)
     return replace(echoes, apparent=apparent).take(seen)
+
+
+def added_noise(sensor: Sensor, settings: ScannerSettings) -> float:
+    """Noise over threshold that the detector adds to echoes of no power; 0 without ``detection``."""
+    return daylight_noise(sensor.noise_ratio, settings.daylight_lux) if settings.detection else 0.0
 
 
 def false_echoes(

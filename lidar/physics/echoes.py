@@ -104,12 +104,6 @@ def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
     return both.take(np.lexsort((both.range, both.pulse)))
 
 
-def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
-    """All rows, sorted by pulse; no pulse may be in both."""
-    both = type(first).concatenate((first, other))
-    return both.take(np.argsort(both.pulse, kind="stable"))
-
-
 def merged(surfaces: EchoesT, separation: float, *, gap: Gap = AXIS_ONLY) -> EchoesT:
     """The echoes of pulses that hit these surfaces.
 
@@ -127,6 +121,30 @@ def merged(surfaces: EchoesT, separation: float, *, gap: Gap = AXIS_ONLY) -> Ech
     columns = surfaces.range, surfaces.apparent, surfaces.axis, surfaces.cosine
     count = _merge(starts, columns, separation, gap, bearer, place, power)
     return replace(surfaces.take(bearer[:count]), range=place[:count], apparent=power[:count])
+
+
+def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
+    """All rows, sorted by pulse; no pulse may be in both."""
+    both = type(first).concatenate((first, other))
+    return both.take(np.argsort(both.pulse, kind="stable"))
+
+
+def mixed(echoes: EchoesT, is_new: NDArray[np.bool_], *, pulses: int, separation: float) -> EchoesT:
+    """Echoes in any order, sorted by pulse and range, and merged as by `merged` where a pulse has new ones.
+
+    Echoes of pulses without new ones stay as they are, in the order in which they come. An echo of several
+    has the columns of the one that sends back most, whatever is on the beam's axis.
+
+    is_new : (m,)
+    pulses : number of pulses
+    """
+    m = len(echoes)
+    if not is_new.any() and np.all(echoes.pulse[1:] >= echoes.pulse[:-1]):
+        return echoes
+    bearer, place, power = np.empty(m, np.int64), np.empty(m), np.empty(m)
+    columns = echoes.pulse, echoes.range, echoes.apparent, is_new
+    count = _mix(columns, pulses, separation, bearer, place, power)
+    return replace(echoes.take(bearer[:count]), range=place[:count], apparent=power[:count])
 
 
 @inlined
@@ -217,6 +235,41 @@ def _merge(starts: Any, columns: Any, separation: Any, gap: Any, bearer: Any, pl
         for i in range(size):
             insert(row, i, first + i, distance)
         count = gather(row, size, distance, apparent, axis, depth, separation, count, bearer, place, power)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _mix(columns: Any, pulses: Any, separation: Any, bearer: Any, place: Any, power: Any) -> Any:
+    """Fill the columns of the echoes, pulse by pulse, and return their number."""
+    pulse, distance, apparent, is_new = columns
+    first = np.zeros(pulses + 1, np.int64)
+    changed = np.zeros(pulses, np.bool_)
+    for i in range(len(pulse)):
+        first[pulse[i] + 1] += 1
+        changed[pulse[i]] |= is_new[i]
+    for p in range(pulses):
+        first[p + 1] += first[p]
+    rows = np.empty(len(pulse), np.int64)
+    free = first[:-1].copy()
+    for i in range(len(pulse)):
+        rows[free[pulse[i]]] = i
+        free[pulse[i]] += 1
+    nowhere, flat = np.zeros(len(pulse), np.bool_), np.zeros(len(pulse))
+    row = np.empty(256, np.int64)
+    count = 0
+    for p in range(pulses):
+        size = first[p + 1] - first[p]
+        if not changed[p] or size == 1:
+            for k in range(first[p], first[p + 1]):
+                i = rows[k]
+                bearer[count], place[count], power[count] = i, distance[i], apparent[i]
+                count += 1
+            continue
+        if size > len(row):
+            row = np.empty(2 * size, np.int64)
+        for k in range(size):
+            insert(row, k, rows[first[p] + k], distance)
+        count = gather(row, size, distance, apparent, nowhere, flat, separation, count, bearer, place, power)
     return count
 
 

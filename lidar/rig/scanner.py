@@ -110,7 +110,7 @@ class Sensor:
     falloff: float = 2.0
     weak_sigma: tuple[float, float] = WEAK_SIGMA
     note: str = ""
-    source: dict[str, str] = field(default_factory=dict)
+    source: dict[str, str] = field(default_factory=dict, compare=False)
 
     def frame_start_ns(self, frame: int) -> int:
         """Start of a frame, nanoseconds since the drive's start."""

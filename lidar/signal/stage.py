@@ -137,6 +137,7 @@ class Pulses(Columns):
     column     : (n,) int32, firing block within the frame
     channel    : (n,) uint16, number of the laser
     power      : (n,) transmitted power over that of the sensor's nominal pulse
+    noise      : standard deviation of the noise that the detector adds to echoes, over the threshold
     """
 
     sensor: Sensor
@@ -147,6 +148,7 @@ class Pulses(Columns):
     column: NDArray[np.int32]
     channel: NDArray[np.uint16]
     power: Float
+    noise: float = 0.0
 
     def received(self, echoes: Echoes) -> Float:
         """Power (m,) of echoes over the detection threshold."""
@@ -166,10 +168,10 @@ class Pulses(Columns):
         )
 
 
-def pulses_of(sensor: Sensor, sent: Firings) -> Pulses:
-    """The pulses that a sensor sends, all with its nominal power."""
+def pulses_of(sensor: Sensor, sent: Firings, *, noise: float = 0.0) -> Pulses:
+    """The pulses that a sensor sends, all with its nominal power; noise as of `Pulses`."""
     columns = (sent.time_ns, sent.direction, sent.origin, sent.ring, sent.column, sent.channel)
-    return Pulses(sensor, *columns, np.ones(len(sent)))
+    return Pulses(sensor, *columns, np.ones(len(sent)), noise)
 
 
 def added_echoes(

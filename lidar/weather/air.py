@@ -6,28 +6,25 @@ from dataclasses import replace
 from math import pi
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.physics.echoes import Origin, TracedEchoes
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, added_echoes
 from lidar.weather.backscatter import (
+    Found,
     drawn_particles,
+    even_echo,
     least_power,
-    particles,
+    noticed,
     pulse_shape,
-    response_ranges,
-    soft_target,
+    scattering,
     strength,
 )
 from lidar.weather.fields import Field, Rays, amounts, rays_of, strongest_response
 from lidar.weather.media import Medium
 
 _STEP = 0.25  # metres of range between samples of a field's response
-
-Found = tuple[NDArray[np.int64], Float, Float]
-"""Pulse, range and power over the threshold of echoes."""
 
 
 def through_air(
@@ -47,43 +44,29 @@ def through_air(
     """
     if medium.extinction <= 0 or (field is not None and not field.share.any()):
         return echoes
-    rays = None
-    if field is not None:
-        rays = rays_of(pulses.origin, pulses.direction, time_ns=pulses.time_ns, at=at)
+    sensor, least = pulses.sensor, least_power(pulses.noise)
+    some, rest, distance = scattering(sensor, medium, lens=lens)
     end = _beam_ends(pulses, echoes)
-    some, backscatter, distance = None, np.empty(0), response_ranges(pulses.sensor)
-    if len(medium.diameter):
-        some, backscatter, distance = particles(pulses.sensor, medium, lens=lens)
-    else:
-        backscatter = np.full(len(distance), medium.backscatter)
     found: Found = np.empty(0, np.int64), np.empty(0), np.empty(0)
     if some is not None:
-        pulse, place, power = drawn_particles(some, len(pulses), rng=rng)
-        before = place < end[pulse]
-        found = pulse[before], place[before], power[before]
-    on = np.concatenate((echoes.pulse.astype(np.int64), found[0]))
-    away: Float = np.concatenate((echoes.range, found[1]))
-    here, column = np.ones(len(on)), away
-    if field is not None and rays is not None:
-        here, column = amounts(field, rays, pulse=on, distance=away)
-    passed = np.exp(-2 * medium.extinction * column)
-    m = len(echoes)
-    single = _noticed(pulses, (found[0], found[1], found[2] * passed[m:]), share=here[m:], rng=rng)
-    if field is None or rays is None:
-        soft = soft_target(
-            pulses.sensor, medium.extinction, backscatter=backscatter, distance=distance, lens=lens
-        )
-        place, power = soft.at(end)
+        found = drawn_particles(some, end, extinction=0.0 if field else medium.extinction, rng=rng)
+    if field is None:
+        column = echoes.range
+        soft = _even_response(pulses, end, medium=medium, lens=lens, rng=rng)
     else:
-        place, power = _field_response(
-            pulses, (field, rays), end=end, medium=medium, rest=(distance, backscatter), lens=lens
+        rays = rays_of(pulses.origin, pulses.direction, time_ns=pulses.time_ns, at=at)
+        _, column = amounts(field, rays, pulse=echoes.pulse, distance=echoes.range)
+        found = _in_field(found, (field, rays), extinction=medium.extinction, rng=rng)
+        soft = _field_response(
+            pulses, (field, rays), end=end, medium=medium, rest=(distance, rest), lens=lens
         )
-    seen = np.flatnonzero(power > least_power(pulses.sensor))
-    pulse = np.concatenate((seen, single[0]))
-    place, power = np.concatenate((place[seen], single[1])), np.concatenate((power[seen], single[2]))
+    single = noticed(found, pulses=len(pulses), least=least, separation=sensor.echo_separation)
+    dimmed = replace(echoes, apparent=echoes.apparent * np.exp(-2 * medium.extinction * column))
+    pulse, place, power = (np.concatenate(both) for both in zip(soft, single, strict=True))
+    if not len(pulse):
+        return dimmed
     apparent = pulses.apparent(power * pulses.power[pulse], place)
     added = added_echoes(pulse, place, apparent=apparent, origin=Origin.WEATHER)
-    dimmed = replace(echoes, apparent=echoes.apparent * passed[:m])
     return TracedEchoes.concatenate((dimmed, added))
 
 
@@ -94,15 +77,26 @@ def _beam_ends(pulses: Pulses, echoes: TracedEchoes) -> Float:
     return end
 
 
-def _noticed(pulses: Pulses, found: Found, *, share: Float, rng: np.random.Generator) -> Found:
-    """The particles that are there, of pulses whose particles together the detector may notice."""
+def _in_field(
+    found: Found, where: tuple[Field, Rays], *, extinction: float, rng: np.random.Generator
+) -> Found:
+    """The particles that are there in a medium that differs from place to place, dimmed by it."""
     pulse, place, power = found
-    if np.any(share < 1):
-        there = rng.random(len(share)) < share
-        pulse, place, power = pulse[there], place[there], power[there]
-    together = np.bincount(pulse, power, minlength=len(pulses))
-    seen = together[pulse] > least_power(pulses.sensor)
-    return pulse[seen], place[seen], power[seen]
+    share, column = amounts(*where, pulse=pulse, distance=place)
+    there = rng.random(len(share)) < share
+    return pulse[there], place[there], (power * np.exp(-2 * extinction * column))[there]
+
+
+def _even_response(
+    pulses: Pulses, end: Float, *, medium: Medium, lens: float, rng: np.random.Generator
+) -> Found:
+    """The echoes of the soft target of even air that the detector may notice."""
+    soft = even_echo(pulses.sensor, medium, lens=lens, noise=pulses.noise)
+    row = soft.row(end)
+    seen = np.flatnonzero((row >= 0) & (soft.power > least_power(pulses.noise))[row])
+    row = row[seen]
+    place = np.minimum(soft.places(row, rng.random(len(seen))), end[seen])
+    return seen, place, soft.power[row]
 
 
 def _field_response(
@@ -113,8 +107,8 @@ def _field_response(
     medium: Medium,
     rest: tuple[Float, Float],
     lens: float,
-) -> tuple[Float, Float]:
-    """Range and power (n,) of the soft target of a medium that differs from place to place."""
+) -> Found:
+    """The echoes of the soft target of a medium that differs from place to place, at its maxima."""
     sensor = pulses.sensor
     reach = float(min(sensor.max_range, 300.0))
     distance = _STEP * np.linspace(0.5, int(reach / _STEP) - 0.5, int(reach / _STEP))
@@ -123,7 +117,7 @@ def _field_response(
     near = sensor.min_range - sensor.pattern.range_offset
     white = pi * backscatter * strength(sensor, distance, lens=lens) * _STEP
     shape = pulse_shape(sensor.pulse_ns, _STEP)
-    return strongest_response(
+    place, power = strongest_response(
         *where,
         end=end,
         white=white,
@@ -131,5 +125,7 @@ def _field_response(
         shape=shape,
         step=_STEP,
         near=near,
-        least=least_power(sensor),
+        least=least_power(pulses.noise),
     )
+    seen = np.flatnonzero(power > least_power(pulses.noise))
+    return seen, place[seen], power[seen]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
-from math import pi
+from math import log, pi
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.physics.link import amplitude
+from lidar.physics.link import GATE, amplitude
 from lidar.rig.scanner import Sensor
 from lidar.weather.media import Medium
 
@@ -25,12 +28,19 @@ LENS = 0.03
 LIGHT = 0.299792458
 """Metres per nanosecond."""
 
+Found = tuple[NDArray[np.int64], Float, Float]
+"""Pulse, range and power over the threshold of echoes."""
+
+_DRAWN = 0.2
+"""Power over the threshold from which on particles are drawn: several within the pulse are one echo."""
+
 _OVERLAP = (
     0.9,
     1.0,
 )  # metres between which the beam enters the receiver's field of view (Hahner et al. 2021)
 _REACH = 60.0  # metres beyond the minimum range within which the response of even air has its maximum
 _STEP = 0.05  # metres between samples of the response
+_QUANTILES = 65  # of the range of a soft target's echo
 _CLASSES = 64  # of range
 
 
@@ -65,42 +75,66 @@ def pulse_shape(pulse_ns: float, step: float) -> Float:
     return shape
 
 
-def least_power(sensor: Sensor) -> float:
-    """Power over the threshold from which on the detector may notice an echo; at least 0.2."""
-    return max(0.2, 1 - _DEVIATIONS * sensor.noise_ratio)
+def least_power(noise: float) -> float:
+    """Power over the threshold from which on the detector may notice an echo; at least 0.2.
+
+    noise : that the detector adds to echoes, over the threshold
+    """
+    return max(0.2, 1 - _DEVIATIONS * noise)
 
 
 @dataclass(frozen=True, slots=True)
 class SoftTarget:
     """The echo of even air, by the range at which the beam ends.
 
-    end      : (k,) metres, ascending
-    range    : (k,) metres at which the integrated response has its maximum
-    power    : (k,) that maximum over the threshold; for a beam that ends beyond the last row, the last one's
+    end   : (k,) metres, ascending, in steps of `GATE`
+    power : (k,) over the threshold; for a beam that ends beyond the last row, the last one's
+    place : (k, q) metres, ranges of the echo at evenly spaced probabilities from 0 to 1
     """
 
     end: Float
-    range: Float
     power: Float
+    place: Float
 
-    def at(self, end: Float) -> tuple[Float, Float]:
-        """Range and power (n,) for beams that end at ranges (n,)."""
-        step = self.end[1] - self.end[0] if len(self.end) > 1 else 1.0
+    def row(self, end: Float) -> NDArray[np.int64]:
+        """Rows (n,) of beams that end at ranges (n,); -1 for those that end before the first one."""
+        step = self.end[1] - self.end[0] if len(self.end) > 1 else GATE
         steps = np.clip((end - self.end[0]) / step + 1e-6, -1, len(self.end) - 1)
-        row = np.floor(steps).astype(np.int64)
-        return self.range[row], np.where(row >= 0, self.power[row], 0.0)
+        row: NDArray[np.int64] = np.floor(steps).astype(np.int64)
+        return row
+
+    def places(self, row: NDArray[np.int64], chance: Float) -> Float:
+        """Ranges (n,) of echoes of rows (n,), at random numbers (n,) from 0 to 1."""
+        at = chance * (self.place.shape[1] - 1)
+        low = np.minimum(at.astype(np.int64), self.place.shape[1] - 2)
+        share = at - low
+        place: Float = (1 - share) * self.place[row, low] + share * self.place[row, low + 1]
+        return place
 
 
 def soft_target(
-    sensor: Sensor, extinction: float, *, backscatter: Float, distance: Float, lens: float = LENS
+    sensor: Sensor,
+    extinction: float,
+    *,
+    backscatter: Float,
+    distance: Float,
+    lens: float = LENS,
+    noise: float = 0.0,
+    least: float = 0.0,
 ) -> SoftTarget:
     """The echo of even air whose particles add up: the pulse convolved with what the air sends back.
 
     The power at range R is pi times the integral of pulse(R - r) b(r) exp(-2 a r) over r, in units of that of
     a white target: Hahner et al. 2021, equations 8 to 10, with the sensor's pulse.
 
+    This response is flat over metres, as the blur of the receiver makes up for the fall with the square of
+    the range, and each gate of range has noise of its own. So the strongest gate is stronger than the
+    maximum of the response, and anywhere where that is high; see `_strongest_gate`.
+
     backscatter : (k,) 1/(m sr) at the distances
     distance    : (k,) metres, evenly spaced
+    noise       : of the receiver over the threshold; without any, the echo is the maximum of the response
+    least       : power over the threshold below which echoes need not be exact
     """
     step = float(distance[1] - distance[0])
     white = strength(sensor, distance, lens=lens) * np.exp(-2 * extinction * distance)
@@ -111,15 +145,87 @@ def soft_target(
     places = distance[0] + step * (np.arange(len(whole)) - (len(shape) - 1) / 2)
     allowed = places >= sensor.min_range - sensor.pattern.range_offset
     best = int(np.argmax(np.where(allowed, whole, -1.0)))
-    if whole[best] < least_power(sensor):  # too weak wherever the beam ends
-        return SoftTarget(distance[:1], places[best : best + 1], whole[best : best + 1])
-    ends = np.arange(min(best + 1, len(distance)))
-    found, power = np.empty(len(ends)), np.empty(len(ends))
-    for end in ends:
-        response = np.where(allowed, np.convolve(sent_back * (distance <= distance[end]), shape), 0.0)
-        peak = int(np.argmax(response))
-        found[end], power[end] = min(places[peak], distance[end]), response[peak]
-    return SoftTarget(distance[: len(ends)], found, power)
+    if _detected_as(np.array([[whole[best]]]), noise, gates=_REACH / GATE)[0] < least:
+        return SoftTarget(distance[:1], whole[best : best + 1], np.full((1, 2), places[best]))
+    stride = max(1, round(GATE / step))
+    gates = np.arange(best % stride, len(whole), stride)
+    gates = gates[allowed[gates] & (whole[gates] >= whole[best] / 2)]
+    # Nothing that lies half a pulse beyond the last gate adds to it.
+    ends = np.arange(0, min(gates[-1] + 1, len(distance)), stride)
+    lag = gates[:, None] - np.arange(len(distance))
+    pulse = np.where((lag >= 0) & (lag < len(shape)), shape[np.clip(lag, 0, len(shape) - 1)], 0.0)
+    response = np.cumsum(pulse * sent_back, axis=1)[:, ends].T
+    if noise <= 0:
+        middle = places[gates[np.argmax(response, axis=1)]]
+        return SoftTarget(distance[ends], response.max(axis=1), np.repeat(middle[:, None], 2, axis=1))
+    power, chance = _strongest_gate(response, noise)
+    sums = np.cumsum(chance, axis=1) / chance.sum(axis=1, keepdims=True)
+    edges = np.append(places[gates] - GATE / 2, places[gates[-1]] + GATE / 2)
+    edges = np.maximum(edges, places[allowed][0])
+    level = np.linspace(0, 1, _QUANTILES)
+    place = np.array([np.interp(level, np.append(0.0, row), edges) for row in sums])
+    return SoftTarget(distance[ends], power, place)
+
+
+def _strongest_gate(response: Float, noise: float) -> tuple[Float, Float]:
+    """Power (k,) of the strongest of gates (k, g) with Gaussian noise, and weights (k, g) of its place.
+
+    It is the power that the strongest gate exceeds in half of the pulses, or, below the threshold, that of a
+    single echo which passes the threshold as often as any gate does. The strongest gate is each one in
+    proportion to the chance that it exceeds the former. Gates of less than half of the strongest response
+    do not count.
+    """
+    from scipy.special import log_ndtr, ndtr  # noqa: PLC0415  (0.2 s)
+
+    most = response.max(axis=1, keepdims=True)
+    gates = np.where(response >= most / 2, response, -np.inf)
+    low, high = most, most + 5 * noise
+    for _ in range(20):
+        middle = (low + high) / 2
+        is_low = log_ndtr((middle - gates) / noise).sum(axis=1, keepdims=True) < -log(2)
+        low, high = np.where(is_low, middle, low), np.where(is_low, high, middle)
+    chance: Float = ndtr((gates - low) / noise)
+    return np.minimum(low[:, 0], _detected_as(gates, noise)), chance
+
+
+def _detected_as(response: Float, noise: float, *, gates: float = 1.0) -> Float:
+    """Power (k,) of an echo that passes the threshold as often as any gate of a response (k, g) does.
+
+    gates : number of gates for each one that is given
+    """
+    from scipy.special import log_ndtr, ndtri  # noqa: PLC0415  (0.2 s)
+
+    if noise <= 0:
+        most: Float = response.max(axis=1)
+        return most
+    none = gates * log_ndtr((1 - response) / noise).sum(axis=1)
+    power: Float = 1 + noise * ndtri(-np.expm1(none))
+    return power
+
+
+@functools.lru_cache(maxsize=16)
+def even_echo(sensor: Sensor, medium: Medium, *, lens: float, noise: float) -> SoftTarget:
+    """The echo of even air of a medium, without the particles that are drawn; noise as of `Pulses`."""
+    _, rest, distance = scattering(sensor, medium, lens=lens)
+    own = noise or sensor.noise_ratio
+    return soft_target(
+        sensor,
+        medium.extinction,
+        backscatter=rest,
+        distance=distance,
+        lens=lens,
+        noise=own,
+        least=least_power(noise),
+    )
+
+
+@functools.lru_cache(maxsize=16)
+def scattering(sensor: Sensor, medium: Medium, *, lens: float) -> tuple[Particles | None, Float, Float]:
+    """The particles of a medium that are drawn, and the back-scatter (k,) of the rest at distances (k,)."""
+    if len(medium.diameter):
+        return particles(sensor, medium, lens=lens)
+    distance = response_ranges(sensor)
+    return None, np.full(len(distance), medium.backscatter), distance
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +266,7 @@ def particles(
         counts: Float = medium.number[:, None] * u * (area * depth)
         return counts
 
-    least = least_power(sensor) / 2
+    least = _DRAWN
     while (counts := expected(least)).sum() > most:
         least *= 1.25
     cells = counts.ravel() > 0
@@ -201,13 +307,69 @@ def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float, lens: float) ->
 
 
 def drawn_particles(
-    some: Particles, pulses: int, *, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], Float, Float]:
-    """Pulse, range and power over the threshold (k,) of particles that pulses meet in clear air."""
-    row = np.repeat(np.arange(len(some.count)), rng.poisson(some.count * pulses))
-    pulse = rng.integers(0, pulses, len(row))
-    along, across = rng.random((2, len(row)))
-    distance = some.near[row] + along * (some.far[row] - some.near[row])
-    strongest = some.strongest[row]
-    power = strongest * (some.least / strongest) ** across
-    return pulse, distance, power
+    some: Particles, end: Float, *, extinction: float = 0.0, rng: np.random.Generator
+) -> Found:
+    """Particles that beams meet before their ends (n,), in metres, dimmed by even air (1/m)."""
+    count = rng.poisson(some.count * len(end))
+    chance = rng.random((2, int(count.sum())))
+    pulse, place, power = np.empty(chance.shape[1], np.int64), *np.empty(chance.shape)
+    classes = count, some.near, some.far, some.strongest, np.log(some.least / some.strongest)
+    met = _meet(classes, chance, end, extinction, (pulse, place, power))
+    return pulse[:met], place[:met], power[:met]
+
+
+@njit(cache=True, nogil=True)
+def _meet(classes: Any, chance: Any, end: Any, extinction: Any, met: Any) -> Any:
+    """Fill the columns of what is met, and return its number."""
+    count, near, far, strongest, weakest = classes
+    pulse, place, power = met
+    i = found = 0
+    for c in range(len(count)):
+        for _ in range(count[c]):
+            # The number of the pulse, and what is left of the random number, which is as random.
+            beam = chance[0, i] * len(end)
+            p = int(beam)
+            r = near[c] + (beam - p) * (far[c] - near[c])
+            if r < end[p]:
+                left = np.exp(chance[1, i] * weakest[c] - 2 * extinction * r)
+                pulse[found], place[found], power[found] = p, r, strongest[c] * left
+                found += 1
+            i += 1
+    return found
+
+
+def noticed(found: Found, *, pulses: int, least: float, separation: float) -> Found:
+    """The particles that return more than a power over the threshold, together with those near by.
+
+    pulses     : number of pulses
+    separation : metres, of particles that may give one echo
+    """
+    rows = np.empty(len(found[0]), np.int64)
+    count = _notice(found, pulses, least, 2 * separation, rows)  # twice, as echoes join in chains
+    return found[0][rows[:count]], found[1][rows[:count]], found[2][rows[:count]]
+
+
+@njit(cache=True, nogil=True)
+def _notice(found: Any, pulses: Any, least: Any, reach: Any, rows: Any) -> Any:
+    """Fill the rows that are noticed, and return their number."""
+    pulse, place, power = found
+    together = np.zeros(pulses)
+    last = np.full(pulses, -1, np.int64)
+    before = np.empty(len(pulse), np.int64)  # in the same pulse
+    for i in range(len(pulse)):
+        p = pulse[i]
+        together[p] += power[i]
+        before[i], last[p] = last[p], i
+    count = 0
+    for i in range(len(pulse)):
+        if together[pulse[i]] <= least:
+            continue
+        near, k = 0.0, last[pulse[i]]
+        while k >= 0:
+            if abs(place[k] - place[i]) <= reach:
+                near += power[k]
+            k = before[k]
+        if near > least:
+            rows[count] = i
+            count += 1
+    return count

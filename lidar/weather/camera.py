@@ -36,9 +36,6 @@ _VISIBLE_NM = 550.0
 _LEAST = 3e-4
 """Diameter in metres of the smallest drops that are seen one by one."""
 
-_FLAKE = 0.1 ** (-1 / 3)
-"""Diameter of a flake over that of its melted drop."""
-
 _TOP = {"fog": 100.0, "dust": 100.0, "rain": 2000.0, "snow": 2000.0}
 """Height of the weather above the camera in metres, through which the sky is seen; typical."""
 
@@ -139,20 +136,16 @@ def _exposed(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]
 def falling(setting: WeatherSetting, air: Medium) -> Particles | None:
     """Particles of a medium that are seen one by one; None for kinds without any.
 
-    The fall speed of drops is that of Atlas, Srivastava and Sekhon (1973). Flakes fall at 1 m/s, swing by
-    0.3 m/s and have a tenth of the density of water (typical); there are as many as have the cross-section of
-    the medium's melted ones.
+    The fall speed of drops is that of Atlas, Srivastava and Sekhon (1973). Flakes fall at 1 m/s and swing by
+    0.3 m/s (typical).
     """
-    size = air.diameter
+    size, number = air.diameter, air.number
+    seen = size > _LEAST
     if setting.kind == "rain":
         fall = np.maximum(9.65 - 10.3 * np.exp(-600.0 * size), 0.1)
-        seen = size > _LEAST
-        return Particles(size[seen], air.number[seen], fall[seen])
+        return Particles(size[seen], number[seen], fall[seen])
     if setting.kind == "snow":
-        seen = size > _LEAST
-        return Particles(
-            size[seen] * _FLAKE, air.number[seen] / _FLAKE**2, np.full(int(seen.sum()), 1.0), swing=0.3
-        )
+        return Particles(size[seen], number[seen], np.full(int(seen.sum()), 1.0), swing=0.3)
     return None
 
 

@@ -9,13 +9,7 @@ from geoscene.charts import Axes, Panel, Series, panels
 from geoscene.typing import Float
 from lidar.physics.link import amplitude
 from lidar.rig.scanner import Sensor
-from lidar.weather.backscatter import (
-    drawn_particles,
-    least_power,
-    particles,
-    response_ranges,
-    soft_target,
-)
+from lidar.weather.backscatter import LENS, drawn_particles, even_echo, least_power, particles
 from lidar.weather.lisa import goodin_extinction
 from lidar.weather.media import fog_extinction, medium_of, rain_extinction, snow_extinction
 
@@ -30,7 +24,7 @@ _ICE = ((0.5, 9.76e-4), (1, 1.447e-3), (5, 3.61e-3))
 # Share of targets of reflectance 0.9 that are lost at 10 mm/h, evenly spread over the 100 m of clear air.
 _LOST_GOODIN, _LOST_ULBRICH_ATLAS = ((10, 1 - 0.3013),), ((10, 1 - 0.8797),)
 
-_PULSES = 200_000
+_SKY = np.full(200_000, np.inf)  # ends of beams
 
 
 def weather_figure(sensor: Sensor) -> bytes:
@@ -77,6 +71,10 @@ def _extinctions() -> Panel:
     rates = np.geomspace(0.3, 100, 60).tolist()
     series = [
         Series("rain, Mie", [(r, rain_extinction(r, 905)) for r in rates]),
+        Series(
+            "snow, Stallabrass",
+            [(r, snow_extinction(r, 905, medium="stallabrass")) for r in rates if r <= 20],
+        ),
         Series("snow, Gunn-Marshall", [(r, snow_extinction(r, 905)) for r in rates if r <= 20]),
         Series("snow, ITU-R dry", [(r, snow_extinction(r, 905, medium="itu-dry")) for r in rates if r <= 20]),
         Series("Goodin's rain", [(r, goodin_extinction(r)) for r in rates]),
@@ -97,7 +95,10 @@ def _lost() -> Panel:
     rates = np.linspace(0.1, 100, 60).tolist()
     series = [
         Series("rain, physical and LISA", [(r, lost_share(rain_extinction(r, 905))) for r in rates]),
-        Series("snow", [(r, lost_share(snow_extinction(r, 905))) for r in rates if r <= 20]),
+        Series(
+            "snow",
+            [(r, lost_share(snow_extinction(r, 905, medium="stallabrass"))) for r in rates if r <= 20],
+        ),
         Series("Goodin's rain", [(r, lost_share(goodin_extinction(r))) for r in rates]),
         Series("Ulbrich-Atlas", _LOST_ULBRICH_ATLAS, dots=True),
         Series("Goodin, published", _LOST_GOODIN, dots=True),
@@ -118,20 +119,18 @@ def _histogram(sensor: Sensor) -> Panel:
     ):
         medium = medium_of(kind, amount, wavelength_nm=sensor.wavelength_nm, medium=_FIRST[kind])
         some, _, _ = particles(sensor, medium)
-        _, place, power = drawn_particles(some, _PULSES, rng=np.random.default_rng(0))
-        power = power * np.exp(-2 * medium.extinction * place)
-        count = np.histogram(place[power > 1], edges)[0] / _PULSES / 0.5
+        _, place, power = drawn_particles(
+            some, _SKY, extinction=medium.extinction, rng=np.random.default_rng(0)
+        )
+        count = np.histogram(place[power > 1], edges)[0] / len(_SKY) / 0.5
         series.append(Series(name, _steps(edges, count)))
     fog = medium_of("fog", 50.0, wavelength_nm=sensor.wavelength_nm, medium="kim")
-    distance = response_ranges(sensor)
-    soft = soft_target(
-        sensor, fog.extinction, backscatter=np.full(len(distance), fog.backscatter), distance=distance
-    )
-    seen = soft.power[-1] > least_power(sensor)
+    soft = even_echo(sensor, fog, lens=LENS, noise=sensor.noise_ratio)
+    seen, middle = soft.power[-1] > least_power(sensor.noise_ratio), float(np.median(soft.place[-1]))
     series += [
         Series(
             f"fog 50 m, {soft.power[-1]:.2g} x threshold",
-            [(float(soft.range[-1]), 1e-5), (float(soft.range[-1]), 1.0)] if seen else [],
+            [(middle, 1e-5), (middle, 1.0)] if seen else [],
         ),
         Series("fog, Hahner 2021: 1.6 m", ((1.60, 1.0),), dots=True),
     ]
@@ -139,7 +138,7 @@ def _histogram(sensor: Sensor) -> Panel:
     return Panel(axes, series, x_log=False)
 
 
-_FIRST = {"rain": "marshall-palmer", "snow": "gunn-marshall"}
+_FIRST = {"rain": "marshall-palmer", "snow": "stallabrass"}
 
 
 def _steps(edges: Float, count: Float) -> list[tuple[float, float]]:

@@ -42,7 +42,7 @@ class WeatherModel(WeatherSetting):
         given = [n for n in ("radius", "polygon", "drops", "dirt", "sunlight") if getattr(self, n)]
         if given:
             raise InputError(f"{given[0]} needs model physical; {self.model} has no such thing")
-        if self.medium.startswith("itu") and self.model == "hahner_snow":
+        if self.medium in ("stallabrass", "itu-dry", "itu-wet") and self.model == "hahner_snow":
             raise InputError(f"medium = {self.medium!r} has no flakes, which model hahner_snow needs")
 
     def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:

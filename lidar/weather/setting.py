@@ -54,7 +54,7 @@ KINDS = {
         0.0,
         50.0,
         None,
-        ("gunn-marshall", "sekhon-srivastava", "itu-dry", "itu-wet"),
+        ("stallabrass", "gunn-marshall", "sekhon-srivastava", "itu-dry", "itu-wet"),
     ),
     "dust": Kind("m", "visibility within the dust", 2.0, 1e5, 20.0, ("plumes", "even")),
     "spray": Kind("mm", "depth of the water on the road", 0.0, 10.0, 1.0, ("plumes",)),
@@ -70,6 +70,9 @@ MODELS = {
     "hahner_snow": ("snow",),
 }
 """Models of what lasers measure, and the kinds that each knows."""
+
+_PUBLISHED = {"snow": "gunn-marshall"}
+"""Media of published models, where they are not the first one of the kind."""
 
 _UNITS = {
     "mm/h": {"mm/h": 1.0, "cm/h": 10.0},
@@ -120,7 +123,8 @@ class WeatherSetting(Stage):
         super().__post_init__()
         kind = KINDS[self.kind]
         if not self.medium:
-            object.__setattr__(self, "medium", kind.media[0])
+            published = _PUBLISHED.get(self.kind) if self.model != "physical" else None
+            object.__setattr__(self, "medium", published or kind.media[0])
         if faults := _faults(self, kind):
             raise InputError("; ".join(faults))
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from geoscene.classes import materials
 from lidar.errors import InputError
-from lidar.physics.echoes import Echoes, joined, merged, numbered, reported
+from lidar.physics.echoes import Echoes, joined, merged, mixed, numbered, reported
 from lidar.physics.footprint import bundle
 from lidar.physics.fresnel import (
     WATER,
@@ -308,6 +308,28 @@ def test_merging_keeps_power_and_separates_echoes(rows, separation):
     assert (np.diff(echoes.range)[same] > 0).all() or separation == 0
     assert (number <= count).all()
     assert number.max() == count.max()
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 4), st.floats(0.5, 30.0), st.floats(0.01, 1.0), st.booleans()),
+        min_size=1,
+        max_size=60,
+    ),
+    st.sampled_from([0.0, 0.6, 3.0]),
+)
+def test_pulses_with_new_echoes_are_merged_and_others_stay_as_they_are(rows, separation):
+    echoes = surfaces([(p, r, a, False) for p, r, a, _ in rows])
+    is_new = np.array([new for *_, new in rows], bool)
+    found = mixed(echoes, is_new, pulses=6, separation=separation)
+    assert np.all(np.diff(found.pulse) >= 0)
+    for p in range(5):
+        own, of = found.where(found.pulse == p), echoes.where(echoes.pulse == p)
+        if is_new[echoes.pulse == p].any():
+            of = merged(of.take(np.argsort(of.range, kind="stable")), separation)
+        for name, column in of.columns().items():
+            np.testing.assert_array_equal(own.columns()[name], column, err_msg=name)
 
 
 def test_return_modes_select_the_echoes_that_they_name():

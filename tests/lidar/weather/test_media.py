@@ -14,10 +14,12 @@ from lidar.weather.media import (
     rain_extinction,
     snow,
     snow_extinction,
+    snow_slope,
     visibility_of,
     water_index,
 )
 from lidar.weather.mie import mie_efficiencies
+from lidar.weather.setting import WeatherSetting
 
 # Bohren and Huffman's example, and spheres of water by miepython 3.3.0.
 SPHERES = [
@@ -82,7 +84,42 @@ def test_extinction_of_rain(rate, mie):
 
 @pytest.mark.parametrize(("rate", "mie"), [(0.5, 9.76e-4), (1, 1.447e-3), (5, 3.61e-3)])
 def test_extinction_of_snow(rate, mie):
-    assert snow_extinction(rate, 905) == pytest.approx(mie, rel=5e-3)
+    assert snow_extinction(rate, 905, medium="gunn-marshall") == pytest.approx(mie, rel=5e-3)
+
+
+# Half to twice the visibility of Stallabrass's measurements, with which dry snow scatters from storm to storm
+# (Rasmussen et al. 1999: a factor of 3 to 10).
+@pytest.mark.parametrize(
+    ("rate", "low", "high"), [(0.5, 800, 3200), (1, 500, 2000), (2.5, 270, 1000), (5, 170, 700)]
+)
+def test_visibility_in_snow_is_as_measured(rate, low, high):
+    assert low < visibility_of("snow", rate, medium=WeatherSetting("snow", rate).medium) < high
+
+
+def test_extinction_of_snow_by_stallabrass():
+    """10.36 C^0.7776 1/km; 0.286 g/m^3 of water that fall with 0.97 m/s are 1 mm/h."""
+    assert 1000 * snow_extinction(1, 905, medium="stallabrass") == pytest.approx(
+        10.36 * 0.2856**0.7776, rel=1e-3
+    )
+    assert snow_extinction(3, 1550, medium="stallabrass") == snow_extinction(3, 550, medium="stallabrass")
+
+
+@pytest.mark.parametrize("rate", [0.3, 1, 3, 10])
+def test_flakes_have_the_extinction_the_water_and_the_lidar_ratio_of_snow(rate):
+    air = snow(rate, 905, medium="stallabrass")
+    area = air.number * np.pi / 4 * air.diameter**2
+    assert 2 * area.sum() == pytest.approx(air.extinction, rel=1e-3)
+    assert air.extinction / air.backscatter == pytest.approx(25, rel=1e-2)
+    n0, slope = snow_slope(rate, "stallabrass")
+    water = 1e-6 * np.pi * n0 / slope**4  # kg/m^3, of the melted flakes
+    density = water / (np.pi / 6 * air.diameter**3 * air.number).sum()
+    assert 20 < density < 120  # kg/m^3: dry snowflakes of some millimetres (Holroyd 1971: 170/D with D in mm)
+
+
+def test_snow_is_dark_for_a_laser_of_1550_nm():
+    assert (
+        snow(2, 1550, medium="stallabrass").backscatter < 0.1 * snow(2, 905, medium="stallabrass").backscatter
+    )
 
 
 def test_extinction_of_snow_by_itu():
