@@ -255,7 +255,8 @@ def _check_images(stages: Stages, rig: Rig) -> None:
             if missing := sorted(set(named.stage.image_kinds) - set(camera.images)):
                 raise InputError(
                     f"stage {named.name} needs {' and '.join(missing)} images of {camera.name}, which were"
-                    f" not recorded; drive again with images = {[*camera.images, *missing]} in the rig"
+                    f" not recorded; drive again with images = {[*camera.images, *missing]} in the rig, or"
+                    " let it act on a scanner alone: `stage` with sensor=NAME"
                 )
 
 

@@ -93,9 +93,14 @@ def tamper(
     freeze : repeat the first of the other frames
     shifts : sensor and nanoseconds; its frames or samples carry later time stamps
 
-    The truth is in `TRUTH`. Raises InputError and DatasetError for frames or sensors that there are not.
+    The truth is in `TRUTH`. Raises InputError and DatasetError for frames or sensors that there are not, and
+    InputError for those that are given twice.
     """
-    source, out, moved = Path(source), Path(out), dict(shifts)
+    source, out, moved = Path(source), Path(out), dict[str, int]()
+    for name, shift in shifts:
+        if name in moved:
+            raise InputError(f"`shift`: {name} is given twice")
+        moved[name] = shift
     if not replacements and not moved:
         raise InputError("give `replace`, `shift` or both")
     check_target(out, source=source, overwrite=overwrite)
@@ -132,6 +137,8 @@ def _copies(
             if not names:
                 raise InputError(f"`replace`: {dataset.path} has no frame {frame} of {one.sensor}")
             for name in names:
+                if name in found:
+                    raise InputError(f"`replace`: frame {frame} of {one.sensor} is given twice")
                 stem = Path(name).name.removeprefix(f"{frame:06d}")
                 path = other.path / Path(name).with_name(f"{taken:06d}{stem}")
                 if not path.is_file():

@@ -81,6 +81,11 @@ def test_shifted_time_stamps_are_later_and_named(signed, tmp_path):
         (["--replace", "lidar_top:1=9"], "000009.laz is missing; give other frames or another --by"),
         (["--shift", "lidar_top=soon"], "--shift lidar_top=soon: give SENSOR=SECONDS"),
         (["--shift", "lidar_top=-1"], "--shift: lidar_top would begin 1 s before the drive's start"),
+        (["--shift", "lidar_top=1", "--shift", "lidar_top=2"], "--shift: lidar_top is given twice"),
+        (
+            ["--replace", "lidar_top:0-1=1", "--replace", "lidar_top:1=0"],
+            "--replace: frame 1 of lidar_top is given twice",
+        ),
         (["--shift", "gnss=1"], "--shift: no scanner, camera or inertial unit 'gnss'"),
         (["--replace", "lidar_top:1=0", "--by", "none"], "none: no dataset.json in it"),
     ],

@@ -62,7 +62,7 @@ def test_recorded_cameras_without_depth_are_refused_with_nothing_written(scene, 
     rig.write_text(RIG.format(images='["rgb"]'))
     drive(scene, tmp_path / "plain", options=replace(options, rig=str(rig)))
     with pytest.raises(
-        InputError, match="stage weather needs depth images of front, which were not recorded"
+        InputError, match=r"needs depth images of front, which were not recorded.*on a scanner alone"
     ):
         apply_stages(tmp_path / "plain", tmp_path / "out", options=ApplyOptions(weather=FOG))
     assert not (tmp_path / "out").exists()
