@@ -1,4 +1,4 @@
-"""Sectors without the returns that the frames before and the sectors beside have."""
+"""Sectors without the returns that the rest of the turn and earlier frames let expect."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from geoscene.typing import Float, Ints
+from geoscene.typing import Float
 from lidar.defences.defence import Defence
 from lidar.defences.observation import Observation
 from lidar.defences.verdict import Gaps, Verdict
@@ -18,17 +18,21 @@ from lidar.world.world import World
 _SECTORS = 360
 _RADIUS = 30.0
 """Metres from the sensor within which a gap is placed."""
+_ENOUGH = 0.3
+"""Share of a sector's pulses of which a return is expected from which on its lack has full weight."""
+_OPEN = 0.5
+"""Share of a sector's expected returns that it may lack, as where buildings end: no suspicion up to it."""
 
 
 @dataclass(frozen=True)
 class Azimuth(Defence):
-    """A sector that lacks returns which earlier frames or the sectors beside it have."""
+    """A sector that lacks returns which the rest of the turn or earlier frames have (Cao et al. 2023)."""
 
     history: ClassVar[int] = 5
 
     width: float = parameter(4.0, "width of the sector, degrees", low=1, high=90)
-    side: float = parameter(
-        4.0, "width of the sectors beside it that must have returns, degrees", low=1, high=90
+    turn: float = parameter(
+        0.35, "share of the turn that may lack a ring's returns, as towards side streets", low=0, high=0.9
     )
 
     def judge(
@@ -37,65 +41,54 @@ class Azimuth(Defence):
         """Judge the last frame."""
         del scene, rng
         frame = frames[-1]
-        fired, got = _counts(frame)
-        share = got / np.maximum(fired, 1)
-        beside = _beside(share, round(self.side), gap=round(self.width))
-        expected = 0.5 * beside
-        if len(frames) > 1:
-            expected = np.maximum(expected, np.min([_turned(past, frame) for past in frames[:-1]], axis=0))
-        # A sector that never has many returns, as towards the sky, tells nothing.
-        lack = np.where(expected > 0.05, np.clip(1 - share / np.maximum(expected, 0.05), 0, 1), 0.0)
-        weight = np.minimum(expected / 0.3, 1.0) * (fired > 0)
-        sector = _running_mean(lack * weight, round(self.width))
+        expected = self._of_turn(frame)
+        if known := [self._of_earlier(past, frame) for past in frames[:-1]]:
+            least = np.min(known, axis=0)
+            expected = np.maximum(expected, np.where(np.isfinite(least), least, 0.0))
+        sector = np.clip((self._lack(frame, expected) - _OPEN) / (1 - _OPEN), 0, 1)
         worst = int(np.argmax(sector))
-        suspicion = float(np.clip(sector[worst], 0, 1))
         middle = np.radians(worst + 0.5 - 180)
         place = Gaps(
             np.array([[np.cos(middle), np.sin(middle)]]) * _RADIUS / 2,
             np.array([_RADIUS / 2]),
-            np.array([suspicion]),
+            sector[[worst]],
         )
-        return Verdict(None, None, suspicion, place)
+        return Verdict(None, None, float(sector[worst]), place)
+
+    def _of_turn(self, frame: Observation) -> Float:
+        """Share of each ring's pulses (rings, 360) with a return that all but a part of the turn reaches."""
+        fired, share = frame.answered
+        least = np.nanquantile(np.where(fired > 0, share, np.nan), self.turn, axis=1, method="lower")
+        return np.repeat(np.nan_to_num(least)[:, None], _SECTORS, axis=1)
+
+    def _of_earlier(self, past: Observation, frame: Observation) -> Float:
+        """Shares (rings, 360) in an earlier frame, in the sectors that have its directions now.
+
+        Each is the least of the sectors beside it, as the vehicle also moves; infinite in sectors that lack
+        returns in that frame itself.
+        """
+        lack = self._lack(past, self._of_turn(past)) > _OPEN
+        reach = round(self.width) + 2
+        suspect = np.any([np.roll(lack, k) for k in range(-reach, reach + 1)], axis=0)
+        share = np.min([np.roll(past.answered[1], k, axis=1) for k in (-2, -1, 0, 1, 2)], axis=0)
+        turns = [f.poses([f.start_ns]).rotation[0] for f in (past, frame)]
+        back = turns[1].T @ turns[0]
+        yaw = np.degrees(np.arctan2(back[1, 0], back[0, 0]))
+        turned: Float = np.roll(np.where(suspect, np.inf, share), round(float(yaw)), axis=1)
+        return turned
+
+    def _lack(self, frame: Observation, expected: Float) -> Float:
+        """Share (360,) of the expected returns that the sector around each degree lacks."""
+        fired, share = frame.answered
+        wanted = _around((fired * expected).sum(axis=0), round(self.width))
+        lost = _around((fired * np.maximum(expected - share, 0)).sum(axis=0), round(self.width))
+        whole = _around(fired.sum(axis=0), round(self.width))
+        # A sector of which few returns are expected, as towards the sky, tells little.
+        weight = np.minimum(wanted / np.maximum(_ENOUGH * whole, 1e-9), 1.0)
+        return weight * lost / np.maximum(wanted, 1e-9)
 
 
-def _sector(azimuth: Float) -> Ints:
-    sector: Ints = np.clip(np.degrees(azimuth) + 180, 0, _SECTORS - 1).astype(np.int64)
-    return sector
-
-
-def _counts(frame: Observation) -> tuple[Float, Float]:
-    """Pulses that are fired and that have a return, by degree of azimuth."""
-    direction = frame.firings.direction
-    sector = _sector(np.arctan2(direction[:, 1], direction[:, 0]))
-    has = np.ones(len(sector), bool)
-    has[frame.empty] = False
-    fired = np.bincount(sector, minlength=_SECTORS)
-    return fired.astype(float), np.bincount(sector[has], minlength=_SECTORS).astype(float)
-
-
-def _turned(past: Observation, frame: Observation) -> Float:
-    """Shares of pulses with a return in an earlier frame, in the sectors that have its directions now.
-
-    Each is the least of the sectors beside it, as the vehicle also moves.
-    """
-    fired, got = _counts(past)
-    share = got / np.maximum(fired, 1)
-    turns = [f.poses([f.start_ns]).rotation[0] for f in (past, frame)]
-    back = turns[1].T @ turns[0]
-    yaw = np.degrees(np.arctan2(back[1, 0], back[0, 0]))
-    share = np.roll(share, round(float(yaw)))
-    least: Float = np.min([np.roll(share, k) for k in (-2, -1, 0, 1, 2)], axis=0)
-    return least
-
-
-def _running_mean(values: Float, width: int) -> Float:
-    """Mean over ``width`` sectors around each."""
-    mean: Float = np.mean([np.roll(values, k - width // 2) for k in range(width)], axis=0)
-    return mean
-
-
-def _beside(share: Float, width: int, *, gap: int) -> Float:
-    """The lesser of the mean shares of the sectors on both sides of each, a gap away."""
-    mean = _running_mean(share, width)
-    shift = gap // 2 + width // 2 + 1
-    return np.minimum(np.roll(mean, shift), np.roll(mean, -shift))
+def _around(values: Float, width: int) -> Float:
+    """Sums over ``width`` sectors around each."""
+    total: Float = np.sum([np.roll(values, k - width // 2) for k in range(width)], axis=0)
+    return total

@@ -162,6 +162,23 @@ class Observation:
         return np.flatnonzero(~has)
 
     @functools.cached_property
+    def answered(self) -> tuple[Float, Float]:
+        """Pulses that are fired, and the share of them with a return, by ring and degree of azimuth.
+
+        Both have the shape (rings, 360), from -180 degrees on.
+        """
+        fired = self.firings
+        direction = fired.direction
+        turn = np.degrees(np.arctan2(direction[:, 1], direction[:, 0])) + 180
+        cell = fired.ring.astype(np.int64) * 360 + np.clip(turn, 0, 359).astype(np.int64)
+        size = (int(fired.ring.max(initial=0)) + 1) * 360
+        has = np.ones(len(fired), bool)
+        has[self.empty] = False
+        count = np.bincount(cell, minlength=size).reshape(-1, 360).astype(float)
+        share = np.bincount(cell, weights=has, minlength=size).reshape(-1, 360) / np.maximum(count, 1)
+        return count, share
+
+    @functools.cached_property
     def surface(self) -> Ground:
         """Height of the ground around the sensor."""
         return ground_of(self.xyz)

@@ -17,8 +17,10 @@ from lidar.physics.link import amplitude
 from lidar.signal.stage import parameter
 from lidar.world.world import World
 
-_ADAPTED = 0.99
-"""Share of a frame's returns that must keep a rule which not every setting of a sensor follows."""
+_ON_STEP = 0.02
+"""Steps by which a range that is a multiple of the range step may be off."""
+_BY_CHANCE = 2 * _ON_STEP
+"""Share of ranges without a step that are as near to one."""
 _WEAK, _BRIGHT = 0.9, 0.2
 """Suspicions of returns that are weaker than the threshold, and brighter than a white target."""
 
@@ -89,14 +91,14 @@ def _surplus(frame: Observation, pulse: NDArray[np.intp]) -> Bools:
 
 
 def _off_quantum(frame: Observation) -> Bools:
-    """Returns whose range is no multiple of the range step, where nearly all are."""
+    """Returns whose range is no multiple of the range step, where far more are than by chance."""
     step = frame.sensor.range_quantum
     none = np.zeros(len(frame), bool)
     if not step or not len(frame):
         return none
     steps = frame.range / step
-    off: Bools = np.abs(steps - np.round(steps)) > 0.02 + 1e-7 * steps
-    return off if off.mean() < 1 - _ADAPTED else none
+    off: Bools = np.abs(steps - np.round(steps)) > _ON_STEP + 1e-7 * steps
+    return off if 1 - off.mean() > 5 * _BY_CHANCE else none
 
 
 def _too_weak(frame: Observation) -> Bools:

@@ -57,7 +57,7 @@ class Temporal(Defence):
     ) -> float:
         """1 less the support of the best motion: the share of returns that earlier frames have where it was.
 
-        Places that an earlier frame did not look at do not count.
+        Places that an earlier frame did not look at do not count, nor motions through many of them.
         """
         body = frame.members[row]
         if len(body) > _MOST:
@@ -78,10 +78,11 @@ class Temporal(Defence):
             counts = seen >= _FEWEST * len(body)
             support += np.where(counts, filled / np.maximum(seen, 1), 0)
             counted += counts
-        known = counted > 0
-        if not known[0]:  # as it stands, nothing is known of its place
+        if not counted[0]:  # as it stands, nothing is known of its place
             return 0.0
-        return float(1 - (support[known] / counted[known]).max())
+        # Motions out of what the object itself hides would excuse all: they must be seen as often as others.
+        seen_enough = counted >= max(counted.max() - 1, 1)
+        return float(1 - (support[seen_enough] / counted[seen_enough]).max())
 
     def _velocities(self, frame: Observation, row: int) -> Float:
         """Velocities (k, 3) in the scene that a box may have, standing still first."""

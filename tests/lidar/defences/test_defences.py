@@ -138,15 +138,46 @@ def test_ground_that_is_moved_outwards_is_a_void(frame):
     assert judged(Void(), moved).frame > 0.5
 
 
-@pytest.mark.parametrize("earlier", [0, 3])
-def test_a_sector_without_returns_stands_out_of_its_neighbours_and_of_earlier_frames(earlier):
-    frames = observed(world(*STREET), frames=earlier + 1, trajectory=driven((8.0, 0.0, 0.0), yaw_rate=0.1))
-    last = frames[-1]
-    gone = np.abs(last.azimuth - np.radians(40)) < np.radians(5)
-    verdict = judged(Azimuth(), *frames[:-1], without(last, gone))
-    assert verdict.frame > (0.8 if earlier else 0.4)
-    assert np.degrees(np.arctan2(*verdict.gaps.xy[0, ::-1])) == pytest.approx(40, abs=4)
-    assert judged(Azimuth(), *frames).frame < 0.2
+@pytest.fixture(scope="module")
+def turning():
+    """Frames of a vehicle in a bend, which pass a wall on one side and open ground on the other."""
+    return observed(world(*STREET), frames=6, trajectory=driven((8.0, 0.0, 0.0), yaw_rate=0.1))
+
+
+def blinded(frame, width):
+    """A frame without the returns of a sector at 40 degrees."""
+    return without(frame, np.abs(frame.azimuth - np.radians(40)) < np.radians(width / 2))
+
+
+@pytest.mark.parametrize("width", [10, 20, 45, 80])
+@pytest.mark.parametrize("since", ["the frame", "the drive's start", "two frames"])
+def test_a_sector_without_returns_stands_out_however_long_it_has_been_removed(turning, width, since):
+    *earlier, last = turning
+    if since == "the frame":
+        verdict = judged(Azimuth(), *earlier, blinded(last, width))
+    elif since == "two frames":
+        verdict = judged(Azimuth(), *earlier[:-1], blinded(earlier[-1], width), blinded(last, width))
+    else:
+        verdict = judged(Azimuth(), *(blinded(frame, width) for frame in turning))
+    assert verdict.frame > 0.9
+    assert judged(Azimuth(), *turning).frame == 0
+    assert np.degrees(np.arctan2(*verdict.gaps.xy[0, ::-1])) == pytest.approx(40, abs=width / 2)
+
+
+def test_a_scanner_that_sees_no_ground_misses_a_sector_of_walls_that_earlier_frames_had(turning):
+    """The rest of the turn looks at the sky: what is missing is known from earlier frames alone."""
+    upwards = [without(frame, frame.xyz[:, 2] < 0) for frame in turning]
+    last = upwards[-1]
+    lost = without(last, np.abs(last.azimuth - np.radians(90)) < np.radians(10))
+    assert judged(Azimuth(), *upwards[:-1], lost).frame > 0.5
+    assert judged(Azimuth(), *upwards).frame < 0.3
+    assert judged(Azimuth(), lost).frame < 0.3
+
+
+def test_fog_that_takes_returns_all_around_is_no_removed_sector(turning):
+    """What no part of the turn has is not expected."""
+    near = [without(frame, frame.distance > 6) for frame in turning]
+    assert judged(Azimuth(), *near).frame < 0.3
 
 
 def test_returns_behind_a_wall_of_the_map_and_lost_walls_stand_out(frame):
@@ -182,6 +213,18 @@ def test_physics_finds_what_no_pulse_can_give(frame):
         found = judged(Physics(), replace(frame, **columns)).returns
         assert found[some[:-1]].mean() > 0.9, name
         assert np.median(found) == 0, name
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5])
+def test_returns_off_the_range_step_stand_out_even_if_half_of_a_frame_are(share):
+    """A forger who computes ranges in floating point does not keep to the scanner's steps."""
+    frame = observed(world(*STREET), settings=replace(LEVELS["survey"], false_alarms=False))[0]
+    forged = np.random.default_rng(3).random(len(frame)) < share
+    shift = np.where(forged, 0.4 * frame.sensor.range_quantum, 0.0)
+    moved = replace(frame, xyz=frame.xyz + shift[:, None] * frame.direction, range=frame.range + shift)
+    returns = judged(Physics(), moved).returns
+    assert returns[forged].min() > 0.8
+    assert returns[~forged].max() <= 0.2
 
 
 def test_returns_too_weak_to_be_detected_are_suspicious_where_the_others_keep_the_threshold():
@@ -225,6 +268,17 @@ def test_earlier_frames_support_genuine_cars_and_no_sudden_ones(speed):
     assert genuine < 0.3
     assert judged(Temporal(), *frames).frame < 0.3
     assert judged(Temporal(), attacked).frame == 0, "without earlier frames nothing is known"
+
+
+def test_a_phantom_that_keeps_pace_is_not_excused_by_motions_through_what_it_hides():
+    """Earlier frames cannot see behind the phantom itself; motions that end there prove nothing."""
+    frames = followed(0.0, frames=10)
+    forged = [with_car(f, (9.0, 1.0, -0.98), points=10**6, noise=0.02, window=np.pi) for f in frames[3:]]
+    for count in (1, 4, 7):
+        *_, (last, rows) = forged[:count]
+        verdict = judged(Temporal(), *frames[:3], *(frame for frame, _ in forged[: count - 1]), last)
+        fake, genuine = split(last, rows, verdict.objects)
+        assert fake > 0.15 > genuine, count
 
 
 def test_an_object_that_comes_out_of_hiding_is_not_suspicious():
