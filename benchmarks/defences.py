@@ -114,10 +114,11 @@ def watermark_calibration(drives: list[Path]) -> Path:
 
 
 def joined(*files: Path) -> Calibration:
-    """One calibration of several files."""
+    """One calibration of several files; what defences have in common is that of the first."""
     parts = [read_calibration(file) for file in files]
     tails = {key: tail for part in parts for key, tail in part.tails.items()}
-    return Calibration(dict(sorted(tails.items())), "; ".join(part.note for part in parts))
+    joint = {level: joint for part in reversed(parts) for level, joint in part.joint.items()}
+    return Calibration(dict(sorted(tails.items())), "; ".join(part.note for part in parts), joint)
 
 
 if __name__ == "__main__":

@@ -618,7 +618,7 @@ def defend(
 
     lidar defend drive --defence occlusion,shadow -o verdicts
 
-    lidar defend drive --defence all --fuse fisher --json
+    lidar defend drive --defence all --fuse max --json
 
     lidar defend drive --defence all --calibrate -o calibration.toml
 
@@ -664,7 +664,7 @@ def defend(
             opened,
             chosen,
             calibration=read_calibration(options.calibration),
-            rule=options.fuse,
+            rule="" if options.fuse == "none" else options.fuse,
             scene=scene,
             out=out,
             overwrite=report.overwrite,

@@ -700,8 +700,9 @@ class DefendOptions:
     scene: Path | None = None
     """Scene that the map defence compares with; by default the one that the dataset was driven in."""
 
-    fuse: Annotated[str, Parameter(converter=_lower)] = ""
-    """Fuse the verdicts: max (the most unusual one counts) or fisher (all count, as if independent)."""
+    fuse: Annotated[str, Parameter(converter=_lower)] = "harmonic"
+    """Verdict of all defences together, if there are several: harmonic (mean of the shares of genuine data
+    that are as suspicious), max (the least of them), fisher (all count, as if independent) or none."""
 
     calibrate: bool = False
     """Instead of judging, write the suspicions of these datasets, which must be genuine, to the TOML file
@@ -715,9 +716,9 @@ class DefendOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.fuse not in ("", "max", "fisher"):
-            raise InputError(f"`fuse` {self.fuse}: max or fisher")
-        if self.calibrate and (self.fuse or self.calibration is not None):
+        if self.fuse not in ("harmonic", "max", "fisher", "none"):
+            raise InputError(f"`fuse` {self.fuse}: harmonic, max, fisher or none")
+        if self.calibrate and (self.fuse != "harmonic" or self.calibration is not None):
             raise InputError("`calibrate`: leave out `fuse` and `calibration`")
         if not 0 <= self.seed < 1 << 63:
             raise InputError(f"`seed` {self.seed}: give a non-negative integer")

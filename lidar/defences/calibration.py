@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -60,11 +60,30 @@ class Tail:
 
 
 @dataclass(frozen=True, slots=True)
+class Joint:
+    """Suspicions that several defences have of the same genuine samples: the most suspicious ones.
+
+    count     : genuine samples that they are chosen of
+    defences  : (k,) names
+    suspicion : (m, k)
+    """
+
+    count: int
+    defences: tuple[str, ...]
+    suspicion: Float
+
+
+@dataclass(frozen=True, slots=True)
 class Calibration:
-    """Tails by defence and level of `lidar.defences.scores.LEVELS`; ``note`` says of which data."""
+    """Tails by defence and level of `lidar.defences.scores.LEVELS`, and what defences have in common.
+
+    joint : by level
+    note  : of which data
+    """
 
     tails: Mapping[tuple[str, str], Tail]
     note: str = ""
+    joint: Mapping[str, Joint] = field(default_factory=dict)
 
     def tail(self, defence: str, level: str) -> Tail:
         """A tail; raises InputError if the defence is not calibrated at that level."""
@@ -73,6 +92,14 @@ class Calibration:
                 f"defence {defence}: the calibration has no suspicions of {level}; calibrate again"
             )
         return self.tails[defence, level]
+
+    def shares(self, defences: Sequence[str], suspicion: Iterable[Float], *, level: str) -> Float:
+        """Shares (k, n) of genuine samples that are at least as suspicious to each of k defences.
+
+        Raises InputError as `tail` does.
+        """
+        columns = zip(defences, suspicion, strict=True)
+        return np.stack([self.tail(name, level).of(column) for name, column in columns])
 
     def threshold(self, defence: str, level: str) -> float:
         """Suspicion above which is the share `FALSE_ALARMS` of genuine samples."""
@@ -100,7 +127,8 @@ def read_calibration(path: Path | None = None) -> Calibration:
         for defence, levels in document["defence"].items():
             for level, row in levels.items():
                 tails[defence, level] = _tail(row)
-        return Calibration(tails, str(document["note"]))
+        joint = {level: _joint(row) for level, row in document.get("joint", {}).items()}
+        return Calibration(tails, str(document["note"]), joint)
     except FileNotFoundError:
         raise InputError(f"{file}: is missing; lidar defend --calibrate makes one") from None
     except KeyError as error:
@@ -117,6 +145,12 @@ def _tail(row: Mapping[str, Any]) -> Tail:
     return Tail(int(row["count"]), share, suspicion)
 
 
+def _joint(row: Mapping[str, Any]) -> Joint:
+    """Joint suspicions of a file; raises ValueError, KeyError or TypeError if they are none."""
+    defences = tuple(map(str, row["defences"]))
+    return Joint(int(row["count"]), defences, np.array(row["suspicion"], float).reshape(-1, len(defences)))
+
+
 def calibration_text(calibration: Calibration) -> str:
     """A calibration as `read_calibration` reads it."""
     lines = [f'note = "{calibration.note}"']
@@ -127,5 +161,15 @@ def calibration_text(calibration: Calibration) -> str:
             f"count = {tail.count}",
             f"share = [{', '.join(f'{v:g}' for v in tail.share)}]",
             f"suspicion = [{', '.join(f'{v:g}' for v in tail.suspicion)}]",
+        ]
+    for level, joint in sorted(calibration.joint.items()):
+        lines += [
+            "",
+            f"[joint.{level}]",
+            f"count = {joint.count}",
+            f"defences = {list(joint.defences)}",
+            "suspicion = [",
+            *(f"  [{', '.join(f'{v:g}' for v in row)}]," for row in joint.suspicion),
+            "]",
         ]
     return "\n".join(lines) + "\n"

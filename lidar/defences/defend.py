@@ -6,7 +6,7 @@ import io
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from geoscene.typing import Float
 from lidar.camera.png import write_png
 from lidar.dataset.derived import check_target, complete_folder
 from lidar.dataset.layout import Dataset
-from lidar.defences.calibration import Calibration, calibration_text, tail_of
-from lidar.defences.fusion import FUSED, fused, fused_threshold
+from lidar.defences.calibration import Calibration, Joint, calibration_text, tail_of
+from lidar.defences.fusion import FUSED, fused, fused_threshold, joint_of
 from lidar.defences.observation import Observation
 from lidar.defences.reading import Scans, read_scans
 from lidar.defences.registry import NamedDefence
@@ -61,6 +61,16 @@ class Tally:
         """Samples by defence and level."""
         return {key: Samples.of(pairs) for key, pairs in self.pairs.items()}
 
+    def joint(self, calibration: Calibration, *, rng: np.random.Generator) -> dict[str, Joint]:
+        """Suspicions of the same samples by all defences, by level."""
+        found = {}
+        for level in LEVELS:
+            columns = {name: pairs for (name, of), pairs in self.pairs.items() if of == level}
+            if any(len(column) for pairs in columns.values() for column, _ in pairs):
+                frames = ({name: pairs[k][0] for name, pairs in columns.items()} for k in range(self.frames))
+                found[level] = joint_of(frames, calibration, level=level, rng=rng)
+        return found
+
 
 @dataclass(frozen=True, slots=True)
 class Defended:
@@ -97,7 +107,7 @@ def defend(
 ) -> Defended:
     """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
 
-    rule      : of `lidar.defences.fusion.FUSIONS`, by which the verdicts are also fused; none if empty
+    rule      : of `lidar.defences.fusion.FUSIONS`, by which verdicts of several are also fused; none if empty
     overwrite : write to a directory that is not empty
 
     Raises InputError if the data lack what a defence needs, before anything is judged.
@@ -131,6 +141,7 @@ def _defended(
 ) -> Defended:
     job = _job(datasets, defences, scene=scene, seed=seed)
     defences = job.defences
+    rule = rule if len(defences) > 1 else ""
     for named in defences:
         calibration.tail(named.name, "frames")
     thresholds = {
@@ -140,7 +151,10 @@ def _defended(
         if (n.name, level) in calibration.tails
     }
     if rule:
-        thresholds |= {(FUSED, level): fused_threshold(level) for level in LEVELS}
+        names = [named.name for named in defences]
+        thresholds |= {
+            (FUSED, level): fused_threshold(calibration, names, level=level, rule=rule) for level in LEVELS
+        }
     tally, tables = Tally(), _Tables()
     for place, scans, judged in job.judged(progress):
         if rule:
@@ -211,6 +225,7 @@ def calibrate(
         names.append(f"{scans.dataset.path.name} ({scans.sensor.model})")
     note = f"{tally.frames} frames of {', '.join(dict.fromkeys(names))}"
     found = Calibration({key: tail_of(samples) for key, samples in tally.samples().items()}, note)
+    found = replace(found, joint=tally.joint(found, rng=generator(seed, "calibration")))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, calibration_text(found).encode())
     return found

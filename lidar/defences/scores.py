@@ -17,7 +17,8 @@ LEVELS = ("returns", "objects", "frames")
 FALSE_ALARMS = {"returns": 0.001, "objects": 0.01, "frames": 0.05}
 """Share of genuine returns, objects and frames that may be suspected, by level."""
 
-_BINS = 2000
+BINS = 2000
+"""Steps of suspicion that samples are counted in."""
 _BOOTSTRAPS = 1000
 
 
@@ -35,18 +36,18 @@ class Samples:
     @classmethod
     def of(cls, frames: Sequence[tuple[Float, NDArray[np.bool_]]]) -> Samples:
         """Samples of frames; each gives its suspicions and which of them are of attacked ones."""
-        genuine = np.zeros((len(frames), _BINS + 1), np.int64)
+        genuine = np.zeros((len(frames), BINS + 1), np.int64)
         attacked = np.zeros_like(genuine)
         for k, (suspicion, truth) in enumerate(frames):
             rows = bins_of(suspicion)
-            genuine[k] = np.bincount(rows[~truth], minlength=_BINS + 1)
-            attacked[k] = np.bincount(rows[truth], minlength=_BINS + 1)
+            genuine[k] = np.bincount(rows[~truth], minlength=BINS + 1)
+            attacked[k] = np.bincount(rows[truth], minlength=BINS + 1)
         return cls(genuine, attacked)
 
 
 def bins_of(suspicion: Float) -> NDArray[np.int64]:
     """Bin of each suspicion."""
-    return np.clip(np.round(np.asarray(suspicion) * _BINS), 0, _BINS).astype(np.int64)
+    return np.clip(np.round(np.asarray(suspicion) * BINS), 0, BINS).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ def threshold_at(samples: Samples, rate: float) -> float:
     genuine = samples.genuine.sum(axis=0)
     above = genuine.sum() - np.cumsum(genuine)
     allowed = np.flatnonzero(above <= rate * genuine.sum())
-    return float(allowed[0] / _BINS)
+    return float(allowed[0] / BINS)
 
 
 def score(samples: Samples, *, threshold: float, rng: np.random.Generator) -> Score:
@@ -97,7 +98,7 @@ def score(samples: Samples, *, threshold: float, rng: np.random.Generator) -> Sc
     )
     every = np.concatenate([weights, drawn])
     genuine, attacked = every @ samples.genuine, every @ samples.attacked
-    alarm = int(np.floor(threshold * _BINS + 1e-9)) + 1
+    alarm = int(np.floor(threshold * BINS + 1e-9)) + 1
     return Score(
         int(genuine[0].sum()),
         int(attacked[0].sum()),

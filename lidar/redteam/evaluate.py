@@ -224,7 +224,7 @@ def _fused_frame(frame: Mapping[str, Any], calibration: Calibration) -> dict[str
             verdicts[name] = Verdict(None, None if objects is None else np.array(objects, float), suspicion)
     if len(verdicts) < 2:
         return dict(frame)
-    found = fused(verdicts, calibration, rule="max")
+    found = fused(verdicts, calibration, rule="harmonic")
     objects = {} if found.objects is None else {FUSED: found.objects.tolist()}
     return {
         **frame,

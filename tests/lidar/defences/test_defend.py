@@ -177,7 +177,14 @@ def test_clouds_without_ring_and_time_are_refused(scene, tmp_path):
 
 def test_calibration_takes_genuine_data_alone(plain, attacked, tmp_path):
     made = calibrate([open_dataset(plain)], read_defences(["physics", "shadow"]), out=tmp_path / "c.toml")
-    assert read_calibration(tmp_path / "c.toml").tails.keys() == made.tails.keys()
+    read = read_calibration(tmp_path / "c.toml")
+    assert read.tails.keys() == made.tails.keys()
+    assert {level: joint.count for level, joint in read.joint.items()} == {
+        level: joint.count for level, joint in made.joint.items()
+    }
+    for level, joint in made.joint.items():
+        assert joint.defences == ("physics", "shadow")
+        assert (read.joint[level].suspicion == joint.suspicion).all()
     with pytest.raises(DatasetError, match="was attacked"):
         calibrate([open_dataset(attacked)], read_defences(["physics"]), out=tmp_path / "d.toml")
     assert not (tmp_path / "d.toml").exists()
@@ -274,12 +281,14 @@ def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
     words = ("lidar", "defend", attacked, "--defence", "occlusion:cell=0.5,physics", "-q")
     found = json.loads(run_program(*words, "--json", "-o", tmp_path / "out").stdout)
     assert found["defences"]["occlusion"]["returns"]["attacked"] > 0
+    assert "fused" in found["defences"]
     assert json.loads((tmp_path / "out" / "defend.json").read_text())["options"][0]["cell"] == 0.5
     for extra, message in {
         ("--defence", "oclusion"): "is occlusion meant",
         ("--defence", "physics", "-o", str(tmp_path / "out")): "is not empty",
-        ("--defence", "physics", "--fuse", "mean"): "max or fisher",
+        ("--defence", "physics", "--fuse", "mean"): "harmonic, max, fisher or none",
         ("--defence", "physics", "--calibrate"): "give --out",
+        ("--defence", "physics", "--calibrate", "--fuse", "max"): "leave out",
         ("--defence", "physics", "--calibration", str(attacked / "dataset.json")): "no calibration",
     }.items():
         refused = run_program("lidar", "defend", attacked, *extra, "-q")

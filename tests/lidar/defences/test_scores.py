@@ -1,11 +1,13 @@
 """Scores, calibrations and fusion against figures that are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from lidar.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
-from lidar.defences.fusion import fused, fused_threshold
+from lidar.defences.fusion import FUSIONS, fused, fused_threshold, joint_of
 from lidar.defences.registry import defence_names, defence_rows, read_defences
 from lidar.defences.scores import FALSE_ALARMS, Samples, score, threshold_at
 from lidar.defences.verdict import Verdict
@@ -88,11 +90,71 @@ def test_fused_verdicts_of_independent_defences_alarm_as_often_as_they_say(rule)
     found = fused(verdicts, calibration, rule=rule)
     assert found.objects is None
     for level in ("objects", "frames"):  # 1 % and 5 %; 0.1 % is at the end of the tail
-        alarms = np.mean(found.returns > fused_threshold(level))
+        alarms = np.mean(found.returns > fused_threshold(calibration, list(verdicts), level=level, rule=rule))
         assert alarms == pytest.approx(FALSE_ALARMS[level], rel=0.1)
     both = {name: Verdict(np.array([0.97]), None, 0.97) for name in ("one", "other")}
     one = {"one": both["one"], "other": Verdict(np.array([0.3]), None, 0.3)}
     assert fused(both, calibration, rule="fisher").frame > fused(one, calibration, rule="fisher").frame
+
+
+NAMES = ("one", "other", "third", "silent")
+
+
+def dependent(rng, frames=200, each=100):
+    """Suspicions of genuine objects by frame: three defences agree in part, one is silent."""
+    for _ in range(frames):
+        common = rng.standard_normal(each)
+        own = rng.standard_normal((3, each))
+        columns = norm.cdf(0.8 * common + 0.6 * own)
+        yield dict(zip(NAMES, [*columns, np.zeros(each)], strict=True))
+
+
+def jointly_calibrated(rng):
+    frames = list(dependent(rng))
+    tails = {
+        (name, level): tail_of(Samples.of([(row[name], np.zeros(len(row[name]), bool)) for row in frames]))
+        for name in NAMES
+        for level in FALSE_ALARMS
+    }
+    plain = Calibration(tails, "dependent")
+    joint = {level: joint_of(frames, plain, level=level, rng=rng) for level in ("objects", "frames")}
+    return replace(plain, joint=joint)
+
+
+@pytest.mark.parametrize("names", [NAMES, ("one", "other"), ("third",), ("one", "silent")])
+def test_a_harmonic_fusion_alarms_as_often_as_it_says_whatever_defences_have_in_common(names):
+    rng = np.random.default_rng(9)
+    calibration = jointly_calibrated(rng)
+    rows = list(dependent(rng, 1000))
+    verdicts = {name: Verdict(None, np.concatenate([row[name] for row in rows]), 0.0) for name in names}
+    objects = fused(verdicts, calibration, rule="harmonic").objects
+    limit = fused_threshold(calibration, names, level="objects", rule="harmonic")
+    assert np.mean(objects > limit) == pytest.approx(FALSE_ALARMS["objects"], rel=0.3)
+    bound = fused(verdicts, calibration, rule="max").objects
+    known = fused_threshold(calibration, names, level="objects", rule="max")
+    if "silent" in names:
+        assert np.mean(bound > known) < 0.8 * np.mean(objects > limit), "Bonferroni's bound is too careful"
+
+
+def test_more_is_fused_than_the_calibration_has_suspicions_of():
+    """A defence that was calibrated on other data has the threshold that the rule has by theory."""
+    calibration = jointly_calibrated(np.random.default_rng(10))
+    tails = {**calibration.tails, ("new", "objects"): calibration.tails["one", "objects"]}
+    found = fused_threshold(
+        replace(calibration, tails=tails), [*NAMES, "new"], level="objects", rule="harmonic"
+    )
+    assert found == pytest.approx(-np.log10(FALSE_ALARMS["objects"]) / 6)
+
+
+@pytest.mark.parametrize("rule", FUSIONS)
+def test_a_fused_suspicion_grows_with_each(rule):
+    calibration = jointly_calibrated(np.random.default_rng(11))
+    steps = np.linspace(0, 1, 50)
+    for name in NAMES[:3]:
+        verdicts = {
+            other: Verdict(None, steps if other == name else np.full(50, 0.3), 0.0) for other in NAMES
+        }
+        assert (np.diff(fused(verdicts, calibration, rule=rule).objects) >= -1e-12).all()
 
 
 def test_defences_are_read_from_text():
@@ -129,4 +191,5 @@ def test_a_suspicion_that_most_genuine_samples_have_is_not_unusual():
     calibration = Calibration({("one", level): tail for level in ("returns", "frames")})
     verdict = fused({"one": Verdict(column, None, 0.0)}, calibration, rule="max")
     for level in FALSE_ALARMS:
-        assert np.mean(verdict.returns > fused_threshold(level)) <= FALSE_ALARMS[level]
+        limit = fused_threshold(calibration, ["one"], level=level, rule="max")
+        assert np.mean(verdict.returns > limit) <= FALSE_ALARMS[level]
