@@ -65,8 +65,7 @@ def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
         return f"needs colour images, and {path} has none"
     if "navigation" in needs and scans.navigation is None:
         return f"needs a GNSS receiver and an inertial unit, and the rig of {path} lacks one"
-    place = scans.dataset.scene_path
-    if "scene" in needs and not (url_of(place) or place.exists()):
+    if "scene" in needs and not (url_of(place := scans.dataset.scene_path) or place.exists()):
         return f"needs the scene {place} of {path}, which is missing; give `scene`"
     if "watermark" in needs and "watermark" not in scans.dataset.manifest["recipe"]:
         return f"needs clouds with a watermark (lidar sign), and {path} has none"
