@@ -11,7 +11,7 @@ GRAVITY = 9.81
 """m/s^2."""
 DRY_GRIP, WET_GRIP, SNOW_GRIP, ICE_GRIP = 0.85, 0.60, 0.20, 0.10
 """Peak coefficients of friction of tyres: middle of 0.8 to 0.9 on dry and of 0.5 to 0.7 on wet asphalt, and
-those of hard-packed snow and ice (Taborek 1957; table in Wong, "Theory of Ground Vehicles")."""
+those of hard-packed snow and ice (Taborek 1957; table in Wong, "Theory of Ground Vehicles"; unconfirmed)."""
 _REACTION_S, _BRAKING = 2.5, 3.4
 """Reaction time in seconds and deceleration in m/s^2 of the stopping sight distance (AASHTO, "A Policy on
 Geometric Design of Highways and Streets")."""

@@ -22,7 +22,7 @@ from lidar.random_streams import generator
 from lidar.rig.camera_model import pixel_rays, project
 from lidar.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
-from lidar.weather.fields import FARTHEST, Field, Rays, amounts, place_field
+from lidar.weather.fields import FARTHEST, Field, Rays, amounts, field_of
 from lidar.weather.media import Medium, medium_of
 from lidar.weather.setting import WeatherSetting
 from lidar.weather.streaks import Particles, streak_cover
@@ -36,7 +36,7 @@ _VISIBLE_NM = 550.0
 _LEAST = 3e-4
 """Diameter in metres of the smallest drops that are seen one by one."""
 
-_TOP = {"fog": 100.0, "dust": 100.0, "rain": 2000.0, "snow": 2000.0}
+_TOP = {"fog": 100.0, "dust": 100.0, "rain": 2000.0, "snow": 2000.0, "spray": 5.0}
 """Height of the weather above the camera in metres, through which the sky is seen; typical."""
 
 _CLEAR = Medium(0.0, 0.0, np.empty(0), np.empty(0), np.empty(0))
@@ -92,7 +92,7 @@ def _through_air(
     camera = at.camera
     added = _exposed(at, lambda sources: sources.mean)
     path = np.where(np.isfinite(distance), distance, _to_sky(camera, pose, top=_TOP[setting.kind]))
-    field = place_field(setting, FARTHEST, at=at)
+    field = field_of(setting, FARTHEST, at=at)
     if field is not None:
         path = _path_through(field, path, camera=camera, pose=pose)
     clear = np.exp(-air.extinction * path).astype(np.float32)[..., None]
@@ -214,7 +214,8 @@ def _glare(
     sun, camera = at.light.direction @ pose.rotation[0], at.camera
     if not (sun[2] > 0 and at.light.beam.any() and _lit(image, at=at, pose=pose)):
         return np.zeros((1, 1, 3), np.float32)
-    path = min(_TOP.get(setting.kind, 0.0) / max(float(at.light.direction[2]), 1e-6), _SKYLINE)
+    top = 0.0 if setting.kind == "spray" else _TOP.get(setting.kind, 0.0)
+    path = min(top / max(float(at.light.direction[2]), 1e-6), _SKYLINE)
     angle = np.degrees(np.arccos(np.clip(pixel_rays(camera) @ sun, -1, 1)))
     veil = np.nan_to_num(10 / np.maximum(angle, 1.0) ** 2).reshape(camera.height, camera.width, 1)
     share = min(setting.drops + setting.dirt, 1.0) / _STRAY * float(sun[2]) * math.exp(-air.extinction * path)

@@ -16,7 +16,6 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.random_streams import generator
 from lidar.raycast.memory import inlined
-from lidar.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 from lidar.weather.setting import WeatherSetting
 from lidar.world.shelter import CELL
@@ -39,9 +38,8 @@ _SPRAY_TIME, _SPRAY_LENGTH = 1.0, 4.0  # s, decay of spray, and after which it i
 _SPRAY_HEIGHT = 0.5  # metres over which spray thins out, typical value
 _SPRAY_AXLE = 1.5  # metres from a vehicle's middle to its rear axle, typical value
 _SPRAY_HALF_WIDTH = 1.0  # metres, of the plume at the axle, typical value
-_SPRAY_EXTINCTION = 0.3
-"""Extinction (1/m) of spray at the ground behind an axle, at 100 km/h on 1 mm of water; assumed so that the
-visibility in it is 50 m at a height of 0.7 m."""
+_SPRAY_ASIDE = 8.0  # metres beside the way of a vehicle beyond which there is no spray, 4 widths of the plume
+_SPRAY_SHAPE = 0.5  # of the gamma distribution of clusters: a sixth of places have twice the mean, assumed
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,21 +94,13 @@ def _around(position: Float, far: float) -> tuple[tuple[float, float], int]:
     return (float(x), float(y)), int(2 * reach / _STEP) + 1
 
 
-def field_of(setting: WeatherSetting, sensor: Sensor, *, at: Situation) -> Field | None:
-    """Where the weather of a setting is around a sensor; None for everywhere.
-
-    Raises InputError if the setting has a place or road users, and the situation knows none.
-    """
-    if setting.kind == "spray":
-        return spray_field(sensor, at=at)
-    return place_field(setting, sensor.max_range, at=at)
-
-
-def place_field(setting: WeatherSetting, far: float, *, at: Situation) -> Field | None:
+def field_of(setting: WeatherSetting, far: float, *, at: Situation) -> Field | None:
     """Where the weather of a setting is up to a distance from a sensor; None for everywhere.
 
-    Raises InputError if the setting has a place or plumes, and the situation knows no poses.
+    Raises InputError if the setting has a place, plumes or road users, and the situation knows none.
     """
+    if setting.kind == "spray":
+        return spray_field(far, at=at)
     has_place = bool(setting.radius or setting.polygon)
     plumes = setting.medium == "plumes"
     cover = _cover(setting, at=at)
@@ -188,7 +178,7 @@ def plume_pattern(
     return share
 
 
-def spray_field(sensor: Sensor, *, at: Situation) -> Field | None:
+def spray_field(far: float, *, at: Situation) -> Field:
     """The spray behind the vehicles around a sensor, as shares of the spray at 100 km/h; zero without any.
 
     Raises InputError if the road users are unknown.
@@ -198,10 +188,9 @@ def spray_field(sensor: Sensor, *, at: Situation) -> Field | None:
             "spray needs road users, which recorded data do not have: use lidar drive --traffic on"
         )
     position = at.poses(np.array([at.start_ns])).position[0]
-    corner, count = _around(position, sensor.max_range)
+    corner, count = _around(position, far)
     share = np.zeros((count, count))
-    frame = at.frame if isinstance(at.frame, int) else 0
-    start_ns, end_ns = sensor.window_ns(frame)
+    start_ns, end_ns = at.world.span_ns
     ground = []
     for group in at.world.caster.instances:
         if group.transform.ndim != 4:
@@ -212,15 +201,36 @@ def spray_field(sensor: Sensor, *, at: Situation) -> Field | None:
         for here, velocity in zip(place[fast, 0], speed[fast], strict=True):
             _add_spray(share, corner=corner, place=here[:2], velocity=velocity[:2])
             ground.append(float(here[2]))
+    if ground:
+        share *= _clusters(at.seed, corner=corner, count=count)
     return Field(corner, share, float(np.median(ground)) if ground else 0.0, _SPRAY_HEIGHT)
+
+
+def _clusters(seed: int, *, corner: tuple[float, float], count: int) -> Float:
+    """Density (count, count) of spray over its mean, at samples: clusters that stay where they are."""
+    table = _cluster_table(seed)
+    first = np.round(np.array(corner) / _STEP).astype(np.int64)
+    column, row = (first[:, None] + np.arange(count)) % len(table)
+    density: Float = table[np.ix_(row, column)]
+    return density
+
+
+@functools.lru_cache(maxsize=2)
+def _cluster_table(seed: int) -> Float:
+    """Gamma-distributed factors (64, 64) with a mean of 1; they repeat after 128 m."""
+    return generator(seed, "weather", "spray clusters").gamma(_SPRAY_SHAPE, 1 / _SPRAY_SHAPE, (64, 64))
 
 
 def _add_spray(share: Float, *, corner: tuple[float, float], place: Float, velocity: Float) -> None:
     """Add the plume of a vehicle to a field: thinning with the time since it passed, and wider with it."""
     speed = float(np.hypot(*velocity))
     ahead = velocity / speed
+    ends = place - np.array([[0.0], [_SPRAY_LENGTH * speed + _SPRAY_AXLE]]) * ahead - corner
+    low = np.maximum(np.floor((ends.min(axis=0) - _SPRAY_ASIDE) / _STEP).astype(int), 0)
+    high = np.maximum(np.ceil((ends.max(axis=0) + _SPRAY_ASIDE) / _STEP).astype(int), low)
+    share = share[low[1] : high[1], low[0] : high[0]]
     y, x = np.indices(share.shape) * _STEP
-    x, y = x + corner[0] - place[0], y + corner[1] - place[1]
+    x, y = x + corner[0] + low[0] * _STEP - place[0], y + corner[1] + low[1] * _STEP - place[1]
     behind = -(x * ahead[0] + y * ahead[1]) - _SPRAY_AXLE
     beside = x * -ahead[1] + y * ahead[0]
     age = behind / speed
@@ -228,11 +238,6 @@ def _add_spray(share: Float, *, corner: tuple[float, float], place: Float, veloc
     plume = np.exp(-age / _SPRAY_TIME - (beside / wide) ** 2) * (_SPRAY_HALF_WIDTH / wide)
     plume *= (speed * 3.6 / 100) ** 2
     share += np.where((behind >= 0) & (age <= _SPRAY_LENGTH), plume, 0.0)
-
-
-def spray_extinction(water_mm: float) -> float:
-    """Extinction (1/m) of spray where the share of its field is 1; water on the road in mm."""
-    return _SPRAY_EXTINCTION * min(water_mm, 3.0)
 
 
 def amounts(field: Field, rays: Rays, *, pulse: NDArray[np.integer], distance: Float) -> tuple[Float, Float]:

@@ -72,6 +72,11 @@ _DROPLETS_OF_LAW = {
 
 _FLAKE_RATIO = 25.0  # sr, ice clouds, typical value (20 to 35)
 _DUST_RATIO = 50.0  # sr, mineral dust, typical value (40 to 60)
+_SPRAY_EXTINCTION = 1.0
+"""1/m for 1 mm of water at 100 km/h. A tenth (assumed) of the water in two tracks 0.2 m wide is 1.1 l/s,
+over the plume of 2 m^2 20 g/m^3; drops of 60 um (assumed) have 3 * 20 g/m^3 / (1 t/m^3 * 60 um)."""
+
+_SPRAY_DEEPEST = 3.0  # mm of water from which on spray grows no more, assumed
 _SPHERE, _OBLATE = 0.3, 1.0  # mm, drops are spheres up to the first and oblate from the second on
 _SNOW_REFLECTANCE = ((400.0, 1100.0, 1500.0), (0.85, 0.85, 0.07))  # nm and reflectance, typical values
 
@@ -305,12 +310,15 @@ def medium_of(kind: str, amount: float, *, wavelength_nm: float, medium: str) ->
     if kind == "dust":
         alpha = CONTRAST / amount
         return Medium(alpha, alpha / _DUST_RATIO, _NONE, _NONE, _NONE)
+    if kind == "spray":
+        return spray(amount, wavelength_nm)
     return CLEAR
 
 
 @lru_cache(maxsize=64)
-def spray(extinction: float, wavelength_nm: float) -> Medium:
-    """Droplets that tyres throw up, with an extinction in 1/m."""
+def spray(water_mm: float, wavelength_nm: float) -> Medium:
+    """Droplets that tyres throw up from water on the road, as dense as behind the axle at 100 km/h."""
+    extinction = _SPRAY_EXTINCTION * min(water_mm, _SPRAY_DEEPEST)
     ratio = droplet_optics("strong-spray", wavelength_nm)[1]
     return Medium(extinction, extinction / ratio, _NONE, _NONE, _NONE)
 

@@ -13,9 +13,9 @@ from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 from lidar.weather.air import through_air
 from lidar.weather.camera import weathered
-from lidar.weather.fields import amounts, field_of, rays_of, spray_extinction
+from lidar.weather.fields import amounts, field_of, rays_of
 from lidar.weather.glass import dazzled, through_glass
-from lidar.weather.media import Medium, medium_of, spray
+from lidar.weather.media import Medium, medium_of
 from lidar.weather.setting import WeatherSetting
 
 
@@ -34,7 +34,7 @@ class Weather(WeatherSetting):
             return echoes
         medium = self._medium(sensor.wavelength_nm, amount=amount)
         if medium.extinction > 0:
-            field = field_of(self, sensor, at=at)
+            field = field_of(self, sensor.max_range, at=at)
             lens = self.lens / 1000
             echoes = through_air(pulses, echoes, medium=medium, field=field, lens=lens, at=at, rng=rng)
         if self.drops or self.dirt:
@@ -50,7 +50,7 @@ class Weather(WeatherSetting):
             return 1.0
         medium = self._medium(pulses.sensor.wavelength_nm, amount=amount)
         column = distance
-        if medium.extinction > 0 and (field := field_of(self, pulses.sensor, at=at)) is not None:
+        if medium.extinction > 0 and (field := field_of(self, pulses.sensor.max_range, at=at)) is not None:
             one = slice(row, row + 1)
             way = rays_of(pulses.origin[one], pulses.direction[one], time_ns=pulses.time_ns[one], at=at)
             column = float(amounts(field, way, pulse=np.zeros(1, int), distance=np.array([distance]))[1][0])
@@ -61,6 +61,4 @@ class Weather(WeatherSetting):
         return weathered(frame, self, at=at, rng=rng)
 
     def _medium(self, wavelength_nm: float, *, amount: float) -> Medium:
-        if self.kind == "spray":
-            return spray(spray_extinction(amount), wavelength_nm)
         return medium_of(self.kind, amount, wavelength_nm=wavelength_nm, medium=self.medium)

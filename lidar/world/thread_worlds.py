@@ -55,7 +55,7 @@ class Worlds:
             m = self.margin
             around = (region[0] - m, region[1] - m, region[2] + m, region[3] + m)
             shape, transform, feature = actor_transforms(self.actors, start_ns, end_ns=end_ns, region=around)
-            world.place_actors(shape, transform, feature=feature)
+            world.place_actors(shape, transform, feature=feature, span_ns=(start_ns, end_ns))
         return world
 
     def _loaded(self, world: World | None, region: Region) -> World:

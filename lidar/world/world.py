@@ -186,6 +186,7 @@ class World:
         self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
+        self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
         self._concatenate_tables()
@@ -247,14 +248,23 @@ class World:
             self._shelter()
             self.caster.update(instances=[self._still, self._moving[0]])
 
-    def place_actors(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> None:
+    def place_actors(
+        self,
+        shape: NDArray[np.int32],
+        transform: Float,
+        *,
+        feature: NDArray[np.int32],
+        span_ns: tuple[int, int] = (0, 1),
+    ) -> None:
         """Replace the actors of this world; its static part is not rebuilt.
 
         shape     : (k,) int32, index into the ``actors`` of the world
         transform : (k, 3, 4) float64, scene from actor; or (k, s, 3, 4) at s >= 2 moments evenly spaced over
                     the ray times 0 to 1: each ray intersects the actor at its pose at the ray's own time
         feature   : (k,) int32, numbers to find in `Surfaces.feature`
+        span_ns   : times that the ray times 0 and 1 stand for
         """
+        self.span_ns = span_ns
         self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
         self._index_instances()
         self.caster.update(instances=[self._still, self._moving[0]])

@@ -1,6 +1,7 @@
 """Weather in camera images: Koschmieder's law, streaks, drops on the window, glare."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -98,6 +99,22 @@ def test_light_passes_as_much_of_a_bank_of_fog_as_lies_in_its_way():
     lon, lat = map(float, GEO.to_geographic(2000.0, 0.0))
     away = WeatherSetting("rain", 40.0, longitude=lon, latitude=lat, radius=20.0)
     np.testing.assert_array_equal(seen(image, away, at).rgb, image.rgb)
+
+
+def test_spray_behind_a_car_veils_what_is_low_and_ahead():
+    def behind(kmh):
+        transform = np.tile(np.eye(3, 4), (1, 2, 1, 1))
+        transform[0, :, :, 3] = (25.0, 0, -1.0), (25.0 + kmh / 3.6 * 0.1, 0, -1.0)
+        caster = SimpleNamespace(instances=(SimpleNamespace(transform=transform),))
+        around = SimpleNamespace(caster=caster, span_ns=(10**9, 10**9 + 10**8))
+        setting = WeatherSetting(kind="spray", amount=1.0, medium="plumes")
+        return seen(picture(40.0), setting, situation(world=around, seed=3, geo=GEO)).rgb.astype(int)
+
+    image = behind(100)
+    ahead, beside, above = image[88:96, 150:170], image[88:96, :20], image[:30, 150:170]
+    assert ahead.mean() > 30
+    assert ahead.mean() > 2 * max(beside.mean(), above.mean(), 1)
+    assert behind(30).max() == 0
 
 
 def test_plumes_of_dust_veil_parts_of_an_image():

@@ -161,22 +161,38 @@ def test_spray_is_behind_the_vehicle_and_grows_with_speed():
     assert np.all(np.diff(behind) > 0)
 
 
-def moving(speed):
+CAR = box((15, -0.9, 0.3), (19.5, 0.9, 1.5), feature=9)
+BEHIND_A_CAR = world(box((-90, -90, -1), (90, 90, 0)), CAR)
+
+
+def moving(speed, *, seed=0):
+    """A car 15 m ahead that moves at a speed in m/s."""
     transform = np.tile(np.eye(3, 4), (1, 2, 1, 1))
-    transform[0, 0, :, 3] = (20.0, 0, 0)
-    transform[0, 1, :, 3] = (20.0 + speed * 0.1, 0, 0)
-    group = SimpleNamespace(transform=transform)
-    return replace(SITUATION, world=SimpleNamespace(caster=SimpleNamespace(instances=(group,))))
+    transform[0, 0, :, 3] = (17.25, 0, 0)
+    transform[0, 1, :, 3] = (17.25 + speed * 0.1, 0, 0)
+    caster = SimpleNamespace(instances=(SimpleNamespace(transform=transform),))
+    return replace(SITUATION, world=SimpleNamespace(caster=caster, span_ns=(0, 10**8)), seed=seed)
 
 
-def test_spray_of_a_fast_vehicle_gives_returns_between_it_and_the_sensor():
-    sweep = replace(SWEEP, sensor=replace(SENSOR, return_mode="first", reference_range=100.0))
-    fast, slow = (altered(read_weather("spray=3mm"), sweep=sweep, at=moving(v)).cloud for v in (28.0, 8.0))
-    spray = fast.xyz[fast.origin == Origin.WEATHER]
-    assert len(spray) > 20
-    assert np.all((spray[:, 0] < 20) & (np.abs(spray[:, 1]) < 8))
-    assert np.all(spray[:, 2] + 1.9 < 4)
-    assert not np.any(slow.origin == Origin.WEATHER)
+def spray_returns(kmh, *, seed):
+    """Positions (k, 3) of returns from spray of 1 mm of water behind a car, above the ground."""
+    sensor = load_sensor("hdl64e_s2")
+    sweep = cast(
+        sensor, Mount((0, 0, 1.9)), frame=0, seed=5, settings=LINK, world=BEHIND_A_CAR,
+        trajectory=driven((0.0, 0.0, 0.0), start=(0, 0, 0)),
+    )  # fmt: skip
+    at = replace(moving(kmh / 3.6, seed=seed), sensor="hdl64e_s2")
+    cloud = altered(read_weather("spray=1mm"), sweep=sweep, at=at).cloud
+    return cloud.xyz[cloud.origin == Origin.WEATHER] + [0, 0, 1.9]
+
+
+def test_a_scanner_15_m_behind_a_car_sees_its_spray_on_a_motorway_and_none_in_town():
+    fast, slower = ([spray_returns(kmh, seed=k) for k in range(4)] for kmh in (100, 70))
+    between = [np.sum((xyz[:, 0] > 1) & (xyz[:, 0] < 15.5) & (np.abs(xyz[:, 1]) < 2.5)) for xyz in fast]
+    assert np.median(between) > 100
+    assert np.mean([len(xyz) for xyz in fast]) > 3 * np.mean([len(xyz) for xyz in slower])
+    assert max(xyz[:, 2].max(initial=0) for xyz in fast) < 3
+    assert not len(spray_returns(30, seed=0))
 
 
 @pytest.mark.parametrize("text", ["spray", "dust", "rain=5,radius=100", "clear,sunlight=100000"])
