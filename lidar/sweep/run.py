@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +20,20 @@ from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.files import digest_of, exclusive, write_json
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress, silent
-from geoscene.scene import open_scene
+from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
 from lidar import __version__
 from lidar.dataset.journal import read_journal
-from lidar.dataset.layout import Paths
+from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError, LidarError
+from lidar.options import DriveOptions
 from lidar.sweep.grid import GridDrive, read_grid
 from lidar.tradeoff.accuracy import Pick, driven, picked
 
 log = logging.getLogger(__name__)
 
 _TABLE = "sweep.json"
+_GENERATOR = f"geoscene lidar {__version__}"
 _SECONDS = 2.0
 """Between two updates of the table."""
 
@@ -46,6 +50,7 @@ class DriveRow:
     seconds : of simulated time
     metres  : driven
     digest  : of the journal, hence of all frames
+    files   : digest of all files
     picked  : settings by which the drive reaches its accuracy or keeps its budget, in words
     reached : errors that its spot check found, in words
     """
@@ -58,6 +63,7 @@ class DriveRow:
     seconds: float = 0.0
     metres: float = 0.0
     digest: str = ""
+    files: str = ""
     picked: str = ""
     reached: str = ""
 
@@ -88,7 +94,7 @@ def sweep(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> SweepSummary:
-    """Record all drives of a grid; finished ones of the same options are verified and kept.
+    """Record all drives of a grid; finished ones of the same options whose files are unchanged are kept.
 
     Folder ``out`` gets a dataset for each drive, ``sweep.json`` and ``sweep.csv``. A drive that fails, or
     whose map cannot be built, is a row with the reason, and the others go on. The bytes depend neither on
@@ -144,7 +150,10 @@ def recorded(
                     table.set(row, DriveRow(planned.name, "failed", scene))
                     continue
                 ready = replace(planned, scene=scene, map=None)
-                task = _Task(row, ready, folder.absolute(), threads, overwrite=overwrite)
+                earlier = None if overwrite or table.rows[row].state != "done" else table.rows[row]
+                task = _Task(
+                    row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier
+                )
                 try:
                     tasks.append(_with_pick(task, progress=progress))
                 except (GeosceneError, LidarError, OSError) as error:
@@ -185,13 +194,19 @@ def _is_sweep(folder: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """One drive to record: its row in the table, the folder of the sweep, the threads, and what is picked."""
+    """One drive to record.
+
+    row     : in the table
+    folder  : of the sweep
+    earlier : its row in the table of an earlier run that finished it
+    """
 
     row: int
     drive: GridDrive
     folder: Path
     threads: int
     overwrite: bool
+    earlier: DriveRow | None = None
     pick: Pick | None = None
 
 
@@ -235,6 +250,8 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
     options = replace(task.drive.options, workers=task.threads)
     try:
         with using(open_scene(task.drive.scene), known=LidarError) as scene:
+            if task.earlier is not None and _is_unchanged(task, scene, options=options):
+                return task.row, task.earlier
             checked = driven(
                 scene,
                 out,
@@ -257,18 +274,54 @@ def _recorded(task: _Task) -> tuple[int, DriveRow]:
         seconds=done.duration,
         metres=round(done.length, 3),
         digest=digest_of(Paths(out).journal),
+        files=_digest_of_folder(out),
         picked=task.pick.label if task.pick else "",
         reached=checked.reached.reached.to_text("are") if checked.reached else "",
     )
+
+
+def _is_unchanged(task: _Task, scene: Scene, *, options: DriveOptions) -> bool:
+    """Whether a drive is there as an earlier run finished it, of the same version, scene and options.
+
+    Whether other settings would be picked, or their errors checked again, is not known without a plan.
+    """
+    out, wanted = task.folder / task.drive.name, task.drive.wanted
+    if task.earlier is None or wanted.picks or wanted.checks or not Paths(out).manifest.exists():
+        return False
+    manifest = open_dataset(out).manifest
+    recipe = json.loads(json.dumps(options.recipe(scene)))
+    known = {"generator": _GENERATOR, "recipe": recipe}
+    return (
+        known.items() <= manifest.items()
+        and manifest["scene"]["path"] == scene.location
+        and _digest_of_folder(out) == task.earlier.files
+    )
+
+
+def _digest_of_folder(folder: Path) -> str:
+    """Digest of the names and contents of all files in a folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    text = "".join(f"{path.relative_to(folder)} {digest_of(path)}\n" for path in files)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 class _Table:
     """The files ``sweep.json`` and ``sweep.csv`` of a sweep."""
 
     def __init__(self, folder: Path, source: str, *, drives: Sequence[GridDrive]) -> None:
-        self.rows = [DriveRow(drive.name) for drive in drives]
         self._folder, self._source, self._drives = folder, source, drives
+        earlier = self._finished()
+        self.rows = [earlier.get(drive.name, DriveRow(drive.name)) for drive in drives]
         self._written = 0.0
+
+    def _finished(self) -> dict[str, DriveRow]:
+        """Rows by name of the drives that an earlier run has finished; none if its table is damaged."""
+        names = [field.name for field in fields(DriveRow)]
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            drives = json.loads((self._folder / _TABLE).read_text("utf-8"))["drives"]
+            rows = [DriveRow(*(drive[name] for name in names)) for drive in drives]
+            return {row.name: row for row in rows if row.state == "done"}
+        return {}
 
     def set(self, row: int, result: DriveRow) -> None:
         """Set a row; the files follow within seconds, while rows are set."""
@@ -282,10 +335,9 @@ class _Table:
             {**asdict(row), "options": drive.values}
             for row, drive in zip(self.rows, self._drives, strict=True)
         ]
-        generator = f"geoscene lidar {__version__}"
         write_json(
             self._folder / _TABLE,
-            {"schema": 1, "generator": generator, "grid": self._source, "drives": documents},
+            {"schema": 1, "generator": _GENERATOR, "grid": self._source, "drives": documents},
         )
         names = list(dict.fromkeys(name for drive in self._drives for name in drive.values))
         columns = {name: [drive.values.get(name, "") for drive in self._drives] for name in names}

@@ -76,6 +76,33 @@ def test_repeated_sweep_keeps_finished_drives_and_mends_the_others(scene, tmp_pa
     assert [path.stat().st_mtime_ns for path in clouds][1:] == times[1:]
 
 
+def test_unchanged_drives_are_kept_without_planning_them(scene, tmp_path, monkeypatch):
+    file, log = written(tmp_path / "grid.toml", scene), tmp_path / "planned"
+    plan_drive = lidar.pipeline.plan_drive
+
+    def noted(*given, **more):
+        with log.open("a") as lines:
+            lines.write("planned\n")
+        return plan_drive(*given, **more)
+
+    first = sweep(file, tmp_path / "out")
+    trajectory = tmp_path / "out" / first.rows[0].name / "trajectory.csv"
+    before = trajectory.read_bytes()
+    monkeypatch.setattr(lidar.pipeline, "plan_drive", noted)
+    monkeypatch.setattr(geoscene.processes, "threads_of_libraries", lambda: 0)  # forked workers have it too
+    assert sweep(file, tmp_path / "out").rows == first.rows
+    assert not log.exists()
+    trajectory.write_bytes(before[:100])
+    assert sweep(file, tmp_path / "out").rows == first.rows
+    assert log.read_text().count("planned") == 1
+    assert trajectory.read_bytes() == before
+    other = written(file, scene, drive='fidelity = "survey"')
+    assert [row.state for row in sweep(other, tmp_path / "out").rows] == ["failed"] * 2
+    again = sweep(other, tmp_path / "out", overwrite=True)
+    assert [row.state for row in again.rows] == ["done"] * 2
+    assert again.rows[0].digest != first.rows[0].digest
+
+
 def test_a_failed_drive_is_a_row_and_the_others_go_on(scene, tmp_path):
     file = written(tmp_path / "grid.toml", scene, grid=f'route = [{NOWHERE}, "random"]')
     done = run_program("lidar", "sweep", file, "-o", tmp_path / "out")
