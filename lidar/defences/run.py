@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,12 +80,14 @@ def judged_frames(
     *,
     scene: Scene | None = None,
     seed: int = 0,
+    rows: Container[int] | None = None,
     progress: Progress = silent,
 ) -> Iterator[Judged]:
     """The frames of a scanner in order, with the verdict of each defence.
 
     scene : the map of defences that need one
     seed  : of the defences' random numbers
+    rows  : of the frames to judge, all by default; the others are only what came before, without verdicts
     """
     past: deque[Observation] = deque(maxlen=1 + max((d.defence.history for d in defences), default=0))
     reach = scans.sensor.max_range
@@ -93,6 +95,9 @@ def judged_frames(
     for done, frame in enumerate(scans):
         progress(scans.sensor.name, done, total=len(scans.frames))
         past.append(frame)
+        if rows is not None and done not in rows:
+            yield Judged(frame, {}, {})
+            continue
         if world is not None:
             x, y, _ = frame.poses([frame.start_ns]).position[0]
             world.follow((x - _AROUND, y - _AROUND, x + _AROUND, y + _AROUND))

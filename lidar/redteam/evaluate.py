@@ -16,7 +16,7 @@ from lidar.defences.fusion import FUSED, fused
 from lidar.defences.scores import Samples, Score, score, threshold_at
 from lidar.defences.verdict import Verdict
 from lidar.random_streams import generator
-from lidar.redteam.measure import FEWEST
+from lidar.redteam.measure import FEWEST, is_attacked
 from lidar.redteam.plan import Attack, Measure, Run
 from lidar.redteam.statistics import Rate, rate
 
@@ -251,11 +251,6 @@ def _thresholds(figures: Sequence[Figures], *, measure: Measure) -> dict[str, di
 def _defences(drives: Iterable[Figures]) -> list[str]:
     """Defences that judged drives, in order."""
     return list(dict.fromkeys(name for one in drives for frame in one.frames for name in frame["suspicion"]))
-
-
-def is_attacked(frame: Mapping[str, Any]) -> bool:
-    """Whether an attack changed what the sensors deliver of a frame."""
-    return any(frame.get(name, 0) > 0 for name in ("added", "lost", "images", "fix_error"))
 
 
 def _samples(

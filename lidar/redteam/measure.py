@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,15 +69,13 @@ class Case:
 def measured(case: Case) -> dict[str, Any]:
     """The figures of a drive; from the file if it has them of the same drive, twin and defences.
 
-    ``frames`` has a row for each frame of each scanner. ``absent`` are defences whose needs the data lack.
+    ``frames`` has a row for each frame of each scanner; in a drive with an attack, those that it leaves as
+    they are have no verdicts. ``absent`` are defences whose needs the data lack.
 
     Raises LidarError for a dataset that cannot be read.
     """
-    key = _key(case)
-    if case.out.exists():
-        document = json.loads(case.out.read_text("utf-8"))
-        if document["key"] == key:
-            return dict(document)
+    if (known := kept(case)) is not None:
+        return known
     dataset = open_dataset(case.path)
     needs_scene = any("scene" in named.defence.needs for named in case.defences)
     if needs_scene:
@@ -84,9 +83,18 @@ def measured(case: Case) -> dict[str, Any]:
             document = _document(case, dataset, scene=scene)
     else:
         document = _document(case, dataset, scene=None)
-    document = json.loads(json.dumps({"key": key} | document))
+    document = json.loads(json.dumps({"key": _key(case)} | document))
     write_json(case.out, document)
     return dict(document)
+
+
+def kept(case: Case) -> dict[str, Any] | None:
+    """The figures in the file of a drive; None if they are not of the same drive, twin and defences."""
+    with suppress(OSError, ValueError, LookupError, TypeError):
+        document = json.loads(case.out.read_text("utf-8"))
+        if document["key"] == _key(case):
+            return dict(document)
+    return None
 
 
 def _key(case: Case) -> str:
@@ -126,20 +134,14 @@ def _frames(
     score: float,
 ) -> Iterator[dict[str, Any]]:
     dataset, name = scans.dataset, scans.sensor.name
-    for row, judged in enumerate(judged_frames(scans, defences, scene=scene)):
+    changes = None if twin is None else [_change(scans, twin, row=row) for row in range(len(scans.frames))]
+    rows = None if changes is None else {row for row, change in enumerate(changes) if is_attacked(change)}
+    for row, judged in enumerate(judged_frames(scans, defences, scene=scene, rows=rows)):
         frame = judged.frame
-        truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
-        users = _users(dataset, name, frame=frame.number)
-        matched = _matched(frame, users)
-        placed = [user for user in users if user["kind"] == PLACED and user["points"] > 0]
-        forged = truth.objects(frame.members) | _near(frame, placed)
         figures: dict[str, Any] = {
             "sensor": name,
             "frame": frame.number,
             "seconds": frame.start_ns * 1e-9,
-            "added": int(truth.returns.sum()) + sum(int(user["points"]) for user in placed),
-            "lost": len(truth.removed_xyz),
-            "objects": _objects(frame, forged=forged, matched=matched),
             "suspicion": {key: round(v.frame, 5) for key, v in judged.verdicts.items()},
             "object_suspicion": {
                 key: v.objects.round(5).tolist()
@@ -148,14 +150,47 @@ def _frames(
             },
             "cost": {key: round(seconds, 5) for key, seconds in judged.seconds.items()},
         }
-        if twin is None:
-            figures["users"] = _found(frame, users)
-        else:
-            known = _Twin(twin, row, score=score)
-            found = set(matched[frame.objects.score >= score].tolist())
-            figures |= known.compared(frame, found=found, truth=dataset.paths.truth(name, frame.number))
-            figures["lost"] = max(figures["lost"] - known.lost, 0)
+        if changes is not None:
+            figures |= changes[row]
+        if rows is None or row in rows:
+            users = _users(dataset, name, frame=frame.number)
+            matched = _matched(frame, users)
+            truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
+            forged = truth.objects(frame.members) | _near(frame, _placed(users))
+            figures["objects"] = _objects(frame, forged=forged, matched=matched)
+            if twin is None:
+                figures["users"] = _found(frame, users)
+            else:
+                found = set(matched[frame.objects.score >= score].tolist())
+                figures |= _hidden(scans, twin, row=row, found=found, score=score)
         yield figures
+
+
+def is_attacked(frame: Mapping[str, Any]) -> bool:
+    """Whether an attack changed what the sensors deliver of a frame, of which the figures are given."""
+    return any(frame.get(name, 0) > 0 for name in ("added", "lost", "images", "fix_error"))
+
+
+def _change(scans: Scans, twin: Scans, *, row: int) -> dict[str, Any]:
+    """What an attack did to the returns, the images and the fixes of a frame, against its twin without it."""
+    frame, other, name = scans.frame(row), twin.frame(row), scans.sensor.name
+    placed = _placed(_users(scans.dataset, name, frame=frame.number))
+    truth, before = (
+        frame_truth(of.dataset, name, frame=frame.number, count=len(each))
+        for of, each in ((scans, frame), (twin, other))
+    )
+    pictures = zip(frame.pictures, other.pictures, strict=True)
+    return {
+        "added": int(truth.returns.sum()) + sum(int(user["points"]) for user in placed),
+        "lost": max(len(truth.removed_xyz) - len(before.removed_xyz), 0),
+        "images": sum(one.file.read_bytes() != another.file.read_bytes() for one, another in pictures),
+        "fix_error": round(_fix_error(frame, other), 3),
+    }
+
+
+def _placed(users: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Objects that an attacker placed and that the scanner sees."""
+    return [user for user in users if user["kind"] == PLACED and user["points"] > 0]
 
 
 def _objects(frame: Observation, *, forged: Bools, matched: Ints) -> dict[str, Any]:
@@ -170,41 +205,28 @@ def _objects(frame: Observation, *, forged: Bools, matched: Ints) -> dict[str, A
     }
 
 
-class _Twin:
-    """A frame of the drive without attack."""
+def _hidden(scans: Scans, twin: Scans, *, row: int, found: set[int], score: float) -> dict[str, int]:
+    """How many road users an attack hides.
 
-    def __init__(self, scans: Scans, row: int, *, score: float) -> None:
-        dataset, name = scans.dataset, scans.sensor.name
-        self._frame = frame = scans.frame(row)
-        self._users = _users(dataset, name, frame=frame.number)
-        matched = _matched(frame, self._users)
-        self._found = set(matched[frame.objects.score >= score].tolist()) - {-1}
-        self._truth = dataset.paths.truth(name, frame.number)
-        self.lost = len(frame_truth(dataset, name, frame=frame.number, count=len(frame)).removed_xyz)
+    found : numbers of the road users that the detector finds in spite of it
 
-    def compared(self, frame: Observation, *, found: set[int], truth: Path) -> dict[str, Any]:
-        """What the attack did to the road users, the images and the fixes.
-
-        found : numbers of the road users that the detector finds in spite of it
-        truth : file of what stages did to the attacked frame
-
-        ``targets`` are road users that the detector finds without the attack, and that lose half of their
-        returns to it; it no longer finds the ``hidden`` ones.
-        """
-        taken, before = _removed(truth), _removed(self._truth)
-        targets = set()
-        for user in self._users:
-            returns, feature = int(user["points"]), int(user["instance"])
-            lost = np.count_nonzero(taken == feature) - np.count_nonzero(before == feature)
-            if user["id"] in self._found and returns >= FEWEST and lost >= _LOST * returns:
-                targets.add(int(user["id"]))
-        pictures = zip(frame.pictures, self._frame.pictures, strict=True)
-        return {
-            "targets": len(targets),
-            "hidden": len(targets - found),
-            "images": sum(one.file.read_bytes() != other.file.read_bytes() for one, other in pictures),
-            "fix_error": round(_fix_error(frame, self._frame), 3),
-        }
+    ``targets`` are road users that the detector finds in the twin, the drive without attack, and that lose
+    half of their returns to it; it no longer finds the ``hidden`` ones.
+    """
+    name, number = scans.sensor.name, int(scans.frames[row])
+    users = _users(twin.dataset, name, frame=number)
+    taken, before = (_removed(of.dataset.paths.truth(name, number)) for of in (scans, twin))
+    robbed = set()
+    for user in users:
+        returns, feature = int(user["points"]), int(user["instance"])
+        lost = np.count_nonzero(taken == feature) - np.count_nonzero(before == feature)
+        if returns >= FEWEST and lost >= _LOST * returns:
+            robbed.add(int(user["id"]))
+    if not robbed:
+        return {"targets": 0, "hidden": 0}
+    frame = twin.frame(row)
+    targets = robbed & set(_matched(frame, users)[frame.objects.score >= score].tolist())
+    return {"targets": len(targets), "hidden": len(targets - found)}
 
 
 def _removed(path: Path) -> NDArray[np.int32]:

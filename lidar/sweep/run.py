@@ -151,9 +151,7 @@ def recorded(
                     continue
                 ready = replace(planned, scene=scene, map=None)
                 earlier = None if overwrite or table.rows[row].state != "done" else table.rows[row]
-                task = _Task(
-                    row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier
-                )
+                task = _Task(row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier)
                 try:
                     tasks.append(_with_pick(task, progress=progress))
                 except (GeosceneError, LidarError, OSError) as error:
