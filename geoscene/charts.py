@@ -21,8 +21,8 @@ _STYLE = (
     "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .5em;text-align:right;white-space:nowrap}"
     "td:first-child,th:first-child{position:sticky;left:0;background:#fff}"
     "td:first-child,th:first-child{text-align:left;white-space:normal;min-width:12em}"
-    "td:last-child{text-align:left;white-space:normal;min-width:16em}img{max-width:100%}"
-    ".matrix td:last-child{text-align:right;min-width:0}"
+    "td.text,th.text{text-align:left;white-space:normal}td.text:last-child{min-width:16em}"
+    "img{max-width:100%}"
 )
 _LEGEND = (
     (_CHOICE, "no other setting is both cheaper and more exact"),
@@ -150,8 +150,13 @@ _COLORS = (
 )
 
 
-def curves(lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, size: int = 560) -> bytes:
-    """A PNG of named lines of shares, both axes linear from 0 to 1, with a legend and the diagonal."""
+def curves(
+    lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, mark: float, size: int = 560
+) -> bytes:
+    """A PNG of named lines of shares, both axes linear from 0 to 1, with a legend and the diagonal.
+
+    mark : value of x at which a line stands
+    """
     left, top, bottom = 70, 70, size - 60
     right = left + bottom - top
     picture = Image.new("RGB", (right + 200, size), (255, 255, 255))
@@ -169,6 +174,7 @@ def curves(lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, si
         pen.text((place((value, 0))[0], bottom + 6), f"{value:g}", fill=_INK, font=font, anchor="mt")
         pen.text((left - 8, place((0, value))[1]), axes.y_text(value), fill=_INK, font=font, anchor="rm")
     pen.line((*place((0, 0)), *place((1, 1))), fill=_GREY, width=2)
+    pen.line((*place((mark, 0)), *place((mark, 1))), fill=_INK, width=1)
     for k, (name, points) in enumerate(lines.items()):
         color = _COLORS[k % len(_COLORS)]
         if len(points) > 1:
@@ -355,12 +361,17 @@ def _console() -> Console:
 
 
 def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of texts; intervals in brackets stand below their values."""
+    """A table of texts; intervals in brackets stand below their values, columns of words to the left."""
+    wordy = [any(row[k][:1].isalpha() for row in rows) for k in range(len(head))]
+
+    def cell(text: str, *, tag: str, words: bool) -> str:
+        if words:
+            return f'<{tag} class="text">{html.escape(text)}</{tag}>'
+        return f"<{tag}>{html.escape(text).replace(' (', '<br>(')}</{tag}>"
 
     def line(cells: Sequence[str], tag: str) -> str:
-        first, *middle, last = map(html.escape, cells)
-        texts = [first, *(text.replace(" (", "<br>(") for text in middle), last]
-        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>"
+        texts = (cell(text, tag=tag, words=words) for text, words in zip(cells, wordy, strict=True))
+        return f"<tr>{''.join(texts)}</tr>"
 
     return (
         f'<div class="wide"><table>{line(head, "th")}{"".join(line(row, "td") for row in rows)}</table></div>'
@@ -382,7 +393,7 @@ def html_matrix(
         for row, some in zip(rows, shades, strict=True)
     ]
     titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-    return f'<div class="wide"><table class="matrix"><tr>{titles}</tr>{"".join(lines)}</table></div>'
+    return f'<div class="wide"><table><tr>{titles}</tr>{"".join(lines)}</table></div>'
 
 
 def html_picture(png: bytes, *, alt: str) -> str:

@@ -17,7 +17,7 @@ from lidar.defences.scores import Samples, Score, score, threshold_at
 from lidar.defences.verdict import Verdict
 from lidar.random_streams import generator
 from lidar.redteam.measure import FEWEST, is_attacked
-from lidar.redteam.plan import Attack, Measure, Run
+from lidar.redteam.plan import GOALS, Attack, Measure, Run
 from lidar.redteam.statistics import Rate, rate
 
 POOLED = ("scene", "route")
@@ -143,7 +143,7 @@ class Matrix:
 
 
 def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure: Measure) -> Matrix:
-    """The matrix of drives with and without attack."""
+    """The matrix of drives with and without attack; attacks by goal, the most successful first."""
     found = Matrix([], [], [], [])
     figures = _with_fused(figures, block=measure.block)
     thresholds = _thresholds(figures, measure=measure)
@@ -161,7 +161,20 @@ def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure:
                 found.detection.extend(
                     _detections(mine, plain, attack=attack, measure=measure, known=known, thresholds=chosen)
                 )
+    rank = _ranks(found.success)
+    found.success.sort(key=lambda row: rank[row.attack])
+    found.detection.sort(key=lambda row: rank[row.attack])
     return found
+
+
+def _ranks(rows: Sequence[Success]) -> dict[str, tuple[int, float, str]]:
+    """Order of attacks: by goal, then by their mean success, those without trials last."""
+    shares: dict[str, list[float]] = defaultdict(list)
+    for row in rows:
+        shares[row.attack].append(row.success.share if row.success.count else -1.0)
+    return {
+        row.attack: (GOALS.index(row.goal), -float(np.mean(shares[row.attack])), row.attack) for row in rows
+    }
 
 
 def _groups(figures: Sequence[Figures]) -> Iterator[tuple[dict[str, str], str, list[Figures]]]:

@@ -15,7 +15,7 @@ from lidar.redteam.evaluate import Accuracy, Detection, Matrix, Success, documen
 from lidar.redteam.measure import FEWEST
 from lidar.redteam.plan import Attack, Plan
 from lidar.redteam.published import ATTACKS, DEFENCES, Band
-from lidar.redteam.statistics import Rate
+from lidar.redteam.statistics import Rate, rate
 
 REPORT = "redteam.json"
 
@@ -88,7 +88,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 def words_of(setting: Mapping[str, str]) -> str:
     """A setting in words."""
-    return ", ".join(f"{name} {text or 'none'}" for name, text in setting.items()) or "one setting"
+    return ", ".join(f"{name} {_value(name, text)}" for name, text in setting.items()) or "one setting"
 
 
 def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequence[str]) -> str:
@@ -104,6 +104,10 @@ def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequ
         _success_table(pooled, plan.attacks),
         html_picture(_success_picture(pooled.success, plan.attacks), alt="Success of attacks"),
     ]
+    if len(settings) > 1:
+        parts += ["<h2>Settings side by side</h2>"]
+        for title, table, shades in setting_tables(pooled):
+            parts += [f"<h3>{title}</h3>", html_matrix(table[0], table[1:], shades=shades)]
     for setting in settings:
         parts += [f"<h2>Detection: {words_of(setting)}</h2>"]
         mine = [row for row in pooled.detection if row.setting == setting]
@@ -114,7 +118,7 @@ def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequ
                 parts += [f"<h3>Area under the ROC, {what}</h3>", _area_matrix(some)]
         of_frames = [row for row in mine if row.level == "frames"]
         parts += ["<h3>Success of the attack without an alarm</h3>", _residual_matrix(of_frames)]
-        parts += [_curves(of_frames)]
+        parts += [_curves(of_frames, allowed=measure.false_alarms)]
     parts += [
         "<h2>Latency and cost of defences</h2>",
         _cost_table(pooled),
@@ -147,6 +151,55 @@ def success_rows(matrix: Matrix) -> list[list[str]]:
     return found
 
 
+def setting_tables(matrix: Matrix) -> list[tuple[str, list[list[str]], list[list[float]]]]:
+    """Titles, texts and shares of tables that have a column for each setting, over all scenes.
+
+    One has the success of each attack; the others have the frames with an alarm of each defence, without
+    attack and with each attack. The tables of texts have heads.
+    """
+    success = matrix.of_all_scenes.success
+    detection = [row for row in matrix.of_all_scenes.detection if row.level == "frames"]
+    settings = list({str(row.setting): row.setting for row in success}.values())
+    names = short_names(settings)
+    none = rate(0, 0, blocks=0)
+    attacks, defences = (
+        list(dict.fromkeys(values))
+        for values in ((row.attack for row in success), (row.defence for row in detection))
+    )
+    succeeded = {(row.attack, str(row.setting)): row.success for row in success}
+    genuine = {(row.defence, str(row.setting)): row.genuine for row in detection}
+    lines = {
+        "Success by setting": ("attack", attacks, succeeded),
+        "Frames with an alarm without attack": ("defence", defences, genuine),
+    }
+    for attack in attacks:
+        alarmed = {(row.defence, str(row.setting)): row.attacked for row in detection if row.attack == attack}
+        lines[f"Attacked frames with an alarm: {attack}"] = ("defence", defences, alarmed)
+    found = []
+    for title, (what, rows, rates) in lines.items():
+        cells = [[rates.get((row, str(setting)), none) for setting in settings] for row in rows]
+        texts = [[row, *(one.to_text() for one in line)] for row, line in zip(rows, cells, strict=True)]
+        found.append((title, [[what, *names], *texts], [[one.share for one in line] for line in cells]))
+    return found
+
+
+def short_names(settings: Sequence[Mapping[str, str]]) -> list[str]:
+    """Settings by the values of the options in which they differ; files without their folders and endings."""
+    varied = [name for name in settings[0] if len({setting.get(name) for setting in settings}) > 1] or list(
+        settings[0]
+    )
+    return [
+        " ".join(_value(name, setting.get(name, "")) for name in varied) or "plain" for setting in settings
+    ]
+
+
+def _value(name: str, text: str) -> str:
+    """A value of an option in words."""
+    if not text:
+        return "clear" if name == "weather" else f"no {name}"
+    return Path(text).stem if text.endswith(".toml") else text
+
+
 def detection_tables(matrix: Matrix) -> list[tuple[str, list[list[str]]]]:
     """Titles and texts of tables of alarmed frames over all scenes, one for each setting, with heads."""
     rows = [row for row in matrix.of_all_scenes.detection if row.level == "frames"]
@@ -170,20 +223,17 @@ def _success_table(matrix: Matrix, attacks: Sequence[Attack]) -> str:
 
 
 def _success_picture(rows: Sequence[Success], attacks: Sequence[Attack]) -> bytes:
+    settings = list({str(row.setting): row.setting for row in rows}.values())
+    short = dict(zip(map(str, settings), short_names(settings), strict=True)) if settings else {}
     marks = []
     for row in rows:
         band = _band(row.attack, attacks)
         bounds = None
         if band is not None and band.low is not None:
             bounds = band.low, 1.0 if band.high is None else band.high
-        several = len({str(other.setting) for other in rows}) > 1
-        name = f"{row.attack}, {_short(row.setting)}" if several else row.attack
+        name = f"{row.attack}, {short[str(row.setting)]}" if len(settings) > 1 else row.attack
         marks.append(Span(name, row.success.share, (row.success.low, row.success.high), bounds))
     return spans(marks, title="Success with 95 % intervals")
-
-
-def _short(setting: Mapping[str, str]) -> str:
-    return " ".join(text for text in setting.values() if text) or "plain"
 
 
 def detection_rows(rows: Sequence[Detection]) -> tuple[list[str], list[list[Rate]], list[str]]:
@@ -215,19 +265,13 @@ def _residual_matrix(rows: Sequence[Detection]) -> str:
 
 def _area_matrix(rows: Sequence[Detection]) -> str:
     defences = list(dict.fromkeys(row.defence for row in rows))
-    by_pair = {(row.attack, row.defence): row.score.auc for row in rows}
     attacks = list(dict.fromkeys(row.attack for row in rows))
-    texts, shades = [], []
-    for attack in attacks:
-        areas = [by_pair[attack, defence] for defence in defences]
-        texts.append(
-            [
-                attack,
-                *("–" if math.isnan(a) else f"{a:.2f} ({low:.2f} to {high:.2f})" for a, low, high in areas),
-            ]
-        )
-        shades.append([2 * area[0] - 1 for area in areas])
-    return html_matrix(["attack", *defences], texts, shades=shades)
+    by_pair = {(row.attack, row.defence): row.score.auc for row in rows}
+    lines = [[by_pair[attack, defence] for defence in defences] for attack in attacks]
+    texts = [[name, *map(_area, line)] for name, line in zip(attacks, lines, strict=True)]
+    return html_matrix(
+        ["attack", *defences], texts, shades=[[2 * area[0] - 1 for area in line] for line in lines]
+    )
 
 
 def _area(area: tuple[float, float, float]) -> str:
@@ -235,13 +279,15 @@ def _area(area: tuple[float, float, float]) -> str:
     return "–" if math.isnan(value) else f"{value:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _curves(rows: Sequence[Detection]) -> str:
-    """A picture of the ROC of frames for each attack."""
+def _curves(rows: Sequence[Detection], *, allowed: float) -> str:
+    """A picture of the ROC of frames for each attack, with the areas and the allowed false alarms."""
     pictures = []
     for attack in dict.fromkeys(row.attack for row in rows):
-        lines = {row.defence: row.score.roc for row in rows if row.attack == attack and row.level == "frames"}
-        axes = Axes(f"ROC of frames: {attack}", "false alarms", "detected", lambda value: f"{value:g}")
-        pictures.append(html_picture(curves(lines, axes), alt=f"ROC of {attack}"))
+        mine = [row for row in rows if row.attack == attack and row.level == "frames" and row.score.roc]
+        lines = {f"{row.defence} {row.score.auc[0]:.2f}": row.score.roc for row in mine}
+        title = f"ROC of frames with areas: {attack}; threshold at {share(allowed)} false alarms"
+        axes = Axes(title, "false alarms", "detected", lambda value: f"{value:g}")
+        pictures.append(html_picture(curves(lines, axes, mark=allowed), alt=f"ROC of {attack}"))
     return "".join(pictures)
 
 

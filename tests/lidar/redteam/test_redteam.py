@@ -17,6 +17,7 @@ from lidar.errors import InputError
 from lidar.redteam import redteam
 from lidar.redteam.evaluate import Figures, evaluated
 from lidar.redteam.plan import Attack, Measure, Run, read_plan
+from lidar.redteam.report import setting_tables
 from lidar.redteam.statistics import rate
 from lidar.sweep.grid import read_grid
 
@@ -217,6 +218,28 @@ def test_a_fix_that_is_off_misleads(written: Callable[..., Path]) -> None:
     assert (success.attacked, success.success.hits) == (39, 20)  # the first frame is as without attack
     assert found.detection[0].residual.hits == 10
     assert found.detection[0].latency == pytest.approx(2.9)
+
+
+def test_settings_stand_side_by_side_and_attacks_are_ordered(written: Callable[..., Path]) -> None:
+    drives = read_grid(written("", grid="seed = [1, 2]"))
+    weak, strong = Attack("weak", "inject", "forge"), Attack("strong", "remove", "forge")
+    figures = []
+    for k, weather in enumerate(("", "fog=100m")):
+        conditions = {"rig": "rigs/mine.toml", "weather": weather}
+        plain = [_frame(j / 10, suspicion=0.1 + 0.5 * k) for j in range(40)]
+        figures.append(Figures(Run(drives[0], None, conditions, "plain"), plain, []))
+        for attack, forged in ((weak, k), (strong, 1)):
+            changed = [_frame(j / 10, suspicion=0.9, forged=forged) | {"lost": 50} for j in range(40)]
+            figures.append(Figures(Run(drives[1], attack, conditions, "plain"), changed, []))
+    found = evaluated(figures, [weak, strong], measure=Measure())
+    assert list(dict.fromkeys(row.attack for row in found.success)) == ["strong", "weak"]
+    tables = {title: (texts, shares) for title, texts, shares in setting_tables(found)}
+    texts, shares = tables["Success by setting"]
+    assert texts[0] == ["attack", "clear", "fog=100m"]
+    assert [line[0] for line in texts[1:]] == ["strong", "weak"]
+    assert shares == [[1.0, 1.0], [0.0, 1.0]]
+    assert tables["Frames with an alarm without attack"][1] == [[0.0, 1.0]]
+    assert tables["Attacked frames with an alarm: weak"][1] == [[1.0, 1.0]]
 
 
 SPOOFED = """
