@@ -192,7 +192,9 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
         rows = reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )
-        echoes, number, count = echoes.take(rows), number[rows], np.minimum(count[rows], sensor.max_echoes)
+        if len(rows) < len(echoes):
+            echoes, number, count = echoes.take(rows), number[rows], count[rows]
+        count = np.minimum(count, sensor.max_echoes)
     distance = measured_range(
         sensor, sweep.firings, echoes=echoes, settings=settings, seed=sweep.seed, deviates=deviates
     )

@@ -6,6 +6,7 @@ from dataclasses import replace
 from math import pi
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.physics.echoes import Origin, TracedEchoes
@@ -25,6 +26,7 @@ from lidar.weather.fields import Field, Rays, amounts, rays_of, strongest_respon
 from lidar.weather.media import Medium
 
 _STEP = 0.25  # metres of range between samples of a field's response
+_EVEN = 1e-6  # share of a way on which a medium may differ and be even
 
 
 def through_air(
@@ -52,17 +54,27 @@ def through_air(
         found = drawn_particles(some, end, extinction=0.0 if field else medium.extinction, rng=rng)
     if field is None:
         column = echoes.range
-        soft = _even_response(pulses, end, medium=medium, lens=lens, rng=rng)
+        soft = [_even_response(pulses, end, medium=medium, lens=lens, rng=rng)]
     else:
         rays = rays_of(pulses.origin, pulses.direction, time_ns=pulses.time_ns, at=at)
         _, column = amounts(field, rays, pulse=echoes.pulse, distance=echoes.range)
         found = _in_field(found, (field, rays), extinction=medium.extinction, rng=rng)
-        soft = _field_response(
-            pulses, (field, rays), end=end, medium=medium, rest=(distance, rest), lens=lens
-        )
-    single = noticed(found, pulses=len(pulses), least=least, separation=sensor.echo_separation)
+        near = even_echo(sensor, medium, lens=lens, noise=pulses.noise).end[-1]
+        is_even = _is_even((field, rays), np.minimum(end, near))
+        soft = [
+            _even_response(pulses, np.where(is_even, end, 0.0), medium=medium, lens=lens, rng=rng),
+            _field_response(
+                pulses,
+                (field, rays),
+                end=np.where(is_even, 0.0, end),
+                medium=medium,
+                rest=(distance, rest),
+                lens=lens,
+            ),
+        ]
+    single = noticed(found, least=least, separation=sensor.echo_separation)
     dimmed = replace(echoes, apparent=echoes.apparent * np.exp(-2 * medium.extinction * column))
-    pulse, place, power = (np.concatenate(both) for both in zip(soft, single, strict=True))
+    pulse, place, power = (np.concatenate(each) for each in zip(*soft, single, strict=True))
     if not len(pulse):
         return dimmed
     apparent = pulses.apparent(power * pulses.power[pulse], place)
@@ -85,6 +97,15 @@ def _in_field(
     share, column = amounts(*where, pulse=pulse, distance=place)
     there = rng.random(len(share)) < share
     return pulse[there], place[there], (power * np.exp(-2 * extinction * column))[there]
+
+
+def _is_even(where: tuple[Field, Rays], distance: Float) -> NDArray[np.bool_]:
+    """Pulses (n,) whose beams go through all of a medium, and no more, up to distances (n,) in metres."""
+    if not np.any(where[0].share == 1):
+        return np.zeros(len(distance), bool)
+    _, column = amounts(*where, pulse=np.arange(len(distance)), distance=distance)
+    even: NDArray[np.bool_] = np.abs(column - distance) < _EVEN * distance
+    return even
 
 
 def _even_response(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.physics.link import GATE, amplitude
+from lidar.raycast.memory import inlined
 from lidar.rig.scanner import Sensor
 from lidar.weather.media import Medium
 
@@ -41,6 +42,7 @@ _OVERLAP = (
 _REACH = 60.0  # metres beyond the minimum range within which the response of even air has its maximum
 _STEP = 0.05  # metres between samples of the response
 _QUANTILES = 65  # of the range of a soft target's echo
+_LEVELS = 4096  # of the table in which classes of particles are looked up
 _CLASSES = 64  # of range
 
 
@@ -309,67 +311,89 @@ def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float, lens: float) ->
 def drawn_particles(
     some: Particles, end: Float, *, extinction: float = 0.0, rng: np.random.Generator
 ) -> Found:
-    """Particles that beams meet before their ends (n,), in metres, dimmed by even air (1/m)."""
-    count = rng.poisson(some.count * len(end))
-    chance = rng.random((2, int(count.sum())))
-    pulse, place, power = np.empty(chance.shape[1], np.int64), *np.empty(chance.shape)
-    classes = count, some.near, some.far, some.strongest, np.log(some.least / some.strongest)
-    met = _meet(classes, chance, end, extinction, (pulse, place, power))
-    return pulse[:met], place[:met], power[:met]
-
-
-@njit(cache=True, nogil=True)
-def _meet(classes: Any, chance: Any, end: Any, extinction: Any, met: Any) -> Any:
-    """Fill the columns of what is met, and return its number."""
-    count, near, far, strongest, weakest = classes
-    pulse, place, power = met
-    i = found = 0
-    for c in range(len(count)):
-        for _ in range(count[c]):
-            # The number of the pulse, and what is left of the random number, which is as random.
-            beam = chance[0, i] * len(end)
-            p = int(beam)
-            r = near[c] + (beam - p) * (far[c] - near[c])
-            if r < end[p]:
-                left = np.exp(chance[1, i] * weakest[c] - 2 * extinction * r)
-                pulse[found], place[found], power[found] = p, r, strongest[c] * left
-                found += 1
-            i += 1
+    """Particles that beams meet before their ends (n,), in metres, dimmed by even air (1/m); by pulse."""
+    sums = np.cumsum(some.count)
+    if not len(sums):
+        return np.empty(0, np.int64), np.empty(0), np.empty(0)
+    first = np.searchsorted(sums / sums[-1], np.arange(_LEVELS) / _LEVELS, side="right")
+    weakest = np.log(some.least / some.strongest)
+    classes = sums, first, some.near, some.far, some.strongest, weakest
+    found: Found = _meet(classes, rng.integers(1 << 63, dtype=np.uint64), end, extinction)
     return found
 
 
-def noticed(found: Found, *, pulses: int, least: float, separation: float) -> Found:
-    """The particles that return more than a power over the threshold, together with those near by.
+@inlined
+def _uniform(key: Any, number: Any) -> Any:
+    """The random number (0 to 1) of a key with a counter: SplitMix64, as `geoscene.splitmix`."""
+    x = key + np.uint64(number) * np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.float64((x ^ (x >> np.uint64(31))) >> np.uint64(11)) * 2.0**-53
 
-    pulses     : number of pulses
+
+@njit(cache=True, nogil=True)
+def _meet(classes: Any, key: Any, end: Any, extinction: Any) -> Any:
+    """The columns of what is met."""
+    sums, first, near, far, strongest, weakest = classes
+    mean, few = sums[-1], np.exp(-sums[-1])
+    count = np.empty(len(end), np.int64)
+    used = 0  # random numbers
+    for p in range(len(end)):
+        # A number of the Poisson distribution: of factors whose product stays above exp(-mean).
+        k, product = 0, 1.0
+        while True:
+            used += 1
+            product *= _uniform(key, used)
+            if product <= few:
+                break
+            k += 1
+        count[p] = k
+    pulse, place, power = np.empty(count.sum(), np.int64), np.empty(count.sum()), np.empty(count.sum())
+    found = 0
+    for p in range(len(end)):
+        for _ in range(count[p]):
+            which, along, across = _uniform(key, used + 1), _uniform(key, used + 2), _uniform(key, used + 3)
+            used += 3
+            c = first[int(which * len(first))]
+            while c < len(sums) - 1 and sums[c] < which * mean:
+                c += 1
+            r = near[c] + along * (far[c] - near[c])
+            if r < end[p]:
+                left = np.exp(across * weakest[c] - 2 * extinction * r)
+                pulse[found], place[found], power[found] = p, r, strongest[c] * left
+                found += 1
+    return pulse[:found], place[:found], power[:found]
+
+
+def noticed(found: Found, *, least: float, separation: float) -> Found:
+    """The particles, by pulse, that return more than a power over the threshold with those near by.
+
     separation : metres, of particles that may give one echo
     """
     rows = np.empty(len(found[0]), np.int64)
-    count = _notice(found, pulses, least, 2 * separation, rows)  # twice, as echoes join in chains
+    count = _notice(found, least, 2 * separation, rows)  # twice, as echoes join in chains
     return found[0][rows[:count]], found[1][rows[:count]], found[2][rows[:count]]
 
 
 @njit(cache=True, nogil=True)
-def _notice(found: Any, pulses: Any, least: Any, reach: Any, rows: Any) -> Any:
+def _notice(found: Any, least: Any, reach: Any, rows: Any) -> Any:
     """Fill the rows that are noticed, and return their number."""
     pulse, place, power = found
-    together = np.zeros(pulses)
-    last = np.full(pulses, -1, np.int64)
-    before = np.empty(len(pulse), np.int64)  # in the same pulse
-    for i in range(len(pulse)):
-        p = pulse[i]
-        together[p] += power[i]
-        before[i], last[p] = last[p], i
-    count = 0
-    for i in range(len(pulse)):
-        if together[pulse[i]] <= least:
+    count = stop = 0
+    while stop < len(pulse):
+        start = stop
+        together = 0.0
+        while stop < len(pulse) and pulse[stop] == pulse[start]:
+            together += power[stop]
+            stop += 1
+        if together <= least:
             continue
-        near, k = 0.0, last[pulse[i]]
-        while k >= 0:
-            if abs(place[k] - place[i]) <= reach:
-                near += power[k]
-            k = before[k]
-        if near > least:
-            rows[count] = i
-            count += 1
+        for i in range(start, stop):
+            near = 0.0
+            for k in range(start, stop):
+                if abs(place[k] - place[i]) <= reach:
+                    near += power[k]
+            if near > least:
+                rows[count] = i
+                count += 1
     return count
