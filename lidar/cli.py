@@ -778,7 +778,7 @@ def sign(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Sign a dataset: a watermark in its point clouds, a signed hash chain over its files, or both.
+    """Sign recorded data: a watermark in point clouds, a signed hash chain over files, or both.
 
     For example:
 
@@ -786,10 +786,12 @@ def sign(
 
     lidar sign drive --chain private.pem
 
+    lidar sign kitti/sequences/00 --watermark secret.key --chain secret.key -o signed_kitti
+
     Parameters
     ----------
     dataset
-        Directory of the dataset.
+        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
     out
         Directory to write to; without it, the hash chain is added to the dataset itself.
     """
@@ -826,7 +828,7 @@ def verify(
     json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> int:
-    """Find what was tampered with in a signed dataset: files, frames, blocks of a ring by 10 degrees, points.
+    """Find what was tampered with in signed data: files, frames, blocks of a ring by 10 degrees, points.
 
     Exits with 1 if anything was.
 
@@ -837,7 +839,7 @@ def verify(
     Parameters
     ----------
     dataset
-        Directory of the dataset.
+        Directory of the dataset, or of clouds of KITTI or nuScenes.
     noise
         Standard deviation in metres that coordinates got since the watermark, such as by another format.
     false_alarms

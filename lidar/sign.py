@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.apply import recording_again
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format, format_of
-from lidar.dataset.formats.table import table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset
+from lidar.dataset.formats.table import read_rows, table_cloud
+from lidar.dataset.layout import Dataset, Paths
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Recording
+from lidar.dataset.signable import Signable, place_of, signable
 from lidar.errors import DatasetError, FormatError, InputError, LidarError
 from lidar.integrity.digest_files import FrameDigests, Link, frame_file, links_bytes
+from lidar.integrity.directions import with_mark
 from lidar.integrity.keys import Signer
 from lidar.integrity.merkle import (
     START,
@@ -37,8 +40,6 @@ from lidar.sensors.cloud import Cloud
 
 SCHEMA = 1
 """Version of the files in the folder ``integrity``."""
-
-_FRAME = re.compile(r"(\d{6,})[._].*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,31 +81,35 @@ def sign_dataset(
 ) -> SignSummary:
     """Write a dataset with a watermark, a signed hash chain or both to ``out``.
 
-    Without ``out`` the chain is added to the dataset itself; a watermark changes clouds and needs ``out``.
+    ``source`` is a dataset, or a folder with clouds of KITTI or nuScenes. Without ``out`` the chain is added
+    to the data themselves; a watermark changes clouds and needs ``out``.
 
-    Raises InputError and DatasetError for a dataset that cannot be signed; nothing is written then.
+    Raises InputError and DatasetError for data that cannot be signed; nothing is written then.
     """
     source = Path(source)
-    dataset = open_dataset(source)
+    given = signable(source)
     if watermark is None and signer is None:
         raise InputError("give `watermark`, `chain` or both")
-    if dataset.manifest["frames_done"] != dataset.frames:
+    dataset = given.dataset
+    if dataset is not None and dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{source}: the drive was not finished; finish it first")
     if out is None:
         if watermark is not None:
             raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
         if Paths(source).integrity.exists() and not overwrite:
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
-        return _chained(dataset, signer, summary=SignSummary(source), progress=progress)
+        return _chained(given, signer, summary=SignSummary(source), progress=progress)
     out = Path(out)
     check_target(out, source=source, overwrite=overwrite)
     with complete_folder(out) as part:
         summary = SignSummary(part)
         if watermark is None:
-            copy_dataset(dataset.path, part, leave_out={Paths(part).integrity})
+            copy_dataset(source, part, leave_out={Paths(part).integrity})
+        elif dataset is None:
+            summary = _marked_clouds(source, summary, watermark=watermark, progress=progress)
         else:
             summary = _marked(dataset, summary, watermark=watermark, progress=progress)
-        summary = _chained(open_dataset(part), signer, summary=summary, progress=progress)
+        summary = _chained(signable(part), signer, summary=summary, progress=progress)
     return replace(summary, path=out)
 
 
@@ -144,6 +149,50 @@ def _marked(
     return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
 
 
+def _marked_clouds(
+    source: Path, summary: SignSummary, *, watermark: Watermark, progress: Progress
+) -> SignSummary:
+    """Copy a folder of KITTI or nuScenes with a watermark in its clouds."""
+    out, clouds = summary.path, foreign_clouds(source)
+    marks = Paths(out).integrity / "watermark.json"
+    if (Paths(source).integrity / marks.name).exists():
+        raise DatasetError(f"{source}: has a watermark already; sign the original")
+    places = [path.relative_to(source) for path, _ in clouds]
+    leave_out = {*(out / place for place in places), Paths(out).integrity}
+    copy_dataset(source, out, leave_out=leave_out)
+    squares = points = 0.0
+    for done, (path, form) in enumerate(clouds):
+        progress("watermark", done, total=len(clouds))
+        rows = read_rows(path, len(form.columns))
+        sensor, frame = cloud_place(source, path)
+        xyz = with_mark(watermark, finite(rows[:, :3], path), sensor=sensor, frame=frame)
+        moved = np.linalg.norm(xyz - rows[:, :3].astype(np.float64), axis=1)
+        write_atomically(out / places[done], np.column_stack([xyz, rows[:, 3:]]).astype("<f4"))
+        squares, points = squares + float(moved @ moved), points + len(moved)
+    progress("watermark", len(clouds), total=len(clouds))
+    marks.parent.mkdir(exist_ok=True)
+    write_json(marks, {"schema": SCHEMA, "step": watermark.step, "clouds": len(clouds)})
+    return replace(summary, marked=len(clouds), rms=float(np.sqrt(squares / max(points, 1))))
+
+
+def cloud_place(source: Path, path: Path) -> tuple[str, int]:
+    """Folder and frame of a cloud of KITTI or nuScenes, by which its watermark differs from others.
+
+    Raises DatasetError for a file that is named otherwise.
+    """
+    found = place_of(path.relative_to(source))
+    if found is None:
+        raise DatasetError(f"{path}: its name has no frame number of six digits or more, nor a time stamp")
+    return found
+
+
+def finite(xyz: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Coordinates as they are; raises DatasetError for those that are no numbers."""
+    if not np.isfinite(xyz).all():
+        raise DatasetError(f"{path}: damaged (coordinates that are not numbers)")
+    return xyz
+
+
 def _kept(name: str) -> bool:
     """Whether files of a frame, named as by `Recording.paths`, stay as they are with a watermark."""
     return name in ("boxes", "truth") or name.startswith("labels ")
@@ -175,44 +224,6 @@ def _mark_frame(
     return moved
 
 
-@dataclass(frozen=True)
-class SignedFiles:
-    """The files of a directory that are signed, by their paths relative to it.
-
-    frames : by sensor and frame number
-    others : that belong to no frame
-    """
-
-    frames: dict[str, dict[int, list[str]]]
-    others: list[str]
-
-    @property
-    def count(self) -> int:
-        """Number of files."""
-        return len(self.others) + sum(len(own) for group in self.frames.values() for own in group.values())
-
-
-def is_truth(place: Path) -> bool:
-    """Whether a file is ground truth of stages, which is not signed: whoever reads data does not have it."""
-    return "truth" in place.parts[:-1] or place.name.endswith(".truth.csv")
-
-
-def signed_files(dataset: Dataset) -> SignedFiles:
-    """The files of a dataset that are signed."""
-    sensors = dataset.sensors("lidar", "camera")
-    found = SignedFiles({name: {} for name in sensors}, [])
-    for path in sorted(dataset.path.rglob("*")):
-        place = path.relative_to(dataset.path)
-        if path.is_dir() or place.parts[0] == "integrity" or is_truth(place):
-            continue
-        number = _FRAME.fullmatch(place.name)
-        if place.parts[0] in sensors and len(place.parts) > 2 and number:
-            found.frames[place.parts[0]].setdefault(int(number[1]), []).append(place.as_posix())
-        else:
-            found.others.append(place.as_posix())
-    return found
-
-
 def file_digest(path: Path) -> bytes:
     """SHA-256 of a file."""
     with path.open("rb") as file:
@@ -228,10 +239,10 @@ def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:
     return block_digests(table, rate_hz=rate_hz)
 
 
-def frame_digests(dataset: Dataset, names: list[str], *, rate_hz: float) -> FrameDigests:
+def frame_digests(folder: Path, names: list[str], *, rate_hz: float) -> FrameDigests:
     """Digests of the files of a frame."""
-    sha256 = {name: file_digest(dataset.path / name) for name in names}
-    found = {name: _cloud_blocks(dataset.path / name, rate_hz=rate_hz) for name in names}
+    sha256 = {name: file_digest(folder / name) for name in names}
+    found = {name: _cloud_blocks(folder / name, rate_hz=rate_hz) for name in names}
     return FrameDigests(sha256, {name: blocks for name, blocks in found.items() if blocks is not None})
 
 
@@ -246,31 +257,29 @@ def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
 
 
 def _chained(
-    dataset: Dataset, signer: Signer | None, *, summary: SignSummary, progress: Progress
+    data: Signable, signer: Signer | None, *, summary: SignSummary, progress: Progress
 ) -> SignSummary:
-    """Write the signed hash chain over the files of a dataset."""
+    """Write the signed hash chain over the files of a directory."""
     if signer is None:
         return summary
     signer.sign(b"")  # a key that cannot sign is refused before anything is written
-    files, folder = signed_files(dataset), dataset.paths.integrity
+    files, folder = data.files(), data.integrity
     folder.mkdir(exist_ok=True)
     (folder / "chain.json").unlink(missing_ok=True)  # written last
     heads: dict[str, tuple[int, bytes]] = {}
     total, done = sum(map(len, files.frames.values())), 0
     for sensor, frames in files.frames.items():
-        times, rate_hz = dataset.sample_times(sensor), float(dataset.sensors()[sensor]["rate_hz"])
-        head, links = START, list[Link]()
-        for frame, names in sorted(frames.items()):
+        rate_hz, head, links = data.rate_hz(sensor), START, list[Link]()
+        for frame, time_ns in zip(sorted(frames), data.time_ns(sensor, sorted(frames)), strict=True):
             progress("sign", done, total=total)
-            digests = frame_digests(dataset, names, rate_hz=rate_hz)
+            digests = frame_digests(data.path, frames[frame], rate_hz=rate_hz)
             write_atomically(frame_file(folder, sensor, frame=frame), digests.to_bytes())
-            time_ns = int(times[frame]) if frame < len(times) else -1
             head = link(head, sensor=sensor, frame=frame, time_ns=time_ns, root=digests.root)
             links.append(Link(frame, time_ns, digests.root, head))
             done += 1
         write_atomically(folder / f"{sensor}.csv", links_bytes(links))
         heads[sensor] = len(links), head
-    tables = {name: file_digest(dataset.path / name) for name in files.others}
+    tables = {name: file_digest(data.path / name) for name in files.others}
     document = {
         "schema": SCHEMA,
         "algorithm": signer.algorithm,

@@ -14,8 +14,8 @@ from geoscene.csv_tables import write_columns
 from lidar.dataset.derived import check_target, complete_folder
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
+from lidar.dataset.signable import signed_files
 from lidar.errors import InputError
-from lidar.sign import signed_files
 from lidar.time_scales import iso_times
 
 TRUTH = "tamper.truth.csv"

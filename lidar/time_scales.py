@@ -38,6 +38,12 @@ def gps_seconds(start: datetime, time_ns: NDArray[np.integer]) -> Float:
     return base + np.asarray(time_ns, np.float64) * 1e-9
 
 
+def drive_ns(start: datetime, gps: Float) -> NDArray[np.int64]:
+    """Nanoseconds after a UTC start of adjusted standard GPS times, within 60 ns; undoes `gps_seconds`."""
+    base = (start - GPS_EPOCH).total_seconds() + leap_seconds(start) - 1e9
+    return np.rint((gps - base) * 1e9).astype(np.int64)
+
+
 def check_start(start: datetime, duration_ns: int) -> None:
     """Raise InputError for a drive without a time zone, outside GPS time or across a leap second.
 

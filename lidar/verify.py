@@ -13,26 +13,17 @@ import numpy as np
 
 from geoscene.progress import Progress, silent
 from geoscene.typing import Ints
-from lidar.dataset.formats import FORMATS
-from lidar.dataset.formats.table import table_cloud
-from lidar.dataset.layout import Dataset, open_dataset, reading_file
-from lidar.dataset.recorded import cloud_points
+from lidar.dataset.layout import reading_file
+from lidar.dataset.signable import Signable, is_truth, signable
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.integrity.blocks import SECTORS
 from lidar.integrity.digest_files import FrameDigests, Link, frame_file, read_digests, read_links
 from lidar.integrity.keys import Signer
 from lidar.integrity.merkle import START, link, signed_message
 from lidar.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
-from lidar.integrity.watermark import Watermark
-from lidar.sign import (
-    SCHEMA,
-    blocks_in,
-    cells_of,
-    file_digest,
-    is_truth,
-    marked_formats,
-    signed_files,
-)
+from lidar.integrity.watermark import SPREAD, Watermark
+from lidar.marked_clouds import MarkedCloud, cloud_files
+from lidar.sign import SCHEMA, blocks_in, file_digest
 
 
 @dataclass(frozen=True)
@@ -78,6 +69,7 @@ class MarkedFrame:
     blocks : (k,) tampered ones: ring times 36 plus sector
     forged : number of returns that do not bear the watermark
     absent : whether the cloud has no watermark at all, such as one of another frame or key
+    rings  : whether blocks are of rings of the scanner; else of 512 steps of elevation
     """
 
     file: str
@@ -87,12 +79,13 @@ class MarkedFrame:
     forged: int
     places: tuple[Place, ...]
     absent: bool
+    rings: bool = True
 
     def to_text(self) -> list[str]:
         """One line for the cloud and one for each place."""
         if self.absent:
             return [f"{self.file}: no watermark of this key and frame"]
-        text = block_text(np.array(self.blocks), world=False)
+        text = block_text(np.array(self.blocks), world=False, rings=self.rings)
         lines = [f"{self.file}: watermark broken in {len(self.blocks)} blocks ({text})"]
         for place in self.places:
             low, high = (", ".join(f"{v:.2f}" for v in corner) for corner in (place.low, place.high))
@@ -195,79 +188,90 @@ def verify_dataset(
 
     Raises InputError and DatasetError for a dataset without a watermark or signature that is asked for.
     """
-    dataset = open_dataset(path)
+    data = signable(Path(path))
     if watermark is None and signer is None:
         raise InputError("give `watermark`, `chain` or both")
     if not 0 <= noise <= 1:
         raise InputError(f"`noise` {noise:g}: give 0 to 1 metre")
     if not 0 < false_alarms <= 100:
         raise InputError(f"`false_alarms` {false_alarms:g}: give more than 0 and at most 100 blocks a cloud")
-    chain = None if signer is None else _chain_report(dataset, signer, progress=progress)
+    chain = None if signer is None else _chain_report(data, signer, progress=progress)
     marks = None
     if watermark is not None:
-        marks = _watermark_report(
-            dataset, watermark, noise=noise, false_alarms=false_alarms, progress=progress
-        )
+        marks = _watermark_report(data, watermark, noise=noise, false_alarms=false_alarms, progress=progress)
     return VerifyReport(marks, chain)
 
 
-def block_text(blocks: Ints, *, world: bool, most: int = 4) -> str:
+def block_text(blocks: Ints, *, world: bool, rings: bool = True, most: int = 4) -> str:
     """Rings and directions of blocks in words.
 
     world : of a cloud in the world frame, whose sectors are parts of a turn in time
+    rings : of a cloud that names rings; those of others are left out
     """
+    if not rings:
+        blocks = np.unique(blocks % SECTORS)
     ring, sector = np.divmod(blocks, SECTORS)
     step = 360 // SECTORS
-    if world:
-        words = [f"ring {r} part {s + 1} of {SECTORS}" for r, s in zip(ring, sector, strict=True)]
-    else:
-        words = [
-            f"ring {r} {s * step - 180} to {(s + 1) * step - 180} deg"
-            for r, s in zip(ring, sector, strict=True)
-        ]
+    words = []
+    for r, s in zip(ring.tolist(), sector.tolist(), strict=True):
+        turn = f"part {s + 1} of {SECTORS}" if world else f"{s * step - 180} to {(s + 1) * step - 180} deg"
+        words.append(f"ring {r} {turn}" if rings else turn)
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return "; ".join(words[:most]) + more
 
 
 def _watermark_report(
-    dataset: Dataset, watermark: Watermark, *, noise: float, false_alarms: float, progress: Progress
+    data: Signable, watermark: Watermark, *, noise: float, false_alarms: float, progress: Progress
 ) -> WatermarkReport:
     found = WatermarkReport(noise, watermark.error_rate(noise))
-    formats = tuple(dataset.manifest["recipe"].get("formats", ()))
-    forms = marked_formats(tuple(name for name in formats if name in FORMATS))
-    if not forms:
-        known = ", ".join(form.name for form in marked_formats(tuple(FORMATS)))
-        raise InputError(f"{dataset.path}: no clouds in a format that keeps a watermark ({known})")
-    names = list(dataset.sensors("lidar"))
-    jobs = [(n, form, k) for n in names for k in range(len(dataset.sample_times(n))) for form in forms]
-    for done, (name, form, frame) in enumerate(jobs):
+    jobs = list(cloud_files(data))
+    for done, file in enumerate(jobs):
         progress("watermark", done, total=len(jobs))
-        path = form.path(dataset.paths.sensor(name), frame)
-        place = path.relative_to(dataset.path).as_posix()
+        where: dict[str, Any] = {"sensor": file.sensor, "frame": file.frame}
         try:
-            cloud = table_cloud(cloud_points(dataset.frame_file(path)))
-            cells = cells_of(cloud, sensor=name, frame=frame)
-            verdict = frame_verdict(watermark, cloud.xyz, cells=cells, noise=noise, false_alarms=false_alarms)
+            cloud = file.read()
+            verdict = frame_verdict(
+                watermark, cloud.xyz, cells=cloud.cells, noise=noise, false_alarms=false_alarms
+            )
         except LidarError as error:
-            what = "cannot be read" if path.exists() else "missing"
-            detail = "" if what == "missing" else str(error).removeprefix(f"{path}: ")
-            found.findings.append(Finding(what, place, detail, sensor=name, frame=frame))
+            what = "cannot be read" if file.path.exists() else "missing"
+            detail = "" if what == "missing" else str(error).removeprefix(f"{file.path}: ")
+            found.findings.append(Finding(what, file.place, detail, **where))
             continue
+        _check_coarseness(cloud, watermark)
         found.add(verdict)
         if len(verdict.blocks.tampered):
             blocks = tuple(verdict.blocks.tampered.tolist())
             forged = int(verdict.forged.sum())
             found.frames.append(
-                MarkedFrame(place, name, frame, blocks, forged, verdict.places, verdict.absent)
+                MarkedFrame(
+                    file.place,
+                    **where,
+                    blocks=blocks,
+                    forged=forged,
+                    places=verdict.places,
+                    absent=verdict.absent,
+                    rings=not cloud.cells.ranges,
+                )
             )
     progress("watermark", len(jobs), total=len(jobs))
     return found
 
 
-def _chain_report(dataset: Dataset, signer: Signer, *, progress: Progress) -> ChainReport:
-    path = dataset.paths.integrity / "chain.json"
+def _check_coarseness(cloud: MarkedCloud, watermark: Watermark) -> None:
+    """Raise InputError for coordinates that are rounded so much that no bit can be read."""
+    least = (1 - SPREAD) * watermark.step / 2
+    if cloud.step >= least:
+        raise InputError(
+            f"{cloud.place}: coordinates are multiples of {cloud.step:g} m; a watermark with a step of"
+            f" {watermark.step:g} m needs less than {least:g} m"
+        )
+
+
+def _chain_report(data: Signable, signer: Signer, *, progress: Progress) -> ChainReport:
+    path = data.integrity / "chain.json"
     if not path.is_file():
-        raise DatasetError(f"{dataset.path}: is not signed; lidar sign --chain signs it")
+        raise DatasetError(f"{data.path}: is not signed; lidar sign --chain signs it")
     with reading_file(path):
         text = path.read_text("utf-8")
         document = json.loads(text)
@@ -280,28 +284,28 @@ def _chain_report(dataset: Dataset, signer: Signer, *, progress: Progress) -> Ch
         tables = {name: bytes.fromhex(sha256) for name, sha256 in document["files"].items()}
         signature, algorithm = bytes.fromhex(document["signature"]), str(document["algorithm"])
     if algorithm != signer.algorithm:
-        raise InputError(f"{dataset.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
+        raise InputError(f"{data.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
     findings: list[Finding] = []
     written = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
     if text != written or not signer.verifies(signed_message(heads, tables), signature):
         detail = "signed with another key, or the list of signed files was changed"
-        findings.append(Finding("signature is not valid", path.relative_to(dataset.path).as_posix(), detail))
-    files = signed_files(dataset)
-    findings += _tables_found(dataset, tables, present=files.others)
+        findings.append(Finding("signature is not valid", path.relative_to(data.path).as_posix(), detail))
+    files = data.files()
+    findings += _tables_found(data, tables, present=files.others)
     frames = 0
     for sensor, head in heads.items():
         found, count = _frames_found(
-            dataset, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
+            data, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
         )
         findings, frames = findings + found, frames + count
     return ChainReport(algorithm, frames, files.count, tuple(findings))
 
 
-def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
+def _tables_found(data: Signable, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
     """Differences of files of no frame."""
     found = [Finding("added", name) for name in present if name not in signed]
     for name, sha256 in signed.items():
-        path = _inside(dataset, name)
+        path = _inside(data, name)
         if path is None or not path.is_file():
             found.append(Finding("missing", name))
         elif file_digest(path) != sha256:
@@ -309,14 +313,14 @@ def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[s
     return found
 
 
-def _inside(dataset: Dataset, name: str) -> Path | None:
-    """A file of the dataset; None for a path that leads out of it."""
+def _inside(data: Signable, name: str) -> Path | None:
+    """A file of the directory; None for a path that leads out of it."""
     path = Path(name)
-    return None if path.is_absolute() or ".." in path.parts else dataset.path / path
+    return None if path.is_absolute() or ".." in path.parts else data.path / path
 
 
 def _frames_found(
-    dataset: Dataset,
+    data: Signable,
     sensor: str,
     *,
     head: tuple[int, bytes],
@@ -326,16 +330,16 @@ def _frames_found(
     """Differences of the frames of a sensor, and the number of frames that were compared."""
     place = f"integrity/{sensor}.csv"
     try:
-        links = read_links(dataset.paths.integrity / f"{sensor}.csv")
+        links = read_links(data.integrity / f"{sensor}.csv")
     except LidarError as error:
         return [Finding("signed list cannot be read", place, str(error), sensor=sensor)], 0
     found, signed = list[Finding](), dict[int, FrameDigests]()
     if broken := _broken_link(links, sensor, head=head):
         found.append(Finding("signed list was changed", place, broken, sensor=sensor))
     for entry in links:
-        path = frame_file(dataset.paths.integrity, sensor, frame=entry.frame)
+        path = frame_file(data.integrity, sensor, frame=entry.frame)
         where: dict[str, Any] = {"sensor": sensor, "frame": entry.frame}
-        name = path.relative_to(dataset.path).as_posix()
+        name = path.relative_to(data.path).as_posix()
         try:
             digests = signed[entry.frame] = read_digests(path)
         except LidarError as error:
@@ -343,8 +347,8 @@ def _frames_found(
             continue
         if digests.root != entry.root:
             found.append(Finding("signed digests were changed", name, **where))
-    rate_hz = float(dataset.sensors().get(sensor, {}).get("rate_hz", 0.0))
-    differing = _files_found(dataset, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
+    rate_hz = data.rate_hz(sensor)
+    differing = _files_found(data, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
     return [*found, *differing], len(links)
 
 
@@ -361,7 +365,7 @@ def _broken_link(links: list[Link], sensor: str, *, head: tuple[int, bytes]) -> 
 
 
 def _files_found(
-    dataset: Dataset,
+    data: Signable,
     sensor: str,
     *,
     signed: dict[int, FrameDigests],
@@ -385,7 +389,7 @@ def _files_found(
         progress(f"verify {sensor}", done, total=len(signed))
         for name, sha256 in digests.sha256.items():
             where: dict[str, Any] = {"sensor": sensor, "frame": frame}
-            path = _inside(dataset, name)
+            path = _inside(data, name)
             if path is None or not path.is_file():
                 yield Finding("missing", name, **where)
                 continue
@@ -414,5 +418,5 @@ def _changed(
     if not len(blocks):
         detail = "no block of points differs: the header, or the order of points"
         return Finding("changed", name, detail, **where)
-    world = path.suffix in (".laz", ".las")
-    return Finding("changed", name, block_text(blocks, world=world), tuple(blocks.tolist()), **where)
+    text = block_text(blocks, world=path.suffix in (".laz", ".las"), rings=path.suffix != ".bin")
+    return Finding("changed", name, text, tuple(blocks.tolist()), **where)

@@ -72,6 +72,15 @@ class Georeference:
             out[:, 0], out[:, 1] = self._project(out[:, 0], out[:, 1])
         return out
 
+    def scene_points(self, points: Float) -> Float:
+        """Scene points (n, 3) of easting, northing and height (n, 3): the exact inverse of `points`."""
+        out = np.array(points, np.float64)
+        if len(out) and self.frame.crs != self.crs:
+            east, north = out[:, 0], out[:, 1]
+            out[:, 0], out[:, 1] = self._transformer.transform(east, north, direction="INVERSE")
+        out[:, :2] -= self.frame.origin
+        return out
+
     def _affine(self, xy: Float) -> tuple[Float, Float, Float] | None:
         """Origin, matrix and shift of the best affine map over the points; None if beyond `AFFINE_LIMIT`."""
         low, high = xy.min(axis=0), xy.max(axis=0)

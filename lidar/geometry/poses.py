@@ -99,6 +99,11 @@ class Poses(Columns):
         placed: Float = self.position + self.scale * turned
         return placed
 
+    def seen(self, points: Float) -> Float:
+        """Body coordinates (n, 3) of scene points (n, 3), row by row: the inverse of `place`."""
+        found: Float = np.einsum("nji,nj->ni", self.rotation, (points - self.position) / self.scale)
+        return found
+
     def directions(self, vectors: Float) -> Float:
         """Ray directions (n, 3) in the scene of body vectors (n, 3), row by row.
 

@@ -51,12 +51,12 @@ def block_test(block: Ints, wrong: NDArray[np.bool_], *, error_rate: float, fals
     """The test of a frame's blocks.
 
     block        : (n,) of each return
-    wrong        : (n, 3) bits that count as wrong
+    wrong        : (n, k) bits that count as wrong, k of each return
     error_rate   : share of bits that noise makes wrong
     false_alarms : blocks a frame that may be reported without tampering, on average at most
     """
     numbers, row = np.unique(block, return_inverse=True)
-    bits = 3 * np.bincount(row, minlength=len(numbers))
+    bits = wrong.shape[1] * np.bincount(row, minlength=len(numbers))
     count = np.bincount(row, weights=wrong.sum(axis=1), minlength=len(numbers)).astype(np.int64)
     least, chance = _thresholds(bits, error_rate=error_rate, chance=false_alarms / max(len(numbers), 1))
     return BlockTest(numbers, bits, count, least, chance)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class Cells:
 
     sensor, frame : name and number
     ring, column, echo : (n,) as of `lidar.sensors.cloud.Cloud`
+    ranges : whether ranges are marked instead of coordinates, see `lidar.integrity.directions`
     """
 
     sensor: str
@@ -47,10 +48,11 @@ class Cells:
     ring: NDArray[np.integer]
     column: NDArray[np.integer]
     echo: NDArray[np.integer]
+    ranges: bool = False
 
     def where(self, keep: NDArray[np.bool_]) -> Cells:
         """The returns of a mask (n,)."""
-        return Cells(self.sensor, self.frame, self.ring[keep], self.column[keep], self.echo[keep])
+        return replace(self, ring=self.ring[keep], column=self.column[keep], echo=self.echo[keep])
 
     def order(self) -> NDArray[np.intp]:
         """Rows (n,) sorted by ring, column and echo."""
@@ -61,8 +63,8 @@ class Cells:
 class Decoded:
     """What a watermark says of the returns of a frame.
 
-    wrong : (n, 3) bool, bits of x, y, z that are not those of the key
-    off   : (n, 3) metres from the nearest lattice point, of either bit
+    wrong : (n, 3) bool, bits of x, y, z that are not those of the key; (n, 1) of ranges
+    off   : (n, 3) or (n, 1) metres from the nearest lattice point, of either bit
     """
 
     wrong: NDArray[np.bool_]
@@ -85,17 +87,18 @@ class Watermark:
             raise InputError(f"`step` {self.step:g}: give 0.0001 to 1 metre")
 
     def embedded(self, xyz: NDArray[np.floating], cells: Cells) -> Float:
-        """Coordinates (n, 3) with the watermark, each at most half its step from where it was."""
+        """Coordinates (n, 3), or ranges (n, 1), with the watermark, each at most half its step off."""
         dither, half, bits = self._expected(cells)
         index = bits + 2 * np.rint(((xyz - dither) / half - bits) / 2)
         marked: Float = dither + half * index
         return marked
 
     def decoded(self, xyz: NDArray[np.floating], cells: Cells) -> Decoded:
-        """Bits and lattice distances of coordinates (n, 3) in the sensor frame."""
+        """Bits and lattice distances of coordinates (n, 3) in the sensor frame, or of their ranges."""
         dither, half, bits = self._expected(cells)
-        index = np.rint((xyz - dither) / half)
-        return Decoded(index % 2 != bits, xyz - dither - half * index)
+        given = np.linalg.norm(xyz.astype(np.float64), axis=1)[:, None] if cells.ranges else xyz
+        index = np.rint((given - dither) / half)
+        return Decoded(index % 2 != bits, given - dither - half * index)
 
     def error_rate(self, sigma: float, *, within: float = np.inf) -> float:
         """Share of bits that Gaussian noise with a standard deviation in metres makes wrong.
@@ -108,7 +111,7 @@ class Watermark:
         )
 
     def _expected(self, cells: Cells) -> tuple[Float, Float, NDArray[np.uint8]]:
-        """Dither, half the step (n, 3) in metres and bits (n, 3) of returns."""
+        """Dither, half the step (n, 3) in metres and bits (n, 3) of returns; (n, 1) of ranges."""
         order = cells.order()
         values = self._cells(cells)[order]
         ring = cells.ring[order]
@@ -117,10 +120,11 @@ class Watermark:
             bits = bits ^ values["of_later"][earlier(ring, back + 1), back]
         row = np.argsort(order)
         half = self.step / 2 * (1 + SPREAD * (values["stretch"][row] / 32767.5 - 1))
+        count = 1 if cells.ranges else 3
         return (
-            values["dither"][row] / 32768 * half,
-            half,
-            ((bits[row, None] >> np.arange(3)) & 1).astype(np.uint8),
+            (values["dither"][row] / 32768 * half)[:, :count],
+            half[:, :count],
+            ((bits[row, None] >> np.arange(count)) & 1).astype(np.uint8),
         )
 
     def _cells(self, cells: Cells) -> NDArray[np.void]:
