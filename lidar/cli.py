@@ -263,8 +263,8 @@ def redteam(
 ) -> int:
     """Measure attacks against defences: success, detection at fixed false alarms, ROC, latency and cost.
 
-    Each drive of a grid is recorded without attack and with each attack, and judged by all defences; a
-    detector without learning shows which attacks succeed. Nothing is sent to any device. The same command
+    Each drive of a grid is recorded without attack and with each attack, and judged by all defences; one or
+    more detectors of road users show which attacks succeed. Nothing is sent to any device. The same command
     resumes an interrupted matrix.
 
     For example:
@@ -620,6 +620,8 @@ def defend(
 
     lidar defend drive --defence all --fuse max --json
 
+    lidar defend drive --defence shadow --detector learned --calibrate -o learned.toml
+
     lidar defend drive --defence all --calibrate -o calibration.toml
 
     Parameters
@@ -636,6 +638,7 @@ def defend(
     from lidar.defences.defend import calibrate, score_rows  # noqa: PLC0415
     from lidar.defences.defend import defend as judged  # noqa: PLC0415
     from lidar.defences.registry import read_defences  # noqa: PLC0415
+    from lidar.detection.registry import read_detector  # noqa: PLC0415
 
     if not datasets:
         raise InputError("`datasets`: give one or more")
@@ -648,22 +651,32 @@ def defend(
             "is a directory; give a file" if out.is_dir() else "exists already; set `overwrite` to replace it"
         )
         raise InputError(f"{out}: {what}")
-    chosen = read_defences(options.defences)
+    chosen, detector = read_defences(options.defences), read_detector(options.detector)
     opened = [open_dataset(path) for path in datasets]
     scene = None if options.scene is None else open_scene(options.scene)
     if options.calibrate and out is not None:
         with progress_bar(quiet=report.quiet) as progress:
-            made = calibrate(opened, chosen, scene=scene, out=out, seed=options.seed, progress=progress)
+            made = calibrate(
+                opened,
+                chosen,
+                detector=detector,
+                scene=scene,
+                out=out,
+                seed=options.seed,
+                progress=progress,
+            )
         if report.json:
             print_json({"path": str(out), "note": made.note})
         else:
             print(f"{out}: {made.note}")
         return 0
+    calibration = read_calibration(options.calibration, detector=detector)
     with progress_bar(quiet=report.quiet) as progress:
         found = judged(
             opened,
             chosen,
-            calibration=read_calibration(options.calibration),
+            calibration=calibration,
+            detector=detector,
             rule="" if options.fuse == "none" else options.fuse,
             scene=scene,
             out=out,
@@ -677,6 +690,56 @@ def defend(
         from lidar.rig.catalog import columns  # noqa: PLC0415
 
         print(columns(score_rows(found)))
+    return 0
+
+
+@app.command
+def train(
+    *datasets: Path,
+    out: Out,
+    seed: Annotated[int, Parameter(converter=whole)] = 0,
+    trees: Annotated[int, Parameter(converter=whole)] = 60,
+    every: Annotated[int, Parameter(converter=whole)] = 1,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    report: Reporting = Report(),
+) -> int:
+    """Train a detector of road users on the labelled clouds of drives.
+
+    Needs scikit-learn (pip install 'geoscene[learn]'); what uses the model does not.
+
+    For example:
+
+    lidar train drive1 drive2 drive3 -o model.npz
+
+    Parameters
+    ----------
+    datasets
+        Directories of datasets with traffic, recorded without attacks.
+    out
+        File to write the model to, for --detector of lidar defend and detector of lidar redteam.
+    seed
+        Seed of the forest. The same data, options and seed give the same file.
+    trees
+        Trees of the forest.
+    every
+        Use each frame of that number: those that follow each other are nearly the same.
+    workers
+        Processes that read the clouds. The model does not depend on it.
+    """
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.train import train as trained  # noqa: PLC0415
+
+    if not datasets:
+        raise InputError("`datasets`: give one or more")
+    if out.is_dir() or (out.exists() and not report.overwrite):
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it, or give another file")
+    with progress_bar(quiet=report.quiet) as progress:
+        made = trained(datasets, out, seed=seed, trees=trees, every=every, workers=workers, progress=progress)
+    if report.json:
+        print_json(made.to_json())
+    else:
+        print(columns(made.table()))
+        print(f"{out}: {made.frames} frames; next: lidar defend {datasets[0]} --detector {out} ...")
     return 0
 
 

@@ -700,6 +700,9 @@ class DefendOptions:
     scene: Path | None = None
     """Scene that the map defence compares with; by default the one that the dataset was driven in."""
 
+    detector: str = "rules"
+    """What gives the boxes of road users: rules, learned, or the file of a model (lidar train)."""
+
     fuse: Annotated[str, Parameter(converter=_lower)] = "harmonic"
     """Verdict of all defences together, if there are several: harmonic (mean of the shares of genuine data
     that are as suspicious), max (the least of them), fisher (all count, as if independent) or none."""
@@ -709,7 +712,8 @@ class DefendOptions:
     --out, for --calibration."""
 
     calibration: Path | None = None
-    """TOML file of thresholds and suspicions of genuine data; those of docs/defences.md by default."""
+    """TOML file of thresholds and suspicions of genuine data; by default those of docs/defences.md, for
+    the detector rules."""
 
     seed: Annotated[int, Parameter(converter=whole)] = 0
     """Seed of the defences' random numbers and of the intervals."""

@@ -27,6 +27,7 @@ import lidar.tradeoff.engine
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
+from lidar.traffic.populate import TrafficOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
@@ -117,6 +118,11 @@ def inputs(tmp_path_factory):
     options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
     recorded = lidar.pipeline.drive(scene, folder / "recorded", options=options).path / "top"
     shutil.copytree(recorded, folder / "kitti" / "sequences" / "00")
+    traffic = TrafficOptions(vehicles=60.0, parked=1.0)
+    options = replace(options, duration=1.0, formats=("pcd",), route="random", traffic=traffic)
+    trained = lidar.pipeline.drive(scene, folder / "drive1", options=options).path
+    for name in ("drive2", "drive3"):
+        shutil.copytree(trained, folder / name)
     return folder
 
 

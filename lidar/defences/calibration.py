@@ -5,7 +5,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +12,21 @@ import numpy as np
 
 from geoscene.typing import Float
 from lidar.defences.scores import FALSE_ALARMS, Samples, threshold_at
+from lidar.detection import RULES, Detector
 from lidar.errors import InputError
+
+_BUILT_IN = {
+    "rules": Path(__file__).with_name("calibration.toml"),
+}
+"""Calibrations that come with the program, by detector."""
 
 TAILS = (0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001)
 """Shares of genuine returns, objects or frames at whose suspicions a calibration is stored."""
 
 _STEP = 1e-9
 """Of suspicion, after one that many samples have."""
+
+_CALIBRATE = "make its own on datasets without attacks by `calibrate`, and give the file as `calibration`"
 
 _FEWEST = 3
 """Genuine samples above the last stored suspicion."""
@@ -77,13 +84,23 @@ class Joint:
 class Calibration:
     """Tails by defence and level of `lidar.defences.scores.LEVELS`, and what defences have in common.
 
-    joint : by level
-    note  : of which data
+    joint    : by level
+    note     : of which data
+    detector : identity of the one that gave the boxes
     """
 
     tails: Mapping[tuple[str, str], Tail]
     note: str = ""
     joint: Mapping[str, Joint] = field(default_factory=dict)
+    detector: str = RULES.identity
+
+    def check(self, detector: Detector) -> None:
+        """Raise InputError if the boxes of the calibration are of another detector."""
+        if detector.identity != self.detector:
+            raise InputError(
+                f"`calibration`: its thresholds are of detector {self.detector}, and `detector` is"
+                f" {detector.name} ({detector.identity}); {_CALIBRATE}"
+            )
 
     def tail(self, defence: str, level: str) -> Tail:
         """A tail; raises InputError if the defence is not calibrated at that level."""
@@ -115,12 +132,20 @@ def tail_of(samples: Samples) -> Tail:
     return Tail(count, np.array(shares), np.array([threshold_at(samples, share) for share in shares]))
 
 
-def read_calibration(path: Path | None = None) -> Calibration:
-    """The calibration of a TOML file, or the one that comes with the program.
+def read_calibration(path: Path | None = None, *, detector: Detector = RULES) -> Calibration:
+    """The calibration of a TOML file, or the one of a detector that comes with the program.
 
-    Raises InputError for a file that is none.
+    Raises InputError for a file that is none, or if none comes with the program for a detector.
     """
-    file = resources.files("lidar.defences") / "calibration.toml" if path is None else path
+    file = path or _BUILT_IN.get(detector.name)
+    if file is None:
+        raise InputError(f"`detector` {detector.name}: no thresholds come with it; {_CALIBRATE}")
+    found = _read(file)
+    found.check(detector)
+    return found
+
+
+def _read(file: Path) -> Calibration:
     tails: dict[tuple[str, str], Tail] = {}
     try:
         document = tomllib.loads(file.read_text("utf-8"))
@@ -128,7 +153,8 @@ def read_calibration(path: Path | None = None) -> Calibration:
             for level, row in levels.items():
                 tails[defence, level] = _tail(row)
         joint = {level: _joint(row) for level, row in document.get("joint", {}).items()}
-        return Calibration(tails, str(document["note"]), joint)
+        detector = str(document.get("detector", RULES.identity))
+        return Calibration(tails, str(document["note"]), joint, detector)
     except FileNotFoundError:
         raise InputError(f"{file}: is missing; lidar defend --calibrate makes one") from None
     except KeyError as error:
@@ -153,7 +179,7 @@ def _joint(row: Mapping[str, Any]) -> Joint:
 
 def calibration_text(calibration: Calibration) -> str:
     """A calibration as `read_calibration` reads it."""
-    lines = [f'note = "{calibration.note}"']
+    lines = [f'note = "{calibration.note}"', f'detector = "{calibration.detector}"']
     for (defence, level), tail in sorted(calibration.tails.items()):
         lines += [
             "",

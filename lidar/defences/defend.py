@@ -30,6 +30,7 @@ from lidar.defences.run import Judged, able, judged_frames
 from lidar.defences.scores import FALSE_ALARMS, LEVELS, Samples, Score, score
 from lidar.defences.truth import FrameTruth, attack_truth
 from lidar.defences.verdict import Verdict
+from lidar.detection import RULES, Detector
 from lidar.errors import DatasetError, InputError
 from lidar.random_streams import generator
 
@@ -98,6 +99,7 @@ def defend(
     defences: Sequence[NamedDefence],
     *,
     calibration: Calibration,
+    detector: Detector = RULES,
     rule: str = "",
     scene: Scene | None = None,
     out: Path | None = None,
@@ -107,11 +109,14 @@ def defend(
 ) -> Defended:
     """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
 
+    calibration : of the same detector
+    detector  : that gives the boxes
     rule      : of `lidar.defences.fusion.FUSIONS`, by which verdicts of several are also fused; none if empty
     overwrite : write to a directory that is not empty
 
     Raises InputError if the data lack what a defence needs, before anything is judged.
     """
+    calibration.check(detector)
     for dataset in datasets:
         if out is not None:
             check_target(out, source=dataset.path, overwrite=overwrite)
@@ -120,6 +125,7 @@ def defend(
             datasets,
             defences,
             calibration=calibration,
+            detector=detector,
             rule=rule,
             scene=scene,
             out=part,
@@ -133,13 +139,14 @@ def _defended(
     defences: Sequence[NamedDefence],
     *,
     calibration: Calibration,
+    detector: Detector,
     rule: str,
     scene: Scene | None,
     out: Path | None,
     seed: int,
     progress: Progress,
 ) -> Defended:
-    job = _job(datasets, defences, scene=scene, seed=seed)
+    job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
     defences = job.defences
     rule = rule if len(defences) > 1 else ""
     for named in defences:
@@ -174,7 +181,9 @@ def _defended(
     )
     if out is not None:
         tables.write(out)
-        extra = {"datasets": [str(d.path) for d in datasets], "fusion": rule, "calibration": calibration.note}
+        extra: dict[str, Any] = {"datasets": [str(d.path) for d in datasets], "fusion": rule}
+        extra |= {"calibration": calibration.note}
+        extra |= {"detector": {"name": detector.name, "identity": detector.identity}}
         write_json(
             out / "defend.json", found.document() | extra | {"options": [n.to_json() for n in defences]}
         )
@@ -207,6 +216,7 @@ def calibrate(
     defences: Sequence[NamedDefence],
     *,
     out: Path,
+    detector: Detector = RULES,
     scene: Scene | None = None,
     seed: int = 0,
     progress: Progress = silent,
@@ -215,7 +225,7 @@ def calibrate(
 
     Raises DatasetError if a frame was attacked.
     """
-    job, tally, names = _job(datasets, defences, scene=scene, seed=seed), Tally(), []
+    job, tally, names = _job(datasets, defences, scene=scene, seed=seed, detector=detector), Tally(), []
     for _, scans, judged in job.judged(progress):
         frame = judged.frame
         truth = _truth_of(scans, frame)
@@ -225,7 +235,8 @@ def calibrate(
         names.append(f"{scans.dataset.path.name} ({scans.sensor.model})")
     note = f"{tally.frames} frames of {', '.join(dict.fromkeys(names))}"
     found = Calibration({key: tail_of(samples) for key, samples in tally.samples().items()}, note)
-    found = replace(found, joint=tally.joint(found, rng=generator(seed, "calibration")))
+    joint = tally.joint(found, rng=generator(seed, "calibration"))
+    found = replace(found, joint=joint, detector=detector.identity)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, calibration_text(found).encode())
     return found
@@ -255,13 +266,18 @@ class Job:
 
 
 def _job(
-    datasets: Sequence[Dataset], defences: Sequence[NamedDefence], *, scene: Scene | None, seed: int
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    scene: Scene | None,
+    seed: int,
+    detector: Detector,
 ) -> Job:
     """The frames of all scanners of datasets; raises InputError as `able` does."""
     scans = []
     for k, dataset in enumerate(datasets):
         name = dataset.path.name if len(datasets) == 1 else f"{k}_{dataset.path.name}"
-        scans += [(Path(name) / each.sensor.name, each) for each in read_scans(dataset)]
+        scans += [(Path(name) / each.sensor.name, each) for each in read_scans(dataset, detector=detector)]
     job = Job(tuple(scans), tuple(able([each for _, each in scans], defences, scene=scene)), scene, seed)
     for _, each in scans:
         if (seen := job.scene_of(each.dataset)) is not None and seen.frame != each.dataset.frame:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Float, Ints
-from lidar.detection import Detections, detect
+from lidar.detection import RULES, Detections, Detector
 from lidar.detection.detector import inside
 from lidar.detection.ground import Ground, ground_of
 from lidar.geometry.mounts import Mount
@@ -84,6 +84,7 @@ class Observation:
     ring, column, echo, echoes, range, intensity : (n,) as in `lidar.sensors.cloud.Cloud`
     pictures  : images that were taken near the frame
     navigation : fixes and inertial measurements
+    detector  : that gives the boxes
     """
 
     number: int
@@ -101,6 +102,7 @@ class Observation:
     intensity: Float
     pictures: tuple[Picture, ...] = ()
     navigation: Navigation | None = None
+    detector: Detector = RULES
 
     def __len__(self) -> int:
         """Number of returns."""
@@ -214,7 +216,7 @@ class Observation:
     @functools.cached_property
     def objects(self) -> Detections:
         """Boxes that the detector finds, in the sensor frame."""
-        return detect(self)
+        return self.detector.detect(self)
 
     @functools.cached_property
     def members(self) -> tuple[NDArray[np.intp], ...]:

@@ -14,6 +14,7 @@ from lidar.dataset.formats import FORMATS
 from lidar.dataset.layout import Dataset, opened_rows, reading_file
 from lidar.dataset.recorded import Stream, cloud_points, clouds_in, color_images
 from lidar.defences.observation import Navigation, Observation, Picture
+from lidar.detection import RULES, Detector
 from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.devices import Scanner, cameras, scanners
@@ -33,6 +34,7 @@ class Scans:
 
     pictures   : images of the cameras, by camera
     navigation : of the vehicle; None without a receiver or an inertial unit
+    detector   : of road users
     """
 
     dataset: Dataset
@@ -41,6 +43,7 @@ class Scans:
     trajectory: Trajectory
     pictures: tuple[tuple[CameraSpec, Stream], ...]
     navigation: Navigation | None
+    detector: Detector = RULES
 
     @property
     def frames(self) -> Ints:
@@ -77,12 +80,13 @@ class Scans:
                 for picture in _pictures_during(camera, images, window_ns=self.sensor.window_ns(number))
             ),
             navigation=self.navigation,
+            detector=self.detector,
             **(whole | {"time_ns": start + whole["time_ns"]}),
         )
 
 
-def read_scans(dataset: Dataset) -> list[Scans]:
-    """The frames of each scanner of a dataset.
+def read_scans(dataset: Dataset, *, detector: Detector = RULES) -> list[Scans]:
+    """The frames of each scanner of a dataset, with the boxes of a detector.
 
     Raises InputError if the rig's files have changed since the drive, and DatasetError if clouds are not in
     the sensor frame with ring, column and time.
@@ -100,6 +104,7 @@ def read_scans(dataset: Dataset) -> list[Scans]:
             trajectory=trajectory,
             pictures=pictures,
             navigation=navigation,
+            detector=detector,
         )
         for scanner in scanners(rig)
     ]

@@ -1,4 +1,6 @@
-"""Road users found in point clouds without learning: what attacks and defences are measured with."""
+"""Road users found in point clouds: what attacks and defences are measured with."""
 
 from lidar.detection.detector import Detections as Detections
-from lidar.detection.detector import detect as detect
+from lidar.detection.detector import Detector as Detector
+from lidar.detection.rules import RULES as RULES
+from lidar.detection.rules import detect as detect

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.typing import Float
 
@@ -29,7 +30,7 @@ class Rectangle:
     edge: float
 
 
-def fitted(xy: Float) -> Rectangle:
+def fitted(xy: NDArray[np.floating]) -> Rectangle:
     """The rectangle (closeness criterion of Zhang et al. 2017) around points (n, 2).
 
     Of 45 directions it is the one in which most points are close to an edge.

@@ -31,16 +31,21 @@ _SEED = 0
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """A drive of the matrix with the figures of `lidar.redteam.measure`."""
+    """A drive of the matrix with the figures of `lidar.redteam.measure`.
+
+    detector : that gave the boxes; empty if all drives have the same
+    """
 
     run: Run
     frames: list[dict[str, Any]]
     absent: list[str]
+    detector: str = ""
 
     @property
     def setting(self) -> dict[str, str]:
         """Its conditions that are not pooled."""
-        return {name: text for name, text in self.run.conditions.items() if name not in POOLED}
+        conditions = {name: text for name, text in self.run.conditions.items() if name not in POOLED}
+        return conditions | ({"detector": self.detector} if self.detector else {})
 
     def block(self, frame: Mapping[str, Any], *, seconds: float) -> tuple[str, str, int]:
         """What tells the independent part of a drive that a frame is of."""
@@ -150,7 +155,8 @@ def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure:
     for setting, scene, drives in _groups(figures):
         plain = [one for one in drives if one.run.attack is None]
         known = {"setting": setting, "scene": scene}
-        found.accuracy.extend(_accuracies(plain, measure=measure, known=known))
+        frames = [(one.block(frame, seconds=measure.block), frame) for one in plain for frame in one.frames]
+        found.accuracy.extend(accuracies(frames, measure=measure, known=known))
         if scene == "all":
             found.cost.extend(_costs(drives, setting=setting))
         for attack in attacks:
@@ -405,8 +411,13 @@ def _latency(one: Figures, defence: str, *, threshold: float) -> float | None:
     return min(alarms) - min(frame["seconds"] for frame in attacked) if alarms else math.inf
 
 
-def _accuracies(plain: Sequence[Figures], *, measure: Measure, known: dict[str, Any]) -> Iterator[Accuracy]:
-    frames = [(one.block(frame, seconds=measure.block), frame) for one in plain for frame in one.frames]
+def accuracies(
+    frames: Sequence[tuple[Any, Mapping[str, Any]]], *, measure: Measure, known: dict[str, Any]
+) -> Iterator[Accuracy]:
+    """How well a detector finds road users in frames without attack, each with its block.
+
+    known : fields of the rows that are not measured
+    """
     if not frames:
         return
     for kind in ("vehicle", "person", "cycle"):

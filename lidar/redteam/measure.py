@@ -24,14 +24,13 @@ from lidar.defences.reading import Scans, read_scans
 from lidar.defences.registry import NamedDefence
 from lidar.defences.run import able, judged_frames
 from lidar.defences.truth import frame_truth
+from lidar.detection import RULES
+from lidar.detection.detector import KINDS
+from lidar.detection.registry import read_detector
 from lidar.errors import InputError, LidarError
 
-KINDS = {
-    **dict.fromkeys(("car", "van", "truck", "bus"), "vehicle"),
-    "pedestrian": "person",
-    **dict.fromkeys(("bicycle", "bicyclist", "motorcycle", "motorcyclist"), "cycle"),
-}
-"""What the detector calls a class of road users."""
+KIND_OF = {code.name.lower(): kind for code, kind in KINDS.items()}
+"""What the detector calls a class of road users, by its name in files of boxes."""
 
 FEWEST = 10
 """Returns of a road user from which on the detector should find it."""
@@ -57,6 +56,7 @@ class Case:
     out      : file for the figures
     defences : that judge it
     score    : of a detection from which on it counts
+    detector : name of the one that gives the boxes
     """
 
     path: Path
@@ -64,6 +64,7 @@ class Case:
     out: Path
     defences: tuple[NamedDefence, ...]
     score: float
+    detector: str = RULES.name
 
 
 def measured(case: Case) -> dict[str, Any]:
@@ -99,15 +100,18 @@ def kept(case: Case) -> dict[str, Any] | None:
 
 def _key(case: Case) -> str:
     drives = [Paths(path).journal for path in (case.path, case.twin) if path is not None]
-    made_of = [__version__, case.score, [digest_of(path) for path in drives]]
+    identity = read_detector(case.detector).identity
+    made_of = [__version__, case.score, identity, [digest_of(path) for path in drives]]
     return json.dumps([*made_of, [named.to_json() for named in case.defences]])
 
 
 def _document(case: Case, dataset: Dataset, *, scene: Scene | None) -> dict[str, Any]:
-    twins = {} if case.twin is None else {s.sensor.name: s for s in read_scans(open_dataset(case.twin))}
+    detector = read_detector(case.detector)
+    twin = [] if case.twin is None else read_scans(open_dataset(case.twin), detector=detector)
+    twins = {scans.sensor.name: scans for scans in twin}
     frames: list[dict[str, Any]] = []
     absent: set[str] = set()
-    for scans in read_scans(dataset):
+    for scans in read_scans(dataset, detector=detector):
         defences, lacking = _able(scans, case.defences)
         absent |= set(lacking)
         frames += _frames(scans, defences, twin=twins.get(scans.sensor.name), scene=scene, score=case.score)
@@ -267,7 +271,7 @@ def _matched(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Ints:
     if not users:
         return number
     away = _apart(frame, users)
-    kinds = np.array([KINDS.get(user["class"], "") for user in users])
+    kinds = np.array([KIND_OF.get(user["class"], "") for user in users])
     free = np.ones(len(users), bool)
     for k in range(len(boxes)):
         apart = np.where(free & (kinds == boxes.kind[k]), away[k], np.inf)
@@ -309,7 +313,7 @@ def _found(frame: Observation, users: Sequence[Mapping[str, Any]]) -> list[dict[
     for user in users:
         away = float(np.hypot(*(np.array([user["x"], user["y"]]) - pose.position[0, :2])) / pose.scale[0, 0])
         if user["points"] > 0:
-            kind = KINDS.get(user["class"], "")
+            kind = KIND_OF.get(user["class"], "")
             rows.append(
                 {"id": user["id"], "kind": kind, "distance": round(away, 2), "points": user["points"]}
             )

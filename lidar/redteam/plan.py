@@ -10,6 +10,8 @@ from typing import Any
 
 from geoscene.errors import reading
 from lidar.defences.registry import NamedDefence, read_defences
+from lidar.detection import RULES
+from lidar.detection.registry import read_detector
 from lidar.errors import InputError
 from lidar.redteam.published import ATTACKS as PUBLISHED
 from lidar.sweep.grid import GridDrive, drives_of
@@ -49,6 +51,8 @@ class Measure:
     deviation    : metres of a fix from the genuine one from which on the vehicle is misled; a car that is
                    1.8 m wide in the middle of a lane of 3.5 m is 0.85 m from its edge
     block        : seconds of a drive that count as one independent trial
+    detector     : what reports road users, as for `lidar.detection.registry.read_detector`; several are
+                   measured on the same drives and stand side by side
     """
 
     score: float = 0.3
@@ -56,6 +60,7 @@ class Measure:
     false_objects: float = 0.01
     deviation: float = 0.85
     block: float = 1.0
+    detector: tuple[str, ...] = (RULES.name,)
 
     def __post_init__(self) -> None:
         """Validate the values."""
@@ -66,6 +71,10 @@ class Measure:
             raise InputError(f"measure: deviation = {self.deviation:g}: give 0.01 to 1,000,000 m")
         if not 0.1 <= self.block <= 600:
             raise InputError(f"measure: block = {self.block:g}: give 0.1 to 600 seconds")
+        if not self.detector or len(set(self.detector)) < len(self.detector):
+            raise InputError("measure: detector: give one or more that differ")
+        for name in self.detector:
+            read_detector(name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,9 +178,14 @@ def _measure(table: Any) -> Measure:
         raise InputError("give a table")
     if unknown := sorted(set(table) - set(known)):
         raise InputError(f"unknown {unknown[0]}; there are {', '.join(known)}")
-    if wrong := [name for name, value in table.items() if type(value) not in (int, float)]:
+    numbers = {name: value for name, value in table.items() if name != "detector"}
+    if wrong := [name for name, value in numbers.items() if type(value) not in (int, float)]:
         raise InputError(f"{wrong[0]}: give a number")
-    return replace(Measure(), **table)
+    detector = table.get("detector", list(Measure().detector))
+    detector = [detector] if isinstance(detector, str) else detector
+    if not isinstance(detector, list) or not all(isinstance(name, str) for name in detector):
+        raise InputError('detector: give a name or a list of names, such as ["rules", "learned"]')
+    return replace(Measure(), **numbers, detector=tuple(detector))
 
 
 def _runs(drives: list[GridDrive], attacks: tuple[Attack, ...]) -> list[Run]:

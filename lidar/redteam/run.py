@@ -11,6 +11,8 @@ from geoscene.errors import GeosceneError
 from geoscene.files import exclusive
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress, silent
+from lidar.detection import RULES
+from lidar.detection.registry import read_detector
 from lidar.errors import InputError, LidarError
 from lidar.redteam.evaluate import Figures, Matrix, evaluated
 from lidar.redteam.measure import Case, measured
@@ -72,7 +74,9 @@ def redteam(
             else:
                 figures.append(result)
         matrix = evaluated(figures, plan.attacks, measure=plan.measure)
-        summary = RedTeamSummary(folder, tuple(one.run.drive.name for one in figures), failed, matrix)
+        summary = RedTeamSummary(
+            folder, tuple(dict.fromkeys(one.run.drive.name for one in figures)), failed, matrix
+        )
         absent = sorted({name for one in figures for name in one.absent})
         write_report(summary.matrix, folder, plan=plan, failed=failed, absent=absent, source=Path(file).name)
     return summary
@@ -85,18 +89,21 @@ def _is_matrix(folder: Path) -> bool:
 def _results(
     plan: Plan, folder: Path, *, failed: dict[str, str], workers: int, progress: Progress
 ) -> Iterator[tuple[Run, Figures | str]]:
-    """Figures of the drives in the order of the plan, or why there are none."""
+    """Figures of the drives by each detector, in the order of the plan, or why there are none."""
     ready = [run for run in plan.runs if run.drive.name not in failed]
     for run in [run for run in ready if run.twin in failed]:
         yield run, f"the drive without attack failed: {failed[run.twin]}"
     ready = [run for run in ready if run.twin not in failed]
-    tasks = [_Task(row, _case(run, plan=plan, folder=folder)) for row, run in enumerate(ready)]
+    both = [(run, name) for name in plan.measure.detector for run in ready]
+    tasks = [_Task(row, _case(run, name, plan=plan, folder=folder)) for row, (run, name) in enumerate(both)]
+    several = len(plan.measure.detector) > 1
     found: dict[int, Figures | str] = {}
     progress("defences", 0, total=len(tasks))
     for row, frames, absent, error in run_tasks(_measured, tasks, workers=workers):
-        found[row] = error or Figures(ready[row], frames, absent)
+        run, name = both[row]
+        found[row] = error or Figures(run, frames, absent, name if several else "")
         progress("defences", len(found), total=len(tasks))
-    for row, run in enumerate(ready):
+    for row, (run, _) in enumerate(both):
         yield run, found[row]
 
 
@@ -108,14 +115,17 @@ class _Task:
     case: Case
 
 
-def _case(run: Run, *, plan: Plan, folder: Path) -> Case:
+def _case(run: Run, detector: str, *, plan: Plan, folder: Path) -> Case:
     drives = folder.absolute() / "drives"
+    identity = read_detector(detector).identity
+    own = "" if identity == RULES.identity else f".{identity.rpartition(' ')[2]}"
     return Case(
         drives / run.drive.name,
         drives / run.twin if run.attack is not None else None,
-        folder.absolute() / "figures" / f"{run.drive.name}.json",
+        folder.absolute() / "figures" / f"{run.drive.name}{own}.json",
         plan.defences,
         plan.measure.score,
+        detector,
     )
 
 

@@ -17,6 +17,7 @@ from lidar.defences.physics import Physics
 from lidar.defences.reading import SEEN, read_scans
 from lidar.defences.registry import defence_names, read_defences
 from lidar.defences.run import DETECTOR
+from lidar.detection.registry import read_detector
 from lidar.errors import DatasetError, InputError
 from lidar.integrity.watermark import Watermark
 from lidar.options import ApplyOptions, DriveOptions
@@ -295,3 +296,23 @@ def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
         assert refused.returncode == 2, extra
         assert message in refused.stderr
         assert refused.stderr.count("\n") == 1
+
+
+def test_thresholds_are_of_the_same_detector(plain, tmp_path):
+    out = tmp_path / "learned.toml"
+    words = ("--defence", "shadow", "--detector", "learned")
+    assert run_program("lidar", "defend", plain, *words, "--calibrate", "-o", out).returncode == 0
+    made = read_calibration(out, detector=read_detector("learned"))
+    assert made.detector.startswith("model ")
+    assert run_program("lidar", "defend", plain, *words, "--calibration", out).returncode == 0
+    wrong = run_program("lidar", "defend", plain, "--defence", "shadow", "--calibration", out)
+    assert wrong.returncode == 2
+    assert wrong.stderr.count("\n") == 1
+    assert "--calibrate" in wrong.stderr
+
+
+def test_boxes_are_those_of_the_chosen_detector(plain):
+    dataset, learned = open_dataset(plain), read_detector("learned")
+    (rules,), (other,) = read_scans(dataset), read_scans(dataset, detector=learned)
+    np.testing.assert_array_equal(other.frame(0).objects.centre, learned.detect(rules.frame(0)).centre)
+    assert len(other.frame(0).members) == len(other.frame(0).objects)

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
+from geoscene.classes import Class
 from geoscene.scene import Scene
 from lidar.errors import InputError
 from lidar.redteam import redteam
 from lidar.redteam.evaluate import Figures, evaluated
+from lidar.redteam.measure import KIND_OF
 from lidar.redteam.plan import Attack, Measure, Run, read_plan
 from lidar.redteam.report import setting_tables
 from lidar.redteam.statistics import rate
@@ -78,6 +80,9 @@ def test_each_drive_has_one_without_attack(written: Callable[..., Path]) -> None
         (PHANTOM + "[measure]\nscore = 2", "score = 2"),
         (PHANTOM + "[measure]\nrate = 2", "unknown rate"),
         (PHANTOM + "[more]\na = 1", "unknown more"),
+        (PHANTOM + '[measure]\ndetector = "rulez"', "give rules, learned, or the file of a model"),
+        (PHANTOM + '[measure]\ndetector = ["rules", "rules"]', "give one or more that differ"),
+        (PHANTOM + "[measure]\ndetector = 3", "give a name or a list of names"),
     ],
 )
 def test_a_file_with_an_error_is_refused(written: Callable[..., Path], rest: str, message: str) -> None:
@@ -300,6 +305,25 @@ def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> Non
     again = redteam(file, tmp_path / "out", workers=2)
     assert [path.stat().st_mtime_ns for path in figures] == times
     np.testing.assert_equal(again.matrix.success, first.matrix.success)
+
+
+def test_detectors_stand_side_by_side_on_the_same_drives(
+    written: Callable[..., Path], tmp_path: Path
+) -> None:
+    use = '[defences]\nuse = ["shadow"]\n[measure]\ndetector = ["rules", "learned"]\n'
+    found = redteam(written(PHANTOM + use), tmp_path / "out")
+    assert found.failed == {}
+    assert len(found.drives) == 2
+    assert len(list((tmp_path / "out" / "figures").iterdir())) == 4
+    assert [row.setting["detector"] for row in found.matrix.success] == ["rules", "learned"]
+    alone = redteam(written(PHANTOM + '[defences]\nuse = ["shadow"]'), tmp_path / "out")
+    assert alone.matrix.success[0].success == found.matrix.success[0].success
+    assert "detector" not in alone.matrix.success[0].setting
+
+
+def test_riders_are_road_users_that_a_detector_can_find() -> None:
+    assert KIND_OF["cyclist"] == KIND_OF["motorcyclist"] == KIND_OF["bicycle"] == "cycle"
+    assert all(name.upper() in Class.__members__ for name in KIND_OF)
 
 
 def test_the_program_names_what_it_cannot_measure(written: Callable[..., Path], tmp_path: Path) -> None:
