@@ -167,7 +167,7 @@ def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure:
                 found.detection.extend(
                     _detections(mine, plain, attack=attack, measure=measure, known=known, thresholds=chosen)
                 )
-    rank = _ranks(found.success)
+    rank = _ranks([row for row in found.success if row.scene == "all"])
     found.success.sort(key=lambda row: rank[row.attack])
     found.detection.sort(key=lambda row: rank[row.attack])
     return found
@@ -378,6 +378,8 @@ def _detections(
             if not samples.attacked.any() and level == "objects":
                 continue
             found = score(samples, threshold=threshold, rng=generator(_SEED, attack.name, defence, level))
+            if min(map(_blocks, (samples.genuine, samples.attacked))) < 2:  # one block tells no spread
+                found = replace(found, auc=(found.auc[0], math.nan, math.nan))
             latencies = [_latency(one, defence, threshold=thresholds[defence, "frames"]) for one in attacked]
             tried = [late for late in latencies if late is not None]
             heard = [late for late in tried if math.isfinite(late)]
@@ -399,7 +401,12 @@ def _detections(
 def _share(share: float, count: int, *, blocks: Any) -> Rate:
     if not count:
         return rate(0, 0, blocks=0)
-    return rate(round(share * count), count, blocks=int(np.count_nonzero(blocks.any(axis=1))))
+    return rate(round(share * count), count, blocks=_blocks(blocks))
+
+
+def _blocks(counts: Any) -> int:
+    """Number of blocks that have samples."""
+    return int(np.count_nonzero(counts.any(axis=1)))
 
 
 def _latency(one: Figures, defence: str, *, threshold: float) -> float | None:

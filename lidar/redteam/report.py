@@ -99,7 +99,7 @@ def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequ
     parts = [
         f"<p>{_METHOD.format(m=measure, frames=frames, objects=objects)}</p>",
         *(f"<p>Not measured: {name}: {reason}</p>" for name, reason in failed.items()),
-        *(f"<p>Defence {name}: some drives lack the data that it needs.</p>" for name in absent),
+        *([f"<p>Some drives lack the data of defences: {', '.join(absent)}.</p>"] if absent else []),
         "<h2>Success of attacks</h2>",
         _success_table(pooled, plan.attacks),
         html_picture(_success_picture(pooled.success, plan.attacks), alt="Success of attacks"),
@@ -276,7 +276,9 @@ def _area_matrix(rows: Sequence[Detection]) -> str:
 
 def _area(area: tuple[float, float, float]) -> str:
     value, low, high = area
-    return "–" if math.isnan(value) else f"{value:.2f} ({low:.2f} to {high:.2f})"
+    if math.isnan(value):
+        return "–"
+    return f"{value:.2f}" if math.isnan(low) else f"{value:.2f} ({low:.2f} to {high:.2f})"
 
 
 def _curves(rows: Sequence[Detection], *, allowed: float) -> str:

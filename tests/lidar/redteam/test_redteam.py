@@ -247,6 +247,23 @@ def test_settings_stand_side_by_side_and_attacks_are_ordered(written: Callable[.
     assert tables["Attacked frames with an alarm: weak"][1] == [[1.0, 1.0]]
 
 
+def test_areas_of_one_block_have_no_interval(written: Callable[..., Path]) -> None:
+    drives = read_grid(written("", grid="seed = [1, 2]"))
+    attack = Attack("phantom", "inject", "forge")
+    found = {}
+    for seconds in (1, 3):
+        plain = [_frame(k / 10, suspicion=k / 100) for k in range(10 * seconds)]
+        changed = [_frame(k / 10, suspicion=0.05 + k / 100, forged=1) for k in range(10 * seconds)]
+        figures = [
+            Figures(Run(drives[0], None, {}, drives[0].name), plain, []),
+            Figures(Run(drives[1], attack, {}, drives[0].name), changed, []),
+        ]
+        found[seconds] = evaluated(figures, [attack], measure=Measure()).detection[0].score.auc
+    assert np.isfinite(found[1][0])
+    assert np.isnan(found[1][1:]).all()
+    assert np.isfinite(found[3]).all()
+
+
 SPOOFED = """
 [[attack]]
 name = "cube"
