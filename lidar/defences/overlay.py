@@ -30,7 +30,7 @@ _LEVELS = 6
 _BANDS = 3
 """Bands of rows of an outline in which colours are compared."""
 _SHOWN = 0.7
-"""Share of an object's returns that must be in the image."""
+"""Share of an object's returns that must be in the image, where it is neither saturated nor black."""
 _SMALLEST = 6.0
 """Pixels, height and width of the smallest outline that is judged."""
 
@@ -89,13 +89,15 @@ class Overlay(Defence):
         return found
 
     def evidence(self, frame: Observation, row: int, *, picture: Picture) -> Evidence | None:
-        """What a picture says of a box; None if it does not show it, or too small or at another time."""
+        """What a picture says of a box; None if it shows it not, too small, blinded or at another time."""
         body = frame.members[row]
         if len(body) < 4 or np.abs(frame.time_ns[body] - picture.time_ns).min() > 1e9 * self.lag:
             return None
         pixels = projected(frame, body, picture=picture)
         with np.errstate(invalid="ignore"):
-            shown = ((pixels >= 0) & (pixels < [picture.camera.width, picture.camera.height])).all(axis=1)
+            within = (pixels >= 0) & (pixels < [picture.camera.width, picture.camera.height])
+        shown = within[:, 0] & within[:, 1]
+        shown[shown] = _tells(picture, pixels[shown])
         if shown.mean() < _SHOWN:
             return None
         corners = hull_of(pixels[shown])
@@ -128,6 +130,14 @@ class Overlay(Defence):
         columns = np.clip(np.round(at[:, :, 0]).astype(int), 0, image.shape[1] - 1)
         across = np.abs(np.einsum("skc,sc->sk", image[rows, columns], normals)).max(axis=1)
         return float((across / (across + self.edge)).mean())
+
+
+def _tells(picture: Picture, pixels: Float) -> NDArray[np.bool_]:
+    """Whether pixels (n, 2) within a picture are neither saturated nor black, as by a lamp or a loss."""
+    column, row = pixels.astype(int).T
+    rgb = picture.rgb()[row, column]
+    found: NDArray[np.bool_] = ~((rgb == 255).all(axis=1) | (rgb == 0).all(axis=1))
+    return found
 
 
 def suspicion_of(evidence: Evidence) -> float:

@@ -329,6 +329,18 @@ def test_the_camera_confirms_a_car_that_it_sees_and_rejects_one_that_it_does_not
     assert judged(Overlay(), late).frame == 0, "a picture of another time says nothing"
 
 
+@pytest.mark.parametrize("level", [0, 255])
+def test_a_blinded_camera_or_lost_rows_say_nothing_of_an_object(frame, tmp_path, level):
+    attacked, _ = with_car(frame, (10.0, 1.0, -0.98), points=150)
+    road = drawn(tmp_path / "road.png")
+    assert judged(Overlay(), replace(attacked, pictures=(road,))).objects.max() > 0.45
+    write_png(tmp_path / "blind.png", np.full((FRONT.height, FRONT.width, 3), level, np.uint8))
+    blinded = replace(attacked, pictures=(replace(road, file=tmp_path / "blind.png"),))
+    verdict = judged(Overlay(), blinded)
+    assert verdict.objects.max() == 0
+    assert not Overlay().pictures(blinded, verdict, threshold=0.4)
+
+
 def with_fixes(frames, *, spoofed=(0.0, 0.0), gyro_z=0.0):
     """Frames with RTK fixes that drift away at a speed (m/s east and north) and a gyroscope."""
     rng, path = np.random.default_rng(1), frames[0].trajectory
