@@ -4,27 +4,31 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.csv_tables import write_columns
+from lidar.camera.png import read_png
 from lidar.dataset.derived import check_target, complete_folder
-from lidar.dataset.formats import FORMATS, LABELS
+from lidar.dataset.formats import FORMATS, LABELS, read_table
+from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
 from lidar.dataset.signable import signed_files
+from lidar.dataset.truth_files import read_truth
 from lidar.errors import InputError
+from lidar.signal.run import changed_pixels, cloud_truth, unaltered, write_truth
 from lidar.time_scales import iso_times
 
 TRUTH = "tamper.truth.csv"
 """File of a tampered dataset that tells what was done; not for defences."""
 
-_DATA = {
-    *("deskewed", "rgb", *(form.folder or form.name for form in FORMATS.values())),
-    *(row.folder for row in LABELS.values()),
-}
+_LABELS = {row.folder for row in LABELS.values()}
+_DATA = {"deskewed", "rgb", *(form.folder or form.name for form in FORMATS.values()), *_LABELS}
 """Folders of a sensor whose files are measurements; boxes, depth and classes stay those of the true world."""
 
 _REPLACED = re.compile(r"([^:=]+):(\d+)(?:-(\d+))?=(\d+)")
@@ -93,8 +97,9 @@ def tamper(
     freeze : repeat the first of the other frames
     shifts : sensor and nanoseconds; its frames or samples carry later time stamps
 
-    The truth is in `TRUTH`. Raises InputError and DatasetError for frames or sensors that there are not, and
-    InputError for those that are given twice.
+    The truth is in `TRUTH`; what stages did to a frame (``truth/``) goes along with its files. Raises
+    InputError and DatasetError for frames or sensors that there are not, and InputError for those that are
+    given twice.
     """
     source, out, moved = Path(source), Path(out), dict[str, int]()
     for name, shift in shifts:
@@ -114,6 +119,9 @@ def tamper(
         shutil.copytree(dataset.path, part, dirs_exist_ok=True)
         for name, path in copies.items():
             shutil.copyfile(path, part / name)
+        for place, truth in _truths(dataset, other, copies=copies):
+            (part / place).parent.mkdir(parents=True, exist_ok=True)
+            write_truth(part / place, truth)
         for table, columns in stamps.values():
             write_columns(part / table, columns)
         names = ("what", "file", "source", "shift_ns")
@@ -145,6 +153,40 @@ def _copies(
                     raise InputError(f"`replace`: {path} is missing; give other frames or another `by`")
                 found[name] = path
     return found
+
+
+def _truths(
+    dataset: Dataset, other: Dataset, *, copies: Mapping[str, Path]
+) -> Iterator[tuple[Path, dict[str, NDArray[Any]]]]:
+    """Paths, in this dataset, and columns of the truth of the stages that acted on frames put into it.
+
+    A frame that no stage has changed gets a truth file, which says so, where the replaced one has one.
+    """
+    frames = {
+        (Path(name).parts[0], _number(Path(name))): path
+        for name, path in copies.items()
+        if Path(name).parts[1] not in _LABELS
+    }
+    for (sensor, frame), path in frames.items():
+        truth = dataset.paths.truth(sensor, frame)
+        columns = read_truth(other.paths.truth(sensor, _number(path)))
+        if columns is None and truth.exists():
+            columns = _untouched(path)
+        if columns is not None:
+            yield truth.relative_to(dataset.path), columns
+
+
+def _number(path: Path) -> int:
+    """Number of the frame of a file."""
+    return int(re.split(r"[._]", path.name)[0])
+
+
+def _untouched(path: Path) -> dict[str, NDArray[Any]]:
+    """The truth of a cloud or an image that no stage has changed."""
+    if path.suffix == ".png":
+        rgb = read_png(path).astype(np.uint8)
+        return changed_pixels(rgb, rgb)
+    return cloud_truth(unaltered(table_cloud(read_table(path))), start_ns=0)
 
 
 def _shifted(dataset: Dataset, name: str, *, shift_ns: int) -> tuple[str, Mapping[str, list[str]]]:

@@ -198,15 +198,20 @@ def cloud_truth(
 
 
 def image_truth(image: Frame, original: Frame) -> dict[str, NDArray[Any]]:
-    """What stages did to the colours of an image.
+    """What stages did to the colours of an image, as `changed_pixels`."""
+    assert image.rgb is not None  # noqa: S101
+    assert original.rgb is not None  # noqa: S101
+    return changed_pixels(image.rgb, original.rgb)
+
+
+def changed_pixels(rgb: NDArray[np.uint8], original: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """What stages did to colours (h, w, 3).
 
     changed : (h, w) bool
     removed : (k, 3) uint8, the colours of the changed pixels without stages, row by row
     """
-    assert image.rgb is not None  # noqa: S101
-    assert original.rgb is not None  # noqa: S101
-    changed = (image.rgb != original.rgb).any(axis=2)
-    return {"changed": changed, "removed": original.rgb[changed]}
+    changed = (rgb != original).any(axis=2)
+    return {"changed": changed, "removed": original[changed]}
 
 
 def image_past(image: Frame, truth: Mapping[str, NDArray[Any]] | None) -> Frame:

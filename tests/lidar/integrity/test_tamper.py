@@ -1,19 +1,43 @@
 """Replaced files and shifted time stamps: what changes, what a hash chain says, and bad input."""
 
 import csv
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.programs import run_program
 
+from lidar.apply import apply_stages
+from lidar.camera.png import read_png
+from lidar.camera.render import Frame
+from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.truth_files import read_past, read_truth
 from lidar.errors import InputError
 from lidar.integrity.keys import Hmac
-from lidar.options import DriveOptions
+from lidar.options import ApplyOptions, DriveOptions
 from lidar.pipeline import drive
 from lidar.sign import sign_dataset
+from lidar.signal.registry import numbered, read_stage, read_stages
+from lidar.signal.run import image_past
 from lidar.tamper import TRUTH, read_replacement, read_shift, tamper
 from lidar.verify import verify_dataset
+from lidar.weather.setting import read_weather
 
+SMALL_RIG = """
+name = "small"
+[[lidar]]
+name = "top"
+preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
+[[camera]]
+name = "front"
+translation = [3.6, 0.0, 0.8]
+width = 64
+height = 48
+fov_deg = 90.0
+rate_hz = 5.0
+"""
 KEY = Hmac(b"fedcba9876543210")
 
 
@@ -68,6 +92,62 @@ def test_shifted_time_stamps_are_later_and_named(signed, tmp_path):
     assert stamp[2].endswith(".050000000Z")
     (finding,) = verify_dataset(out, signer=KEY).chain.findings
     assert (finding.what, finding.place) == ("changed", "lidar_top/timestamps.csv")
+
+
+SNOW = numbered(read_stage(one.table()) for one in read_weather("snow=10"))
+BLIND = read_stages(["camera_blind:power=30"]).stages
+
+
+@pytest.fixture(scope="module")
+def seen(scene, tmp_path_factory):
+    """A clear drive with a camera, and the same one in snow before a lamp."""
+    folder = tmp_path_factory.mktemp("seen")
+    rig = folder / "small.toml"
+    rig.write_text(SMALL_RIG)
+    options = DriveOptions(rig=str(rig), duration=0.5, workers=1, formats=("pcd", "nuscenes"))
+    options = replace(options, labels=("nuscenes",))
+    for name, stages in (("clear", ()), ("snowy", (*SNOW, *BLIND))):
+        drive(scene, folder / name, options=replace(options, stages=stages))
+    return folder / "clear", folder / "snowy"
+
+
+@pytest.mark.parametrize("by", ["snowy", "clear"])
+def test_the_truth_of_stages_goes_along_with_replaced_frames(seen, tmp_path, by):
+    clear, snowy = seen
+    other = {"snowy": snowy, "clear": clear}[by]
+    out = tmp_path / "b"
+    tamper(snowy, out, replacements=[read_replacement("top:3=1"), read_replacement("front:1=0")], by=other)
+    before, after = (unstaged(folder, frame) for folder, frame in ((other, 1), (out, 3)))
+    assert before == after
+    assert unstaged(out, 2) == unstaged(snowy, 2)
+    pictures = [image_without_stages(folder, frame) for folder, frame in ((other, 0), (out, 1))]
+    np.testing.assert_array_equal(*pictures)
+
+
+def test_stages_can_act_on_replaced_frames(seen, tmp_path):
+    clear, snowy = seen
+    for dataset, by in ((snowy, ""), (snowy, clear), (clear, snowy)):
+        out = tmp_path / f"{dataset.name} by {by and by.name}"
+        tamper(dataset, out, replacements=[read_replacement("top:2-3=0")], by=by)
+        again = out.with_name(f"{out.name} again")
+        apply_stages(out, again, options=ApplyOptions(read_stages(["dropped_packets:loss=0.3"]).stages))
+        source = by or dataset
+        assert unstaged(again, 2) == unstaged(out, 2) == unstaged(source, 0)
+    assert not (tmp_path / "clear by snowy/top/truth/000001.npz").exists()
+
+
+def unstaged(folder, frame):
+    """Places of the returns that the scanner measured, without stages."""
+    cloud = read_cloud(folder / f"top/pcd/{frame:06d}.pcd")
+    past = read_past(folder / f"top/truth/{frame:06d}.npz", cloud)
+    return past.original.xyz.tobytes()
+
+
+def image_without_stages(folder, frame):
+    rgb = read_png(folder / f"front/rgb/{frame:06d}.png")
+    nothing = np.empty(0)
+    truth = read_truth(folder / f"front/truth/{frame:06d}.npz")
+    return image_past(Frame(rgb, nothing, nothing, nothing), truth).rgb
 
 
 @pytest.mark.parametrize(
