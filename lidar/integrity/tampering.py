@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float, Ints
 from lidar.integrity.blocks import SECTORS, BlockTest, block_of, block_test
+from lidar.integrity.linkage import joined, linked_clusters
 from lidar.integrity.watermark import CHAINED, Cells, Decoded, Watermark, earlier
 
 NOISE = 0.001
@@ -170,60 +171,65 @@ def _gaps(
     following = broken + broken[after] + broken[after[after]]
     begins = (broken >= 1) & (following >= (2 if noisy else 1)) & near[order]
     begins &= ~(begins[before] | begins[before[before]])  # those after the first are of the same gap
-    missing = (column - column[before] - 1) % (int(column.max()) + 1)
+    missing = np.maximum((column - column[before]) % (int(column.max()) + 1) - 1, 0)  # 0 of the same pulse
     row = np.flatnonzero(begins)
     for _ in range(CHAINED - 1):  # one time in eight the first return after a gap fits by chance
         row = np.unique(np.where(missing[row] == 0, before[row], row))
-    fill = [_between(points[before[k]], points[k], count=int(missing[k])) for k in row]
-    rings = [np.full(len(filled), ring[k]) for filled, k in zip(fill, row, strict=True)]
-    xyz, ring = np.concatenate([np.empty((0, 3)), *fill]), np.concatenate([ring[:0], *rings])
-    return _places("removed", xyz, ring=ring)
+    fill, gap = _between(points[before[row]], points[row], count=missing[row])
+    return _places("removed", fill, ring=ring[row[gap]])
 
 
-def _between(first: NDArray[np.floating], last: NDArray[np.floating], *, count: int) -> Float:
-    """Points (count, 3) in equal steps of direction and range between two; none if they are far apart."""
+def _between(first: NDArray[np.floating], last: NDArray[np.floating], *, count: Ints) -> tuple[Float, Ints]:
+    """Points (n, 3) in equal steps of direction and range between k pairs of points, and the pair of each.
+
+    count : (k,) points of each pair; none of pairs that are far apart
+    """
     ends = np.stack([first, last]).astype(np.float64)
-    away = np.linalg.norm(ends, axis=1)
-    unit = ends / np.maximum(away[:, None], 1e-9)
-    angle = float(np.arccos(np.clip(unit[0] @ unit[1], -1, 1)))
-    if count < 1 or angle > np.radians(_WIDEST) or angle < 1e-9:
-        return np.empty((0, 3))
-    share = np.arange(1, count + 1)[:, None] / (count + 1)
-    turned = (np.sin((1 - share) * angle) * unit[0] + np.sin(share * angle) * unit[1]) / np.sin(angle)
-    filled: Float = turned * ((1 - share) * away[0] + share * away[1])
-    return filled
+    away = np.linalg.norm(ends, axis=2)
+    unit = ends / np.maximum(away[..., None], 1e-9)
+    angle = np.arccos(np.clip((unit[0] * unit[1]).sum(axis=1), -1, 1))
+    count = np.where((angle <= np.radians(_WIDEST)) & (angle >= 1e-9), count, 0)
+    gap = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(gap)) - np.repeat(np.cumsum(count) - count, count)
+    share = ((number + 1) / (count[gap] + 1))[:, None]
+    turn, (begin, end) = angle[gap, None], unit[:, gap]
+    turned = (np.sin((1 - share) * turn) * begin + np.sin(share * turn) * end) / np.sin(turn)
+    filled: Float = turned * ((1 - share) * away[0, gap, None] + share * away[1, gap, None])
+    return filled, gap
 
 
 def _places(kind: str, xyz: NDArray[np.floating], *, ring: NDArray[np.integer]) -> tuple[Place, ...]:
     """Boxes of clusters of linked points; the largest first."""
-    from scipy.sparse import coo_array  # noqa: PLC0415  (0.2 s)
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    n = len(xyz)
-    if not n:
+    if not len(xyz):
         return ()
-    pairs = _links(xyz, ring)
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    count, cluster = connected_components(graph, directed=False)
-    found = []
-    for number in range(count):
-        own = cluster == number
-        if np.count_nonzero(own) >= _FEWEST:
-            points = xyz[own].astype(np.float64)
-            low, high = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-            rings = int(ring[own].min()), int(ring[own].max())
-            found.append(Place(kind, tuple(low), tuple(high), int(own.sum()), rings))
-    return tuple(sorted(found, key=lambda place: -place.returns))
+    cluster = _clusters(xyz, ring)
+    order = np.argsort(cluster, kind="stable")
+    count = np.bincount(cluster)
+    first = np.cumsum(count) - count
+    points, rings = xyz[order].astype(np.float64), ring[order]
+    low, high, lowest, highest = (
+        least.reduceat(column, first) for column in (points, rings) for least in (np.minimum, np.maximum)
+    )
+    large = np.flatnonzero(count >= _FEWEST)
+    return tuple(
+        Place(
+            kind,
+            tuple(low[k].tolist()),
+            tuple(high[k].tolist()),
+            int(count[k]),
+            (int(lowest[k]), int(highest[k])),
+        )
+        for k in large[np.argsort(-count[large], kind="stable")].tolist()
+    )
 
 
-def _links(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
-    """Pairs (k, 2) of rows of points that are within `_LINK`, or on neighbouring beams at a like range."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (0.2 s)
-
-    near = cKDTree(xyz).query_pairs(_LINK, output_type="ndarray")
+def _clusters(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
+    """Cluster (n,) of points: linked are those within `_LINK`, or on neighbouring beams at a like range."""
+    n, away = len(xyz), np.linalg.norm(xyz, axis=1)
     level = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-9)
     turn = xyz[:, :2] / level[:, None] / np.radians(_TURN)
-    beside = cKDTree(np.column_stack([turn, 0.9 * ring])).query_pairs(1.0, p=np.inf, output_type="ndarray")
-    away = np.linalg.norm(xyz, axis=1)
-    beside = beside[np.abs(away[beside[:, 0]] - away[beside[:, 1]]) <= _DEPTH]
-    return np.concatenate([near, beside])
+    near = linked_clusters(xyz / _LINK, p=2)
+    beside = linked_clusters(np.column_stack([turn, 0.9 * ring, away / _DEPTH]), p=np.inf)
+    rows = np.arange(n)
+    links = np.column_stack([np.append(rows, rows), np.append(n + near, n + near.max() + 1 + beside)])
+    return joined(links, count=int(links.max()) + 1)[:n]

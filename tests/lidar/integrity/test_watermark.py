@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
 
 from lidar.errors import InputError
+from lidar.integrity.linkage import joined, linked_clusters
 from lidar.integrity.tampering import frame_verdict
 from lidar.integrity.watermark import Cells, Watermark, bit_error_rate
 
@@ -207,3 +209,41 @@ def test_an_empty_cloud_and_single_returns_have_a_verdict():
 def test_a_step_out_of_bounds_is_refused():
     with pytest.raises(InputError, match=r"`step` 0: give 0\.0001 to 1 metre"):
         Watermark(b"0123456789abcdef", 0.0)
+
+
+@given(
+    npst.arrays(np.int64, st.tuples(st.integers(1, 60), st.just(3)), elements=st.integers(-32, 32)),
+    st.sampled_from([2, np.inf]),
+)
+@settings(deadline=None)
+def test_clusters_are_chains_of_points_within_a_distance_of_one(eighths, p):
+    points = eighths / 8  # so that distances of exactly 1 are computed as such
+    linked = np.linalg.norm(points[:, None] - points[None], ord=p, axis=2) <= 1
+    same = (
+        own[:, None] == own
+        for own in (linked_clusters(points, p=p), joined(np.argwhere(linked), count=len(points)))
+    )
+    np.testing.assert_array_equal(*same)
+
+
+@pytest.mark.parametrize(("gap", "clusters"), [(0.99, 1), (1.01, 2)])
+def test_dense_walls_are_one_cluster_if_any_two_points_are_within_a_distance_of_one(gap, clusters):
+    """A list of the links would have 300 million rows."""
+    wall = np.random.default_rng(0).uniform(0, 1, (20_000, 3)) * [0.01, 1, 1]
+    other = wall.copy()
+    other[:, 0] += wall[:, 0].max() - wall[:, 0].min() + gap
+    other[0] = wall[np.argmax(wall[:, 0])] + [gap, 0, 0]
+    assert linked_clusters(np.concatenate([wall, other]), p=2).max() + 1 == clusters
+
+
+def test_further_returns_of_a_pulse_are_beside_no_gap():
+    """Their column is that of the return before, not that of a whole turn later."""
+    xyz, cells = scan()
+    both = np.concatenate([xyz, xyz * 1.2])
+    second = replace(cells, echo=np.full(len(xyz), 2, np.uint8))
+    marked = MARK.embedded(both, extended(cells, second))
+    forged = np.arange(3000, 4000, 5)
+    marked[forged] += np.random.default_rng(1).uniform(-0.2, 0.2, (200, 3))
+    verdict = frame_verdict(MARK, marked, cells=extended(cells, second))
+    assert verdict.forged[forged].mean() > 0.8
+    assert sum(place.returns for place in verdict.places if place.kind == "removed") < 200
