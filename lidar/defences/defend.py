@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.csv_tables import write_columns
-from geoscene.files import write_atomically, write_json
+from geoscene.files import atomic_folder, write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.camera.png import write_png
-from lidar.dataset.derived import check_target, complete_folder
+from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset
 from lidar.defences.calibration import Calibration, Joint, calibration_text, tail_of
 from lidar.defences.fusion import FUSED, fused, fused_threshold, joint_of
@@ -33,6 +33,12 @@ from lidar.defences.verdict import Verdict
 from lidar.detection import RULES, Detector
 from lidar.errors import DatasetError, InputError
 from lidar.random_streams import generator
+
+_MARK = "defend.json"
+"""File of a directory of verdicts: the scores."""
+
+_NAMES = rf"{_MARK}|(frames|objects)\.csv|[^/]+/[^/]+/(\d{{6,}}\.npz|\w+/\d{{6,}}_[^/]+\.png)"
+"""Regular expression of the paths of the files of verdicts."""
 
 _Pairs = list[tuple[Float, NDArray[np.bool_]]]
 
@@ -112,7 +118,7 @@ def defend(
     calibration : of the same detector
     detector  : that gives the boxes
     rule      : of `lidar.defences.fusion.FUSIONS`, by which verdicts of several are also fused; none if empty
-    overwrite : write to a directory that is not empty
+    overwrite : replace a directory with former verdicts; other files there are kept
 
     Raises InputError if the data lack what a defence needs, before anything is judged.
     """
@@ -120,7 +126,7 @@ def defend(
     for dataset in datasets:
         if out is not None:
             check_target(out, source=dataset.path, overwrite=overwrite)
-    with nullcontext() if out is None else complete_folder(out) as part:
+    with nullcontext() if out is None else atomic_folder(out, mark=_MARK, names=_NAMES) as part:
         return _defended(
             datasets,
             defences,
@@ -184,9 +190,7 @@ def _defended(
         extra: dict[str, Any] = {"datasets": [str(d.path) for d in datasets], "fusion": rule}
         extra |= {"calibration": calibration.note}
         extra |= {"detector": {"name": detector.name, "identity": detector.identity}}
-        write_json(
-            out / "defend.json", found.document() | extra | {"options": [n.to_json() for n in defences]}
-        )
+        write_json(out / _MARK, found.document() | extra | {"options": [n.to_json() for n in defences]})
     return found
 
 

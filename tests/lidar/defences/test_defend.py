@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
+from geoscene.errors import GeosceneError
 from lidar.apply import apply_stages
 from lidar.dataset.formats import FORMATS, read_table
 from lidar.dataset.layout import open_dataset
@@ -210,6 +211,27 @@ def test_verdicts_are_written_whole_or_not_at_all_and_never_into_the_data(attack
         defend([dataset], chosen, calibration=CALIBRATION, out=tmp_path / "out")
     assert sorted(attacked.rglob("*")) == before
     assert list(tmp_path.iterdir()) == []
+
+
+def test_new_verdicts_replace_former_ones_whole(attacked, tmp_path):
+    dataset, both, out = open_dataset(attacked), read_defences(["physics", "overlay"]), tmp_path / "out"
+    defend([dataset], both, calibration=CALIBRATION, out=out)
+    assert list(out.rglob("overlay/*.png"))
+    (out / "notes.txt").write_text("mine")
+    renamed = tmp_path / "renamed"
+    shutil.copytree(attacked, renamed)
+    chosen = read_defences(["physics"])
+    defend([open_dataset(renamed)], chosen, calibration=CALIBRATION, out=out, overwrite=True)
+    defend([open_dataset(renamed)], chosen, calibration=CALIBRATION, out=tmp_path / "fresh")
+    found, fresh = (
+        {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+        for folder in (out, tmp_path / "fresh")
+    )
+    assert found == fresh | {"notes.txt"}
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("mine")
+    with pytest.raises(GeosceneError, match=r"exists and holds no defend.json; give another folder"):
+        defend([dataset], chosen, calibration=CALIBRATION, out=tmp_path / "mine", overwrite=True)
 
 
 def test_the_map_of_another_place_is_refused(attacked, scene, tmp_path):
