@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.apply import recording_again
 from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import Table, table_cloud
@@ -23,6 +22,7 @@ from lidar.dataset.signable import Signable
 from lidar.errors import FormatError, InputError
 from lidar.integrity.directions import cells_by_direction, is_marked
 from lidar.integrity.watermark import Cells
+from lidar.rerecord import recording_again
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.specs import rig_of

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import recording_again
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format, format_of
@@ -34,6 +33,7 @@ from lidar.integrity.merkle import (
     signed_message,
 )
 from lidar.integrity.watermark import Cells, Watermark
+from lidar.rerecord import recording_again
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.specs import rig_of
 from lidar.sensors.cloud import Cloud

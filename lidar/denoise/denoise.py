@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.apply import recorded_cloud, recording_again, richest_format, write_altered
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.foreign import (
@@ -32,6 +31,7 @@ from lidar.denoise.filters import Bools, Filter
 from lidar.denoise.scores import Tally
 from lidar.errors import DatasetError, InputError
 from lidar.physics.echoes import Origin
+from lidar.rerecord import recorded_cloud, recording_again, richest_format, write_altered
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.specs import rig_of
 from lidar.signal.run import Altered, cloud_truth, unaltered, write_truth
