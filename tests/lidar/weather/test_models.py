@@ -277,6 +277,6 @@ def test_models_without_weather_change_nothing(text):
 
 
 def test_models_have_no_place_and_no_cover_glass():
-    for extra in ("drops=0.1", "radius=50"):
+    for extra in ("drops=0.1", "longitude=7,latitude=50,radius=50"):
         with pytest.raises(InputError, match="needs model physical"):
             stages_of([s.table() for s in read_weather(f"rain=5,model=lisa,{extra}")])
