@@ -178,7 +178,7 @@ def test_an_attack_in_a_second_run_is_that_of_one_run_but_for_what_the_detector_
         one, two = (truth_of(tmp_path / k, frame) for k in ("once", "twice"))
         for kind in (Origin.SURFACE, Origin.INJECTED):
             counts = [np.count_nonzero(t["origin"] == kind) for t in (one, two)]
-            assert abs(counts[0] - counts[1]) <= 0.03 * counts[0], (kind, counts)
+            assert abs(counts[0] - counts[1]) <= 0.08 * counts[0], (kind, counts)
         assert np.setxor1d(one["removed"], two["removed"]).size <= 0.03 * len(one["removed"])
 
 
