@@ -54,6 +54,7 @@ from lidar.rerecord import (
 from lidar.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.rig.scanner import Sensor, load_sensor
 from lidar.rig.specs import GnssSpec, ImuSpec, Rig, rig_of
+from lidar.signal.effects import Counts, Effects
 from lidar.signal.past import Past, truth_since
 from lidar.signal.recorded import altered_recording, recorded_echoes
 from lidar.signal.registry import NamedStage, Stages, dimming, numbered
@@ -72,6 +73,7 @@ class ApplySummary:
     files          : point clouds, images and measurements of receivers and inertial units, as written
     points_in      : returns before the stages
     points         : returns after them
+    effects        : what each stage did
     sight          : what told whether devices of attackers are in sight: rays in the ``scene``, or recorded
         ``returns``; empty without any
     """
@@ -80,6 +82,7 @@ class ApplySummary:
     files: int
     points_in: int
     points: int
+    effects: Counts
     sight: str = ""
 
 
@@ -135,6 +138,9 @@ def _apply_to_dataset(
         _check_images(chosen, rig)
         points = dict(dataset.manifest["points"])
     sensors: list[Scanner | Camera] = [*scanners(rig), *cameras(rig)]
+    last = dict.fromkeys(sensor_kinds(rig), dataset.trajectory().duration_ns / 1e9)
+    last |= {s.name: float(dataset.sample_times(s.name)[-1:].sum()) / 1e9 for s in sensors}
+    chosen.check_start(sensor_kinds(rig), last=last)
     recording = recording_again(dataset, out, stages=chosen)
     contents = recording.contents
     jobs = [
@@ -171,7 +177,8 @@ def _apply_to_dataset(
     recipe |= {"applied_stages": applied, "settings": with_stage_settings(recipe["settings"], stages)}
     write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points})
     sight = ("returns" if around is None else "scene") if has_devices else ""
-    return ApplySummary(out, len(jobs) + len(units), before, sum(points.values()), sight)
+    effects = chosen.effects(recording.effects.counts)
+    return ApplySummary(out, len(jobs) + len(units), before, sum(points.values()), effects, sight)
 
 
 def listed(named: NamedStage, *, seed: int) -> dict[str, Any]:
@@ -191,7 +198,12 @@ def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | I
     """Write the measurements of a receiver or an inertial unit after the stages, and their truth."""
     stages, start, out = recording.contents.stages, recording.start, Paths(recording.out)
     at = situation_of_unit(
-        spec.name, spec.mount, trajectory=recording.trajectory, start=start, seed=recording.contents.seed
+        spec.name,
+        spec.mount,
+        trajectory=recording.trajectory,
+        start=start,
+        seed=recording.contents.seed,
+        effects=recording.effects,
     )
     truth = dataset.paths.measurements_truth(spec.name)
     past = truth if truth.exists() else None
@@ -325,7 +337,10 @@ def _apply_to_clouds(
     acted = read_foreign_stages(source)
     names = [str(table["name"]) for table in acted]
     chosen = Stages(numbered(options.all_stages, after=names), before=dimming(acted))
-    chosen.check({name: "lidar" for name, _ in devices})
+    kinds = {name: "lidar" for name, _ in devices}
+    chosen.check(kinds)
+    chosen.check_start(kinds, last=dict.fromkeys(kinds, 0.0))
+    effects = Effects()
     check_sight(
         chosen, (_place_of(path, form, device=devices[path.parent.name, form.name]) for path, form in clouds)
     )
@@ -337,7 +352,8 @@ def _apply_to_clouds(
         device = devices[path.parent.name, form.name]
         past = read_foreign_past(path, form, source=source, device=device)
         frame = int(stem) if stem.isdigit() else stem
-        at = Situation(device.name, frame, earlier=Former(clouds, done, source=source, device=device).cloud)
+        former = Former(clouds, done, source=source, device=device)
+        at = Situation(device.name, frame, earlier=former.cloud, effects=effects)
         altered = altered_recording(past.cloud, chosen, sensor=device, at=at, sent=None)
         truth = foreign_truth(out, place, form=form)
         for target in (out / place, truth):
@@ -350,7 +366,8 @@ def _apply_to_clouds(
     write_foreign_stages(out, [*acted, *(listed(stage, seed=chosen.seed) for stage in chosen.stages)])
     progress("stages", len(clouds), total=len(clouds))
     has_devices = any(isinstance(named.stage, Attacker) for named in chosen.stages)
-    return ApplySummary(out, len(clouds), before, after, "returns" if has_devices else "")
+    sight = "returns" if has_devices else ""
+    return ApplySummary(out, len(clouds), before, after, chosen.effects(effects.counts), sight)
 
 
 def _place_of(path: Path, form: Format, *, device: Sensor) -> tuple[Situation, Callable[[], Seen]]:

@@ -47,6 +47,7 @@ from lidar.options import (
 if TYPE_CHECKING:
     from lidar.maps.aggregate import MapSummary
     from lidar.scene_cache import OpenedScene
+    from lidar.signal.effects import Counts
 
 app = App(
     name="lidar",
@@ -164,6 +165,7 @@ def drive(
         "length_m": round(summary.length, 2),
         "wall_s": round(summary.wall, 2),
         "stages_s": {name: round(seconds, 3) for name, seconds in summary.stages.items()},
+        **({"effects": summary.effects} if summary.effects else {}),
     }
     if pick or done.reached:
         document["accuracy"] = done.accuracy(options.workers)
@@ -177,6 +179,7 @@ def drive(
             f" {total:,} points{before} in {summary.wall:.1f} s;"
             f" next: {command_line('lidar', 'map', shown(out), '-o', 'map.laz')}"
         )
+        _print_effects(summary.effects if summary.written or not summary.resumed else {})
         if reached := done.to_text():
             print(reached)
     for missed in done.missed():
@@ -189,6 +192,14 @@ def drive(
             file=sys.stderr,
         )
     return 0
+
+
+def _print_effects(effects: Counts) -> None:
+    """Say what each stage did."""
+    from lidar.signal.effects import effect_lines  # noqa: PLC0415
+
+    for line in effect_lines(effects):
+        print(line)
 
 
 def _print_built(found: OpenedScene) -> None:
@@ -512,6 +523,7 @@ def apply(
         print_json({**asdict(summary), "path": str(out)})
     else:
         print(f"{out}: {summary.files} files, {summary.points:,} of {summary.points_in:,} points")
+        _print_effects(summary.effects)
         if summary.sight:
             by = {"scene": "rays in the scene", "returns": "recorded returns, without the scene"}
             print(f"line of sight to devices: by {by[summary.sight]}")

@@ -17,6 +17,7 @@ from lidar.dataset.journal import Journal
 from lidar.dataset.record import record_frame
 from lidar.plan import DrivePlan, Job
 from lidar.rig.devices import Camera, Scanner
+from lidar.signal.effects import Counts
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import Region
 
@@ -49,10 +50,12 @@ class _Done:
 
     frames  : sensor, frame, points, digest
     seconds : by stage
+    effects : what stages of signals did
     """
 
     frames: tuple[tuple[str, int, int, str], ...]
     seconds: dict[str, float]
+    effects: Counts
 
 
 def record_on_cluster(
@@ -84,6 +87,8 @@ def record_on_cluster(
             for sensor, frame, points, digest in result.frames:
                 journal.add(sensor, frame, points=points, digest=digest)
             recording.watch.add(result.seconds)
+            for stage, counts in result.effects.items():
+                recording.effects.add(stage, counts)
             done += len(result.frames)
             progress("driving", done, total=total)
     finally:
@@ -116,6 +121,7 @@ def _recorded(task: _Task) -> _Done:
         _station.plan = task.plan
     recording, worlds = _station.recording, _station.worlds
     recording.watch.seconds.clear()
+    recording.effects.counts.clear()
     with recording.watch.stage("load"):
         worlds.follow(task.region)
     frames = []
@@ -124,4 +130,4 @@ def _recorded(task: _Task) -> _Done:
         points = record_frame(recording, sensor, frame=frame, worlds=worlds)
         with recording.watch.stage("digest"):
             frames.append((sensor.name, frame, points, recording.digest(sensor, frame)))
-    return _Done(tuple(frames), dict(recording.watch.seconds))
+    return _Done(tuple(frames), dict(recording.watch.seconds), dict(recording.effects.counts))

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,7 @@ from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
+from lidar.signal.effects import Counts
 from lidar.signal.situation import Situation
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import Region
@@ -65,6 +66,7 @@ class DriveSummary:
     planning  : seconds of it in which the drive was planned
     recording : seconds of it in which frames were recorded
     stages    : seconds of all threads by stage
+    effects   : what weather, attacks and other stages did in the frames of this run
     """
 
     path: Path
@@ -78,6 +80,7 @@ class DriveSummary:
     planning: float
     recording: float
     stages: dict[str, float]
+    effects: Counts = field(default_factory=dict)
 
 
 def drive(
@@ -156,7 +159,7 @@ def _driven(
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
         journal = _verified(recording, plan.jobs, progress=progress)
-        _write_plan(plan, out, manifest=manifest)
+        _write_plan(plan, recording, manifest=manifest)
         pending = _pending(plan, journal)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
         trim_memory()
@@ -196,6 +199,7 @@ def _driven(
         planning=planning_s,
         recording=recording_s,
         stages=recording.watch.seconds,
+        effects=recording.contents.stages.effects(recording.effects.counts),
     )
 
 
@@ -223,14 +227,14 @@ def trim_memory() -> None:
             trim(0)
 
 
-def _write_plan(plan: DrivePlan, out: Path, *, manifest: dict[str, Any]) -> None:
+def _write_plan(plan: DrivePlan, recording: Recording, *, manifest: dict[str, Any]) -> None:
     """Write all files of the dataset that do not depend on recorded frames."""
-    paths = Paths(out)
+    paths = Paths(recording.out)
     if not paths.manifest.exists():
         write_json(paths.manifest, manifest | {"frames_done": 0})
     write_trajectory(paths.trajectory, plan.trajectory)
     write_metadata(
-        out,
+        recording.out,
         plan.scene,
         rig=plan.rig,
         sensors=plan.sensors,
@@ -238,6 +242,7 @@ def _write_plan(plan: DrivePlan, out: Path, *, manifest: dict[str, Any]) -> None
         start=plan.start,
         frames=plan.frames,
         contents=plan.options.contents(),
+        effects=recording.effects,
     )
 
 

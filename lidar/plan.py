@@ -223,6 +223,9 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     jobs = schedule(sensors, trajectory.duration_ns)
     if sensors and not jobs:
         raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
+    last = dict.fromkeys(sensor_kinds(rig), trajectory.duration_ns / 1e9)
+    last |= {job.sensor.name: job.start_ns / 1e9 for job in jobs}
+    stages.check_start(sensor_kinds(rig), last=last)
     return DrivePlan(
         scene,
         options,

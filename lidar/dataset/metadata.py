@@ -27,6 +27,7 @@ from lidar.navigation.imu import observe_imu
 from lidar.rig.camera_model import intrinsic_matrix
 from lidar.rig.devices import Camera, Scanner
 from lidar.rig.specs import Rig
+from lidar.signal.effects import Effects
 from lidar.time_scales import iso_times
 
 
@@ -125,6 +126,7 @@ def write_metadata(
     start: datetime,
     frames: Mapping[str, int],
     contents: Contents,
+    effects: Effects | None = None,
 ) -> None:
     """Write all files of a dataset but clouds, images and boxes.
 
@@ -159,12 +161,13 @@ def write_metadata(
             folder, mount = paths.sensor(sensor.name), sensor.spec.mount
             write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
     stages = contents.stages
+    situation = partial(situation_of_unit, trajectory=trajectory, start=start, seed=seed, effects=effects)
     for receiver in rig.gnss:
         fixes = observed_fixes(scene, receiver, trajectory=trajectory, start=start, seed=seed)
-        at = situation_of_unit(receiver.name, receiver.mount, trajectory=trajectory, start=start, seed=seed)
+        at = situation(receiver.name, receiver.mount)
         heights = heights_of(scene.frame, fixes)
         record_fixes(paths, fixes, at=at, stages=stages, start=start, heights=heights)
     for unit in rig.imus:
         samples = partial(observe_imu, trajectory, scene.frame, spec=unit, seed=seed)
-        at = situation_of_unit(unit.name, unit.mount, trajectory=trajectory, start=start, seed=seed)
+        at = situation(unit.name, unit.mount)
         record_samples(paths, samples, at=at, stages=stages, start=start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import islice
 from pathlib import Path
@@ -236,9 +236,8 @@ def record_samples(
                 for pair in altered_samples(samples(), stages, at=at)
             ),
         )
-    write_blocks(
-        path, (_sample_columns(rows, start) for rows, _ in altered_samples(samples(), stages, at=at))
-    )
+    again = altered_samples(samples(), stages, at=replace(at, effects=None))  # which are counted already
+    write_blocks(path, (_sample_columns(rows, start) for rows, _ in again))
 
 
 def _sample_columns(rows: Inertial, start: datetime) -> dict[str, Any]:

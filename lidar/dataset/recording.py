@@ -28,6 +28,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.physics.settings import PLAIN as PLAIN_SCANNER
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Camera, Scanner
+from lidar.signal.effects import Effects
 from lidar.signal.registry import NO_STAGES, Stages
 from lidar.world.actors import Actors
 from lidar.world.settings import PLAIN as PLAIN_WORLD
@@ -125,6 +126,7 @@ class Recording:
     geo         : from the scene frame to the export CRS
     contents    : which files are written
     watch       : measures the time of each stage
+    effects     : counts what stages do
     actors      : other road users; None without traffic, and then without boxes
     max_range   : metres from the ego vehicle within which road users get 3D boxes
     scanning_ns : (k, 2) times from and until which scanners work; None for always
@@ -137,6 +139,7 @@ class Recording:
     geo: Georeference
     contents: Contents
     watch: Stopwatch = field(default_factory=Stopwatch)
+    effects: Effects = field(default_factory=Effects)
     actors: Actors | None = None
     max_range: float = 0.0
     scanning_ns: NDArray[np.int64] | None = None

@@ -22,6 +22,7 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.devices import Camera, Scanner
 from lidar.sensors.cloud import Cloud
+from lidar.signal.effects import Effects
 from lidar.signal.situation import Situation
 from lidar.traffic.ground import ground_height
 from lidar.world.world import World
@@ -80,6 +81,7 @@ def situation_of(
         geo=recording.frame,
         ground=ground,
         surroundings=None if surroundings is None else surroundings.around,
+        effects=recording.effects,
     )
 
 
@@ -111,14 +113,20 @@ def surroundings_of(dataset: Dataset) -> Surroundings | None:
 
 
 def situation_of_unit(
-    name: str, mount: Mount, *, trajectory: Trajectory, start: datetime, seed: int
+    name: str,
+    mount: Mount,
+    *,
+    trajectory: Trajectory,
+    start: datetime,
+    seed: int,
+    effects: Effects | None = None,
 ) -> Situation:
     """Where and when a satellite receiver or an inertial unit measures during a drive."""
 
     def poses(time_ns: NDArray[np.int64]) -> Poses:
         return trajectory.at(time_ns).mounted(mount.translation, mount.rotation)
 
-    return Situation(name, 0, utc=start, poses=poses, seed=seed)
+    return Situation(name, 0, utc=start, poses=poses, seed=seed, effects=effects)
 
 
 def light_during(recording: Recording, time_ns: int) -> Light:

@@ -22,9 +22,11 @@ def altered_fixes(fixes: Fixes, stages: Stages, *, at: Situation) -> Fixes:
     found = fixes
     for named in stages.at("fixes", at.sensor):
         rng = named.rng(stages.seed, at.sensor, frame=at.frame)
-        found = cast("FixesStage", named.stage).fixes(found, at=at, rng=rng)
+        before, found = found, cast("FixesStage", named.stage).fixes(found, at=at, rng=rng)
         if len(found) != len(fixes):
             raise LidarError(f"stage {named.name} returned {len(found)} of {len(fixes)} fixes")
+        if at.effects is not None:
+            at.effects.add(named.label, {"fixes changed": fixes_truth(found, before)["changed"].sum()})
     truth = {name: getattr(fixes, name) for name in ("error", "true_lonlath", "true_velocity")}
     return replace(found, **truth)
 
@@ -34,15 +36,17 @@ def altered_samples(
 ) -> Iterator[tuple[Inertial, Inertial]]:
     """Each block of an inertial unit's samples after the stages on them, and as without; truth stays."""
     chosen = [
-        (named.name, cast("SamplesStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame))
+        (named.label, cast("SamplesStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame))
         for named in stages.at("samples", at.sensor)
     ]
     for original in blocks:
         found = original
         for name, stage, rng in chosen:
-            found = stage.samples(found, at=at, rng=rng)
+            before, found = found, stage.samples(found, at=at, rng=rng)
             if len(found) != len(original):
                 raise LidarError(f"stage {name} returned {len(found)} of {len(original)} samples")
+            if at.effects is not None:
+                at.effects.add(name, {"samples changed": samples_truth(found, before)["changed"].sum()})
         yield replace(found, true_gyro=original.true_gyro, true_accel=original.true_accel), original
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from lidar.errors import InputError
 from lidar.random_streams import generator
+from lidar.signal.effects import Counts
 from lidar.signal.stage import Stage, parameter_rows
 
 _STAGES = {
@@ -71,6 +72,11 @@ class NamedStage:
         own = seed if self.seed is None else self.seed
         return generator(own, "stage", self.name, self.number, sensor, frame)
 
+    @property
+    def label(self) -> str:
+        """Its name, and its number if an earlier stage has the same."""
+        return f"{self.name} {self.number + 1}" if self.number else self.name
+
     def to_json(self) -> dict[str, Any]:
         """What `read_stage` reads."""
         extra = {"seed": self.seed, "sensor": self.sensor}
@@ -124,6 +130,27 @@ class Stages:
                 raise InputError(
                     f"stage {named.name} acts on a {' or '.join(sorted(kinds))}, and there is none"
                 )
+
+    def check_start(self, sensors: Mapping[str, str], *, last: Mapping[str, float]) -> None:
+        """Raise InputError for a stage that starts when all sensors that it acts on have measured.
+
+        sensors : kind by name
+        last    : start of the last frame, or last measurement, seconds since the drive's start, by name
+        """
+        for named in self.stages:
+            start, alone = getattr(named.stage, "start", 0.0), Stages((named,))
+            ends = [last[name] for name, kind in sensors.items() if alone.act_on(name, kind=kind)]
+            if ends and start > max(ends):
+                raise InputError(
+                    f"stage {named.name}: start = {start:g} s is after the last measurement, at"
+                    f" {max(ends):g} s (clouds of KITTI and nuScenes count as of 0 s); let it start earlier"
+                )
+
+    def effects(self, counts: Counts) -> Counts:
+        """What each of them did, nothing of those that are not in ``counts``; not of objects in the scene."""
+        seams = SEAMS.keys() - {"scene"}
+        acting = [named for named in self.stages if any(hasattr(named.stage, seam) for seam in seams)]
+        return {named.label: counts.get(named.label, {}) for named in acting}
 
 
 NO_STAGES = Stages()

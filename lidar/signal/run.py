@@ -21,6 +21,7 @@ from lidar.physics.echoes import Echoes, Origin, TracedEchoes, mixed, traced
 from lidar.random_streams import generator
 from lidar.sensors.cloud import Cloud, TracedCloud
 from lidar.sensors.scan import Sweep, detect, deviates_of, report
+from lidar.signal.effects import row_changes
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
@@ -97,9 +98,12 @@ def altered_echoes(
     situation = replace(at, clearness=clearness)
     for named in acting:
         stage, rng = cast("EchoStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame)
-        echoes = stage.echoes(pulses, echoes, at=situation, rng=rng)
+        before, echoes = echoes, stage.echoes(pulses, echoes, at=situation, rng=rng)
         if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
             raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
+        if at.effects is not None:
+            found = row_changes(before, echoes, unit="echoes", columns=("range", "apparent"))
+            at.effects.add(named.label, found)
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
     return mixed(echoes, is_new, pulses=len(pulses), separation=pulses.sensor.echo_separation)
 
@@ -134,7 +138,10 @@ def altered_cloud(cloud: TracedCloud, stages: Stages, *, at: Situation) -> Trace
     """A cloud after the stages on it."""
     for named in stages.at("cloud", at.sensor):
         rng = named.rng(stages.seed, at.sensor, frame=at.frame)
-        cloud = cast("CloudStage", named.stage).cloud(cloud, at=at, rng=rng)
+        before, cloud = cloud, cast("CloudStage", named.stage).cloud(cloud, at=at, rng=rng)
+        if at.effects is not None:
+            found = row_changes(before, cloud, unit="returns", columns=("xyz", "intensity"))
+            at.effects.add(named.label, found)
     moved = (cloud.origin == Origin.MOVED) & (cloud.hidden < 0)
     return replace(cloud, hidden=np.where(moved, cloud.source, cloud.hidden))
 
@@ -143,7 +150,11 @@ def altered_image(image: Frame, stages: Stages, *, at: Situation) -> Frame:
     """An image with colours after the stages on it."""
     for named in stages.at("image", at.sensor):
         rng = named.rng(stages.seed, at.sensor, frame=at.frame)
+        before = image
         image = replace(image, rgb=cast("ImageStage", named.stage).image(image, at=at, rng=rng).rgb)
+        if at.effects is not None:
+            changed = int(image_truth(image, before)["changed"].any())
+            at.effects.add(named.label, {"images changed": changed})
     return image
 
 

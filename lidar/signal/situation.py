@@ -15,6 +15,7 @@ from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
 from lidar.rig.specs import CameraSpec
 from lidar.sensors.cloud import Cloud
+from lidar.signal.effects import Effects
 from lidar.world.world import World
 
 
@@ -43,6 +44,7 @@ class Situation:
     earlier  : the cloud of the same scanner a number of frames (1 or more) before, as without stages; None
         before the first frame. On drives it reaches back for the seconds of `Stage.lookback`. None for
         sensors that are not scanners
+    effects  : counts what the stages do; None where nobody asks
     """
 
     sensor: str
@@ -55,6 +57,7 @@ class Situation:
     camera: CameraSpec | None = None
     light: Light | None = None
     earlier: Callable[[int], Cloud | None] | None = None
+    effects: Effects | None = None
     geo: Frame | None = None
     clearness: Callable[[int, float], float] | None = None
     ground: Callable[[float, float], float] | None = None

@@ -112,7 +112,7 @@ def assert_same_truth(one, other):
         ([WALL], ["dropped_packets:loss=0.2", "perturb:bound=0.1,share=0.2"]),
         (["cover_glass:transmission=0.9"], ["lost_rows:loss=0.5,rows=4"]),
         (["lost_rows:loss=0.3,rows=4"], ["lost_rows:loss=0.3,rows=4"]),
-        (["gnss_spoof:left=5"], ["gnss_spoof:left=-8"]),
+        (["gnss_spoof:left=5,start=0"], ["gnss_spoof:left=-8,start=0.1"]),
     ],
 )
 def test_two_runs_give_what_one_with_both_gives(plain, tmp_path, first, second):
