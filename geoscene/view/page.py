@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import html
-import re
-from base64 import b64encode
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
-from string import Template
 from typing import IO, Any
 
 import numpy as np
@@ -17,19 +13,21 @@ from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import attribution, read_features
-from geoscene.files import append, atomic_file, spool
+from geoscene.files import atomic_file, spool
 from geoscene.options import Degrees, ViewOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Bools, Ints
+from geoscene.view.assembly import check_page, gzip, linked, part, script_text, write_blob, write_page
 from geoscene.view.attributes import tables
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
-from geoscene.view.tiles import Groups, groups_of, gzip, only, pack_shapes, pack_tile
+from geoscene.view.tiles import Groups, groups_of, only, pack_shapes, pack_tile
 
-SCRIPTS = ("data.js", "camera.js", "shaders.js", "draw.js", "panel.js", "main.js")
+SCRIPTS = (
+    *("blob.js", "camera.js", "gestures.js", "program.js"),
+    *("data.js", "shaders.js", "draw.js", "panel.js", "main.js"),
+)
 """The viewer's parts, in the order in which they are joined."""
-
-_COPYRIGHT = "https://www.openstreetmap.org/copyright"
 
 
 def view_scene(
@@ -50,7 +48,7 @@ def view_scene(
     """
     out = Path(out)
     scene.require("tiles", "tables")
-    _check(out, overwrite=overwrite)
+    check_page(out, overwrite=overwrite)
     bounds_deg, layers, max_mb = options.bounds_deg, options.layers, options.max_mb
     chosen = _tiles_within(scene, bounds_deg)
     chosen = chosen[np.lexsort([chosen[:, 1], chosen[:, 0], _rings(chosen)])]  # from the middle outwards
@@ -62,7 +60,7 @@ def view_scene(
     ends: list[int] = []
     faces = 0
     with atomic_file(out) as file, spool(out) as blobs:
-        _blob(blobs, "shapes", data=shape_bytes)
+        write_blob(blobs, "shapes", data=shape_bytes)
         for done, (i, j, _) in enumerate(chosen.tolist()):
             progress("page", done, total=len(chosen))
             tile = only(scene.tile(i, j), groups, kept=kept)
@@ -71,11 +69,11 @@ def view_scene(
                 present[column[column >= 0]] = True
             entry, data = pack_tile(tile, groups)
             tiles.append({"index": [i, j], **entry})
-            _blob(blobs, f"tile-{done}", data=data)
+            write_blob(blobs, f"tile-{done}", data=data)
             ends.append(blobs.tell())
             if blobs.tell() > max_mb * 1e6:
                 break
-        _blob(blobs, "attributes", data=gzip(compact_json(tables(read_features(scene), present))))
+        write_blob(blobs, "attributes", data=gzip(compact_json(tables(read_features(scene), present))))
         if blobs.tell() > max_mb * 1e6:
             raise InputError(_too_large(scene, chosen, sizes=ends, size=blobs.tell(), max_mb=max_mb))
         head = _head(scene, tiles, groups=groups, shapes=shapes)
@@ -94,15 +92,6 @@ def view_scene(
     return Summary.of(out, "html", objects=count, faces=faces, crs=crs, notes=tuple(notes))
 
 
-def _check(out: Path, *, overwrite: bool) -> None:
-    if out.is_dir():
-        raise InputError(f"{out}: is a folder; name a file such as page.html")
-    if out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"{out}: unknown suffix; a page is a file such as {out.with_suffix('.html').name}")
-    if out.exists() and not overwrite:
-        raise InputError(f"{out}: exists already; set `overwrite` to replace it")
-
-
 def _kept(groups: Groups, layers: Sequence[str]) -> Bools:
     """Groups (n,) to include in the page."""
     if unknown := sorted(set(layers) - set(groups.names)):
@@ -114,24 +103,12 @@ def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[byte
     """Write the page: the template with its placeholders filled in and the bytes of the scene."""
     words = {
         "title": html.escape(str(head["name"])),
-        "credit": _linked(attribution(scene)),
-        "style": _part("page.css"),
-        "scene": compact_json(head).decode().replace("<", "\\u003c"),
-        "script": "\n".join(_part(name) for name in SCRIPTS),
+        "credit": linked(attribution(scene)),
+        "style": part("page.css"),
+        "scene": script_text(compact_json(head).decode()),
+        "script": "\n".join(part(name) for name in SCRIPTS),
     }
-    before, after = (Template(half).substitute(words).encode() for half in _part("page.html").split("$blobs"))
-    file.write(before)
-    append(file, blobs)
-    file.write(after)
-
-
-def _part(name: str) -> str:
-    return resources.files("geoscene.view").joinpath("page", name).read_text("utf-8")
-
-
-def _blob(file: IO[bytes], name: str, *, data: bytes) -> None:
-    """Bytes as an element of the page that browsers neither run nor display."""
-    file.write(f'<script type="text/plain" id="{name}">'.encode() + b64encode(data) + b"</script>\n")
+    write_page(file, part("page.html"), words=words, blobs=blobs)
 
 
 def _tiles_within(scene: Scene, bounds_deg: Degrees | None) -> Ints:
@@ -222,9 +199,3 @@ def _head(
         "shapes": shapes,
         "tiles": tiles,
     }
-
-
-def _linked(text: str) -> str:
-    """Text as HTML with a link to OpenStreetMap's copyright page."""
-    link = f'<a href="{_COPYRIGHT}" target="_blank" rel="noopener">openstreetmap.org/copyright</a>'
-    return re.sub(re.escape(_COPYRIGHT), link, html.escape(text)).replace("(c)", "©")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +13,7 @@ from geoscene.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints
+from geoscene.view.assembly import gzip
 
 STEP = 1 / 128
 """Quantisation step of vertices in metres; a power of two, so that tiles share one grid and
@@ -29,12 +29,6 @@ GROUND = "ground"
 """Name of the group of ground faces other than roads: bare terrain, land cover, building pads."""
 
 _WITHIN = {"building_parts": "buildings", "landcover": GROUND, "roads": "road_surfaces"}
-
-
-def gzip(data: bytes) -> bytes:
-    """Gzip bytes (RFC 1952) without a time stamp: equal data give equal bytes."""
-    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
-    return packer.compress(data) + packer.flush()
 
 
 @dataclass(frozen=True, slots=True)

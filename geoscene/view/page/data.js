@@ -1,16 +1,5 @@
 // The scene as typed arrays.
 
-/** The inflated bytes of an element of the page, which is removed. */
-async function blobOf(id) {
-  const element = document.getElementById(id);
-  const text = atob(element.textContent);
-  element.remove();
-  const bytes = new Uint8Array(text.length);
-  for (let k = 0; k < bytes.length; k++) bytes[k] = text.charCodeAt(k);
-  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  return new Response(stream).arrayBuffer();
-}
-
 /** Bytes of a vertex of the graphics card: position 4 x u16, feature i32, normal 4 x i8, codes and colour 4 x u8. */
 const VERTEX_BYTES = 24;
 

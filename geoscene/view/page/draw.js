@@ -13,7 +13,7 @@ class Renderer {
     this.hidden = new Set();
     this.programs = {};
     for (const pass of ["VIEW", "PICK", "DEPTH"])
-      this.programs[pass] = [programOf(gl, pass), programOf(gl, pass, "COPIES")];
+      this.programs[pass] = [programOf(gl, VERTEX, FRAGMENT, pass), programOf(gl, VERTEX, FRAGMENT, pass, "COPIES")];
     const onCard = (shape) => ({
       bytes: this.buffer(vertexBytes(shape, 1)), positions: this.buffer(shapePositions(shape)), count: shape.corners.length,
     });
