@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from geoscene.console import (
     print_json,
     progress_bar,
     whole,
+    with_flags,
 )
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError
@@ -40,6 +41,7 @@ from lidar.options import (
     ExportOptions,
     MapOptions,
     PlaceOptions,
+    PlaybackOptions,
     SignOptions,
     TradeoffOptions,
 )
@@ -440,6 +442,87 @@ def map_(
 def _left_out(summary: MapSummary) -> dict[str, int]:
     """Numbers of returns that a map leaves out, by what they are of."""
     return {"noise": summary.noise, "moving": summary.moving, "classes": summary.without}
+
+
+@app.command
+def view(
+    dataset: Path,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    options: PlaybackOptions = PlaybackOptions(),
+    serve: bool = False,
+    port: int = 8765,
+    open3d: bool = False,
+    report: Reporting = Report(),
+) -> int:
+    """Play a drive in a browser: the point cloud in step with images, boxes, plan and speed.
+
+    For example:
+
+    lidar view drive -o page.html
+
+    lidar view drive -o short.html --frames 0:100 --every 2
+
+    lidar view drive --serve
+
+    lidar view map.laz --open3d
+
+    The page needs no network and no server; open the file in any browser with WebGL 2.
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset; for a window of Open3D also a file of points.
+    out
+        File to write.
+    serve
+        Write no file; serve the player at 127.0.0.1 until interrupted, for drives of any length.
+    port
+        Port of the server; 0 for a free one.
+    open3d
+        Write no file; open the first frame, or a file of points, in a window of Open3D (extra open3d).
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.view.page import view_drive  # noqa: PLC0415
+
+    if (out is not None) + serve + open3d != 1:
+        raise InputError("give one of `out`, `serve` and `open3d`")
+    if open3d:
+        from lidar.view.window import show_window  # noqa: PLC0415
+
+        show_window(dataset, options=options)
+        return 0
+    if serve:
+        return _serve(dataset, options, port=port)
+    assert out is not None  # noqa: S101
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = view_drive(
+            open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
+        print_json({**asdict(summary), "path": str(out)})
+        return 0
+    images = f", {summary.images} images" if summary.images else ""
+    print(
+        f"{out}: {summary.frames} frames, {summary.returns:,} returns{images}, {summary.bytes / 1e6:.1f} MB"
+    )
+    for note in summary.notes:
+        print(f"  {with_flags(app, note)}")
+    return 0
+
+
+def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
+    """Serve the player until interrupted."""
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.view.server import DriveServer  # noqa: PLC0415
+
+    with DriveServer(open_dataset(dataset), options=options, port=port) as server:
+        print(f"{server.address} plays {len(server.drive)} frames of {dataset}; Ctrl+C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+    return 0
 
 
 @app.command

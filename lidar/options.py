@@ -651,6 +651,41 @@ class MapOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
+class PlaybackOptions:
+    """Options of the page that plays a drive."""
+
+    sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
+    """Names of a scanner and of cameras to show; by default the first scanner and the first camera with
+    images."""
+
+    frames: str = ""
+    """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
+    default."""
+
+    every: int = 1
+    """Show each n-th of these frames only."""
+
+    max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
+    """Maximum size of the page in megabytes; for a larger one, the error names a selection that fits."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if not re.fullmatch(r"(\d*:\d*)?", self.frames):
+            raise InputError(f"`frames` {self.frames}: give FIRST:END, such as 100:200, 100: or :200")
+        if self.every < 1:
+            raise InputError(f"`every` {self.every}: give 1 or more")
+        if not 0 < self.max_mb < math.inf:
+            raise InputError(f"`max_mb` {self.max_mb:g}: give a positive number of megabytes")
+
+    @property
+    def limits(self) -> tuple[int, float]:
+        """The first frame, and the one after the last; infinity for all further ones."""
+        first, _, end = self.frames.partition(":")
+        return int(first or 0), int(end) if end else math.inf
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
 class ExportOptions:
     """Options of an export of a dataset."""
 

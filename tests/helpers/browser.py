@@ -62,15 +62,23 @@ class Browser:
         told = self._call("POST", "", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/{told['sessionId']}"
 
-    def open(self, page: Path, address: str = "") -> None:
-        """Open or reload a page from disk, and wait until it is ready."""
+    def open(self, page: Path | str, address: str = "") -> None:
+        """Open or reload a page from disk or at a URL, and wait until it is ready."""
         self._call("POST", "/url", {"url": "about:blank"})
-        self._call("POST", "/url", {"url": page.as_uri() + address})
+        self._call("POST", "/url", {"url": (page if isinstance(page, str) else page.as_uri()) + address})
         end = time.monotonic() + 120
         while (state := self.js("return document.documentElement.dataset.ready")) is None:
             assert time.monotonic() < end, self.text("message")
             time.sleep(0.05)
         assert state == "yes", self.text("message")
+
+    def wait(self, script: str) -> Any:
+        """The return value of a script as soon as it is true."""
+        end = time.monotonic() + 30
+        while not (value := self.js(script)):
+            assert time.monotonic() < end, script
+            time.sleep(0.05)
+        return value
 
     def js(self, script: str, *args: Any) -> Any:
         """The return value of a script."""
