@@ -42,8 +42,8 @@ def colored_points(path: str | Path, options: PlaybackOptions) -> tuple[Float, F
 
 def _colors(table: dict[str, NDArray[Any]], height: Float) -> NDArray[np.uint8]:
     if "red" in table:
-        rgb: NDArray[np.uint8] = np.column_stack([table[name] for name in ("red", "green", "blue")])
-        return rgb
+        rgb = np.column_stack([table[name] for name in ("red", "green", "blue")])
+        return (rgb >> 8 if rgb.dtype == np.uint16 else rgb).astype(np.uint8)  # LAS has 16 bits
     if "label" in table:
         colors: NDArray[np.uint8] = class_codes().color[table["label"]]
         return colors

@@ -121,16 +121,15 @@ def test_boxes_enclose_the_returns_of_their_road_users(dataset, opened):
     boxes = opened.js("return lidar.view.sweep.boxes")
     true = read_boxes(dataset.paths.frame_boxes("lidar_top", 2), ("id",))
     assert [box["id"] for box in boxes] == [box["id"] for box in true]
-    parked = [box for box, row in zip(boxes, true, strict=True) if box["points"] > 20 and not row["moving"]]
-    assert parked
-    for box in parked:
-        instance = np.array(opened.js("return [...lidar.view.sweep.instance]"))
+    seen = [box for box in boxes if box["points"]]
+    assert seen
+    instance = np.array(opened.js("return [...lidar.view.sweep.instance]"))
+    for box in seen:
         rows = np.flatnonzero(instance == box["instance"]).tolist()
         away = np.array(opened.js("return lidar.placed(arguments[0])", rows)) - [box[axis] for axis in "xyz"]
-        assert (
-            np.linalg.norm(away, axis=1).max()
-            < np.linalg.norm([box["length"], box["width"], box["height"]]) / 2 + 0.05
-        )
+        reach = np.linalg.norm([box["length"], box["width"], box["height"]]) / 2
+        moved = 0.1 * np.hypot(box["vx"], box["vy"])  # during the sweep
+        assert np.linalg.norm(away, axis=1).max() < reach + moved + 0.05
 
 
 def test_the_cloud_is_drawn_in_many_colours_and_boxes_can_be_hidden(opened):
@@ -170,12 +169,14 @@ def test_keys_step_play_and_change_the_rate(opened):
     opened.wait("return lidar.view.frame === 0")
     press(opened, "[", "[")
     assert opened.js("return lidar.view.rate") == 0.25
+    opened.js("lidar.view.rate = 1e-4")  # so that a frame lasts longer than the keys take
     press(opened, " ")
     assert opened.text("play") == "Pause"
-    opened.wait("return lidar.view.frame >= 2")
     press(opened, " ")
     assert opened.text("play") == "Play"
-    press(opened, "]", "]", "]", "]", " ")
+    assert frame_of(opened) == 0
+    press(opened, "]", "]", " ")
+    assert opened.js("return lidar.view.rate") == 1
     opened.wait("return lidar.view.frame === 5 && !lidar.view.playing")  # stops at the end
 
 
