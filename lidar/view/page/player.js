@@ -225,10 +225,11 @@ function listen(view) {
   const { renderer, camera, head } = view;
   const canvas = $("canvas");
   const moving = () => { view.dirty = true; };
-  const step = (by) => {
+  const go = (to) => {
     play(view, false);
-    show(view, view.frame + by).catch(fail);
+    show(view, to).catch(fail);
   };
+  const step = (by) => go(view.wanted + by); // from the frame last asked for, which may still be decoded
   const toggle = (id) => $(id).click();
   const rate = (by) => {
     const next = $("rate").selectedIndex + by;
@@ -238,7 +239,7 @@ function listen(view) {
   };
   const together = (by) => {
     $("sweeps").value = Math.min(100, Math.max(1, Number($("sweeps").value) + by));
-    show(view, view.frame).catch(fail);
+    show(view, view.wanted).catch(fail);
   };
 
   gestures(canvas, camera, {
@@ -271,10 +272,10 @@ function listen(view) {
   $("back").onclick = () => step(-1);
   $("ahead").onclick = () => step(1);
   $("rate").onchange = () => { view.rate = Number($("rate").value); };
-  $("time").oninput = () => step(Number($("time").value) - view.frame);
+  $("time").oninput = () => go(Number($("time").value));
   $("graph").onclick = (event) => {
     const share = (event.offsetX - 8) / Math.max(1, $("graph").clientWidth - 16);
-    step(Math.round(share * (head.numbers.length - 1)) - view.frame);
+    go(share * (head.numbers.length - 1));
   };
   $("color").onchange = () => color(view, $("color").value);
   $("sweeps").onchange = () => together(0);
