@@ -544,6 +544,8 @@ def export(
 
     lidar export drive --to kitti -o odometry
 
+    lidar export drive --to ros2 -o bag
+
     Parameters
     ----------
     dataset

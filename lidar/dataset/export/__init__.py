@@ -92,6 +92,14 @@ EXPORTERS = {
             hint="open it with pykitti.raw('{path}', DATE, '0001')",
         ),
         Exporter(
+            "mcap",
+            "mcap",
+            "one MCAP file of ROS 2 messages, with a layout for Foxglove",
+            mark="foxglove.json",
+            names=r"foxglove\.json|drive\.mcap",
+            hint="open {path}/drive.mcap with Foxglove and import the layout foxglove.json",
+        ),
+        Exporter(
             "nuscenes",
             "nuscenes",
             "samples and sweeps with all tables of nuScenes, two key frames per second",
@@ -99,6 +107,22 @@ EXPORTERS = {
             names=r"v1\.0-mini/[a-z_]+\.json|maps/drivable\.png|lidarseg/v1\.0-mini/[0-9a-f]{32}_lidarseg\.bin"
             r"|(samples|sweeps)/[^/]+/.+__\d+\.(pcd\.bin|png)",
             hint="open it with NuScenes('v1.0-mini', '{path}')",
+        ),
+        Exporter(
+            "ros2",
+            "ros2",
+            "a ROS 2 recording (rosbag2) in MCAP",
+            mark="metadata.yaml",
+            names=r"metadata\.yaml|drive\.(mcap|db3)",
+            hint="play it with ros2 bag play {path}",
+        ),
+        Exporter(
+            "ros2-sqlite3",
+            "ros2_sqlite3",
+            "a ROS 2 recording (rosbag2) in SQLite",
+            mark="metadata.yaml",
+            names=r"metadata\.yaml|drive\.(mcap|db3)",
+            hint="play it with ros2 bag play {path}",
         ),
         Exporter(
             "tum",

@@ -251,5 +251,5 @@ def test_a_failed_export_leaves_no_files(dataset, tmp_path):
     with pytest.raises(DatasetError, match="was the drive finished"):
         EXPORTERS["tum"].export(dataset, tmp_path / "tum")
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
-    with pytest.raises(InputError, match="`to` waymo: one of kitti, kitti-raw, nuscenes, tum"):
+    with pytest.raises(InputError, match="`to` waymo: one of kitti, kitti-raw, mcap, nuscenes, ros2, "):
         exporter("waymo")
