@@ -11,7 +11,7 @@ from geoscene.csv_tables import write_columns
 from geoscene.typing import Float
 from lidar.dataset.boxes import box_rows, count_points
 from lidar.dataset.deskew import MOMENTS, deskewed
-from lidar.dataset.formats.table import Table, cloud_table, point_labels
+from lidar.dataset.formats.table import FrameInfo, Table, cloud_table, point_labels
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import situation_of
 from lidar.errors import LidarError
@@ -157,15 +157,19 @@ def write_clouds(
         still = deskewed(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=time_ns)
         return table | dict(zip("xyz", still.T, strict=True))
 
+    info = None
+    if any(form.framed for form in contents.cloud_formats):
+        pose = _pose_in_crs(recording, scanner, time_ns=begin)
+        info = FrameInfo(scanner.name, frame, begin, pose)
     deskewed_table: Table = {}
     if contents.deskew:
         deskewed_table = still_at(begin + int(MOMENTS[contents.deskew] * scanner.period_ns))
     for form in contents.cloud_formats:
         if form.frame == "sensor":
             with watch.stage(f"write {form.name}"):
-                form.write(paths[form.name], still_at(begin) if form.kitti else table)
+                form.write(paths[form.name], still_at(begin) if form.kitti else table, frame=info)
                 if contents.deskew:
-                    form.write(paths[f"deskewed {form.name}"], deskewed_table)
+                    form.write(paths[f"deskewed {form.name}"], deskewed_table, frame=info)
     if world_formats:
         with watch.stage("georeference"):
             east, north, up = recording.geo.points(placed).T
@@ -173,7 +177,18 @@ def write_clouds(
             world_table = table | {"x": east, "y": north, "z": up, "gps_time": gps}
         for form in world_formats:
             with watch.stage(f"write {form.name}"):
-                form.write(paths[form.name], world_table, info=recording.las_info)
+                form.write(paths[form.name], world_table, info=recording.las_info, frame=info)
+
+
+def _pose_in_crs(recording: Recording, scanner: Scanner, *, time_ns: int) -> Float:
+    """The pose (4, 4) of a scanner in the export CRS: the rotation nearest to the projection's map."""
+    mount = scanner.spec.mount
+    pose = recording.trajectory.at([time_ns]).mounted(mount.translation, mount.rotation)
+    ends = recording.geo.points(pose.position[0] + np.vstack([np.zeros(3), pose.rotation[0].T]))
+    left, _, right = np.linalg.svd((ends[1:] - ends[0]).T)
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = left @ right, ends[0]
+    return out
 
 
 def _velocity(

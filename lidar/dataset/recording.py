@@ -88,6 +88,8 @@ class Contents:
             raise InputError(f"`formats`: give one or more of {', '.join(FORMATS)}")
         if unknown := sorted(set(self.formats) - set(FORMATS)):
             raise InputError(f"`formats` {','.join(unknown)}: unknown; there are {', '.join(FORMATS)}")
+        for form in self.cloud_formats:
+            form.require()
         if unknown := sorted(set(self.labels) - set(LABELS)):
             raise InputError(f"`labels` {','.join(unknown)}: unknown; there are {', '.join(LABELS)}")
         if self.deskew and self.deskew not in MOMENTS:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, class_codes
 from geoscene.progress import Progress, silent
 from lidar.dataset.formats import FORMATS, Format, format_of, map_suffixes
-from lidar.dataset.formats.las import LasInfo, read_chunks
+from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, placed_returns, records, rows
 from lidar.dataset.layout import Dataset, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
@@ -74,16 +74,17 @@ def aggregate(
 ) -> MapSummary:
     """Write the map of a dataset in the format of the suffix of ``out`` (see `map_suffixes`).
 
-    LAS, LAZ and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose readers take
-    float32, holds the same minus the whole-metre offset that its comment line states.
+    LAS, LAZ, COPC, E57 and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose
+    readers take float32, holds the same minus the whole-metre offset that its comment line states.
 
     overwrite : replace an existing file
 
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
     out = Path(out)
-    if out.suffix.lower() not in map_suffixes():
+    if not out.name.lower().endswith(tuple(map_suffixes())) or not format_of(out).maps:
         raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
+    format_of(out).require()
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     lidars = dataset.sensors("lidar")
@@ -165,8 +166,8 @@ class _Source:
     def tables(self, every: int = 1) -> Iterator[tuple[int, str, Table]]:
         """Frame number, scanner and table of every n-th file; several tables for large files."""
         for frame, name, index, path in self._files[::every]:
-            if format_of(path).frame == "world":
-                for table in read_chunks(path):
+            if (form := format_of(path)).frame == "world":
+                for table in form.read_chunks(path):
                     yield (
                         frame,
                         name,

@@ -133,7 +133,7 @@ def _in_sensor_frame(bench: Bench, scanner: Scanner, *, seen: Measured, frame: i
     )
     still = ((seen.placed - pose.position) / pose.scale) @ pose.rotation[0]
     for form in FORMATS.values():
-        if form.frame == "sensor":
+        if form.frame == "sensor" and form.installed():
             exact = still if form.kitti else seen.exact
             bound = float32_bound(exact) + _STEPS.get(form.name, 0.0) * 3**0.5 / 2
             bound += float32_bound(seen.exact) if form.kitti else 0.0

@@ -6,14 +6,19 @@ Modules are imported when a file is read or written, so that a list of the forma
 from __future__ import annotations
 
 import importlib
+import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from geoscene.errors import need
 from lidar.errors import FormatError, InputError
 
 if TYPE_CHECKING:
-    from lidar.dataset.formats.table import PointLabels, Table
+    from collections.abc import Iterator
+
+    from lidar.dataset.formats.las import LasInfo
+    from lidar.dataset.formats.table import FrameInfo, PointLabels, Table
     from lidar.sensors.cloud import Cloud
 
 ALL = (
@@ -23,6 +28,7 @@ ALL = (
 """Columns of a recorded cloud, see `lidar.dataset.formats.table`; velocity of Doppler scanners only."""
 
 _LAS = (*(name for name in ALL if name not in ("time_ns", "column")), "gps_time")
+_E57 = (*(name for name in ALL if name != "time_ns"), "gps_time")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +43,9 @@ class Format:
     folder  : of its files, in a sensor's folder; by default its name
     kitti   : a sensor's folder becomes a KITTI sequence: calib.txt, times.txt and poses.txt are added, and
               clouds are de-skewed to their frame's start, as KITTI's are
-    maps    : its module has ``open_map``, which writes aggregated maps
+    maps    : its module has ``open_map``, which writes aggregated maps; it may have that and no ``write``
+    framed  : its files state the frame that they are of
+    extra   : optional dependency that its module needs: a package and the name of the extra
     """
 
     name: str
@@ -48,6 +56,8 @@ class Format:
     folder: str = ""
     kitti: bool = False
     maps: bool = False
+    framed: bool = False
+    extra: str = ""
 
     def path(self, folder: Path, frame: int) -> Path:
         """File of a frame in a sensor's folder."""
@@ -61,9 +71,30 @@ class Format:
         table: Table = self._functions().read(path)
         return table
 
-    def write(self, path: Path, table: Table, **info: Any) -> None:
-        """Write a point table; formats of the world frame need ``info``, a `las.LasInfo`."""
-        self._functions().write(path, table, **info)
+    def require(self) -> None:
+        """Raise MissingExtraError if the package that the format needs is not installed."""
+        if self.extra:
+            need(*self.extra.split())
+
+    def installed(self) -> bool:
+        """Whether the package that the format needs is installed."""
+        return not self.extra or importlib.util.find_spec(self.extra.split()[0]) is not None
+
+    def read_chunks(self, path: Path) -> Iterator[Table]:
+        """The point tables of a file of the world frame, some points at a time; raises as `read`."""
+        tables: Iterator[Table] = self._functions().read_chunks(path)
+        return tables
+
+    def write(
+        self, path: Path, table: Table, *, info: LasInfo | None = None, frame: FrameInfo | None = None
+    ) -> None:
+        """Write a point table.
+
+        info  : of the export CRS, which formats of the world frame need
+        frame : of which the table is; formats that state no frame ignore it
+        """
+        given = ({"info": info} if info else {}) | ({"frame": frame} if frame and self.framed else {})
+        self._functions().write(path, table, **given)
 
     def count(self, path: Path) -> int:
         """Number of points of a file, from its header or its size.
@@ -110,15 +141,37 @@ FORMATS = {
     for row in (
         Format("pcd", "pcd", ".pcd", maps=True),
         Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
+        Format("pcd-compressed", "pcd_compressed", ".compressed.pcd"),
         Format("ply", "ply", ".ply", maps=True),
         Format("csv", "text", ".csv"),
+        Format("npz", "npz", ".npz"),
+        Format("parquet", "parquet", ".parquet", framed=True, extra="pyarrow gis"),
         Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True),
         Format("las", "las", ".las", frame="world", columns=_LAS, maps=True),
+        Format(
+            "e57",
+            "e57",
+            ".e57",
+            frame="world",
+            columns=_E57,
+            maps=True,
+            framed=True,
+            extra="pye57 e57",
+        ),
         Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", kitti=True),
         Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring")),
     )
 }
 """Point-cloud formats by name."""
+
+MAPS = {
+    row.name: row
+    for row in (
+        *(row for row in FORMATS.values() if row.maps),
+        Format("copc", "copc", ".copc.laz", frame="world", columns=_LAS, maps=True),
+    )
+}
+"""Formats of aggregated maps by name; COPC sorts points, so that clouds of frames are not written in it."""
 
 LABELS = {
     row.name: row
@@ -135,20 +188,21 @@ def format_of(path: Path, name: str = "") -> Format:
 
     Raises InputError for an unknown name or suffix.
     """
+    known = FORMATS | MAPS
     if name:
-        if name not in FORMATS:
-            raise InputError(f"format {name}: one of {', '.join(FORMATS)}")
-        return FORMATS[name]
-    found = [row for row in FORMATS.values() if path.name.lower().endswith(row.suffix)]
+        if name not in known:
+            raise InputError(f"format {name}: one of {', '.join(known)}")
+        return known[name]
+    found = [row for row in known.values() if path.name.lower().endswith(row.suffix)]
     if not found:
-        suffixes = ", ".join(row.suffix for row in FORMATS.values())
+        suffixes = ", ".join(row.suffix for row in known.values())
         raise InputError(f"{path}: no point-cloud format has this suffix; there are {suffixes}")
     return max(found, key=lambda row: len(row.suffix))
 
 
 def map_suffixes() -> list[str]:
     """Suffixes of the files that aggregated maps can be written to."""
-    return [row.suffix for row in FORMATS.values() if row.maps]
+    return [row.suffix for row in MAPS.values()]
 
 
 def read_table(path: Path, format: str = "") -> Table:  # noqa: A002 - the word that users know

@@ -136,7 +136,7 @@ class _Uncompressed:
 
 
 @contextmanager
-def _compressor_errors(path: Path) -> Iterator[None]:
+def compressor_errors(path: Path) -> Iterator[None]:
     """Raise the compressor's errors, which hide their cause, as the OSError behind them."""
     import lazrs  # noqa: PLC0415
 
@@ -163,18 +163,18 @@ class _Compressed:
     def write_points(self, points: NDArray[np.void]) -> None:
         """Append points."""
         h = self._header
-        with _compressor_errors(self._path):
+        with compressor_errors(self._path):
             self._writer.write_points(
                 self._record(points, h.point_format, scales=h.scales, offsets=h.offsets)
             )
 
     def close(self) -> None:
         """Write the remaining points."""
-        with _compressor_errors(self._path):
+        with compressor_errors(self._path):
             self._writer.close()
 
 
-class _Encoder:
+class Encoder:
     """Tables as LAS point records; see `open_las` for their columns."""
 
     def __init__(self, path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> None:
@@ -220,7 +220,7 @@ def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator
               intensity, ring, instance, range, incidence, true_range, velocity, echo, echoes (up to 15),
               source (point source id), red, green and blue
     """
-    encoder = _Encoder(path, info, columns=columns)
+    encoder = Encoder(path, info, columns=columns)
     with atomic_path(path) as part:
         sink = (_Compressed if path.suffix.lower() == ".laz" else _Uncompressed)(part, encoder.layout)
         try:

@@ -38,6 +38,26 @@ from lidar.world.actors import Actors
 Table = dict[str, NDArray[Any]]
 
 
+@dataclass(frozen=True, slots=True)
+class FrameInfo:
+    """The frame that a cloud is of, for formats that state it.
+
+    sensor   : name
+    frame    : number
+    start_ns : since the drive's start
+    pose     : (4, 4) export CRS from the sensor at the frame's start, rigid; None if it is not known
+    """
+
+    sensor: str = ""
+    frame: int = 0
+    start_ns: int = 0
+    pose: Float | None = None
+
+
+NO_FRAME = FrameInfo()
+"""Of clouds that are of no drive."""
+
+
 def cloud_table(cloud: Cloud) -> Table:
     """The table of a cloud, in the sensor frame, with the types of files."""
     return {
