@@ -84,7 +84,7 @@ READERS = {"maps": _MAPS, "scenes": _SCENES, "datasets": _DATASETS, "configurati
 def reader_of(kind: str, path: Path) -> Callable[[Path], object] | None:
     """The function that reads a file; None if there is none of its own."""
     found = (read for pattern, read in READERS[kind].items() if path.match(pattern))
-    return next(found, None) if path.parent.name not in ("boxes", "lidarseg", "deskewed") else None
+    return next(found, None) if path.parent.name not in ("boxes", "lidarseg", "deskewed", "truth") else None
 
 
 @functools.cache

@@ -13,7 +13,7 @@ import numpy as np
 from bench.measure import Case
 from bench.scenes import Setup
 from geoscene.classes import class_codes
-from lidar.dataset.formats import FORMATS, read_table
+from lidar.dataset.formats import FORMATS, MAPS, read_table
 from lidar.dataset.formats.las import SCALE, LasInfo
 from lidar.dataset.formats.pcd import pcd_header
 from lidar.dataset.formats.table import Table, rows
@@ -69,6 +69,80 @@ def writing(setup: Setup) -> Iterator[Case]:
             "numpy": partial(plain, folder / f"theirs.{name}", local),
         }
         yield Case("writing", name.upper(), rows(local) / 1e6, "M points", sides, note)
+    yield from _others(folder, world=world, local=local, info=info)
+
+
+def _others(folder: Path, *, world: Table, local: Table, info: LasInfo) -> Iterator[Case]:
+    """Writing formats of other libraries, and COPC against plain LAZ."""
+    names = tuple(world)
+    colored = world | {name: np.zeros(rows(world), np.uint8) for name in ("red", "green", "blue")}
+    theirs = {
+        "pcd-compressed": ("pypcd4", pypcd4_written, "same columns; pypcd4: liblzf"),
+        "npz": ("numpy", numpy_npz, "same bytes"),
+        "parquet": (
+            "pyarrow",
+            pyarrow_written,
+            "lidar: frame columns, floats split by bytes, Zstandard; pyarrow: defaults",
+        ),
+    }
+    for name, (side, plain, note) in theirs.items():
+        sides = {
+            "lidar": partial(_written, name, folder / f"ours{FORMATS[name].suffix}", local),
+            side: partial(plain, folder / f"theirs{FORMATS[name].suffix}", local),
+        }
+        yield Case("writing", name.upper(), rows(local) / 1e6, "M points", sides, note)
+    sides = {
+        "lidar": partial(_written, "e57", folder / "ours.e57", world, info=info),
+        "pye57": partial(pye57_written, folder / "theirs.e57", world, info=info),
+    }
+    note = "lidar: all columns, an identifier from the content; pye57: x, y, z, intensity and row only"
+    yield Case("writing", "E57", rows(world) / 1e6, "M points", sides, note)
+    sides = {
+        "lidar": partial(map_written, folder / "ours.copc.laz", colored, info=info, columns=names),
+        "laspy": partial(laspy_written, folder / "theirs.laz", world, info=info),
+    }
+    note = "lidar: an octree of samples; laspy: plain LAZ in the order of firing, without colours"
+    yield Case("writing", "COPC", rows(world) / 1e6, "M points", sides, note)
+
+
+def map_written(path: Path, table: Table, *, info: LasInfo, columns: tuple[str, ...]) -> None:
+    """Write a table as a map."""
+    colors = ("red", "green", "blue")
+    with MAPS["copc"].open_map(path, info=info, columns=(*columns, *colors)) as append:
+        append(table)
+
+
+def pypcd4_written(path: Path, table: Table) -> None:
+    """Write a table as compressed PCD by pypcd4 alone."""
+    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - for development only
+
+    cloud = PointCloud.from_points(
+        list(table.values()), tuple(table), tuple(column.dtype.type for column in table.values())
+    )
+    cloud.save(path, encoding=Encoding.BINARY_COMPRESSED)
+
+
+def numpy_npz(path: Path, table: Table) -> None:
+    """Write a table as NPZ by numpy alone."""
+    with path.open("wb") as file:
+        np.savez(file, allow_pickle=False, **table)
+
+
+def pyarrow_written(path: Path, table: Table) -> None:
+    """Write a table as Parquet by pyarrow alone."""
+    import pyarrow.parquet  # noqa: PLC0415 - optional
+
+    pyarrow.parquet.write_table(pyarrow.table(table), path)
+
+
+def pye57_written(path: Path, table: Table, *, info: LasInfo) -> None:
+    """Write what pye57 writes of a table as E57."""
+    import pye57  # noqa: PLC0415 - optional
+
+    data = {f"cartesian{k.upper()}": table[k] - o for k, o in zip("xyz", info.offset, strict=True)}
+    data |= {"intensity": table["intensity"], "rowIndex": table["ring"], "columnIndex": table["ring"]}
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(data, translation=np.array(info.offset))
 
 
 def _written(name: str, path: Path, table: Table, **info: Any) -> None:

@@ -104,7 +104,8 @@ class Format:
         try:
             return int(self._functions().count(path))
         except (OSError, ValueError, IndexError, StopIteration) as error:
-            raise FormatError(f"{path}: its number of points cannot be read ({error})") from error
+            text = " ".join(str(error).split())
+            raise FormatError(f"{path}: its number of points cannot be read ({text})") from error
 
     def open_map(self, path: Path, *, info: Any, columns: tuple[str, ...]) -> Any:
         """A context manager that yields a function which appends tables in the world frame to a map."""

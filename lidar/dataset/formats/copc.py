@@ -204,10 +204,10 @@ def _write(file: IO[bytes], points: _Bucket, *, encoder: Encoder) -> None:
     compressor = lazrs.LasZipCompressor(file, laz)
     keys = []
     for key, node in _nodes(points, (0, 0, 0, 0), low=facts.low, side=facts.side):
-        keys.append(key)
-        if len(node):
-            compressor.compress_many(np.frombuffer(node.tobytes(), np.uint8))
+        if keys:
             compressor.finish_current_chunk()
+        keys.append(key)
+        compressor.compress_many(np.frombuffer(node.tobytes(), np.uint8))
     compressor.done()
     entries = _hierarchy(file, laz, keys=keys, start=len(start))
     end = file.seek(0, 2)
@@ -235,9 +235,9 @@ def _hierarchy(file: IO[bytes], laz: Any, *, keys: list[Key], start: int) -> NDA
     entries = np.zeros(len(keys), _ENTRY)
     entries["key"] = keys
     file.seek(start)
-    chunks = [(points, size) for points, size in lazrs.read_chunk_table(file, laz) if points]
-    if chunks:
-        entries["points"], entries["size"] = np.array(chunks, np.int64).T
+    chunks = np.array(lazrs.read_chunk_table(file, laz), np.int64)
+    if chunks[:, 0].any():
+        entries["points"], entries["size"] = chunks.T
         ends = start + 8 + np.cumsum(entries["size"], dtype=np.int64)  # after the place of the chunk table
         entries["offset"] = ends - entries["size"]
     return entries

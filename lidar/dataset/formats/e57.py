@@ -296,7 +296,7 @@ def read(path: Path) -> Table:
 
 def read_chunks(path: Path) -> Iterator[Table]:
     """The tables of a file, a scan at a time; see `read`."""
-    size = path.stat().st_size if path.is_file() else 0
+    size = path.stat().st_size
     with _scans(path) as (image, scans):
         if not len(scans):
             raise FormatError(f"{path}: has no scan")

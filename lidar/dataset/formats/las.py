@@ -297,7 +297,7 @@ def _check_layers(path: Path, header: Any) -> None:
     import lazrs  # noqa: PLC0415
 
     compressed, point = header.vlrs.get("LasZipVlr"), header.point_format
-    if not compressed or point.id < 6:
+    if not compressed or point.id < 6 or not header.point_count:
         return
     layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point.id] + point.num_extra_bytes
     with path.open("rb") as file:

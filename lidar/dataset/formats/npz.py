@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from pathlib import Path
@@ -13,6 +14,12 @@ from numpy.typing import NDArray
 from geoscene.files import atomic_file
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
+
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, KeyError, ValueError, SyntaxError, EOFError, OSError),
+    *(NotImplementedError, RuntimeError),
+)
+"""What damaged archives and headers of arrays raise."""
 
 
 def write(path: Path, table: Table) -> None:
@@ -27,11 +34,12 @@ def read(path: Path) -> Table:
 
     Raises FormatError for a file without x, y and z, or with arrays that are no columns of numbers.
     """
+    data = io.BytesIO(path.read_bytes())
     try:
-        with zipfile.ZipFile(path) as file:
+        with zipfile.ZipFile(data) as file:
             names = [entry for entry in file.infolist() if entry.filename.endswith(".npy")]
             table = {entry.filename.removesuffix(".npy"): _column(file, entry) for entry in names}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
+    except _DAMAGE as error:
         raise FormatError(f"{path}: not a readable NPZ file ({error})") from error
     if lacks := [axis for axis in "xyz" if axis not in table]:
         raise FormatError(f"{path}: has no array {', '.join(lacks)}")
@@ -46,7 +54,7 @@ def count(path: Path) -> int:
     try:
         with zipfile.ZipFile(path) as file, file.open("x.npy") as member:
             return _shape(member)[0][0]
-    except (zipfile.BadZipFile, KeyError, EOFError) as error:
+    except _DAMAGE as error:
         raise ValueError(str(error)) from error
 
 

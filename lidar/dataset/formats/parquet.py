@@ -49,9 +49,10 @@ def read(path: Path) -> Table:
 
     Raises FormatError for a file that is damaged, lacks x, y and z, or has columns that are no numbers.
     """
-    parquet = _pyarrow("pyarrow.parquet")
+    pa, parquet = _pyarrow(), _pyarrow("pyarrow.parquet")
+    data = pa.py_buffer(path.read_bytes())
     try:
-        with parquet.ParquetFile(path) as file:
+        with parquet.ParquetFile(pa.BufferReader(data)) as file:
             names = [name for name in file.schema_arrow.names if name not in _OF_FRAME]
             found = file.read(names)
         table = {name: found[name].to_numpy() for name in names}

@@ -1,0 +1,190 @@
+"""Compressed PCD, NPZ and Parquet against the readers of others."""
+
+import io
+import sys
+import zipfile
+
+import lzf as reference
+import numpy as np
+import pyarrow.dataset
+import pyarrow.parquet
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pypcd4 import Encoding, PointCloud
+
+from geoscene.errors import MissingExtraError
+from lidar.dataset.formats import FORMATS, npz, parquet, pcd_compressed, read_table
+from lidar.dataset.formats.lzf import compressed, decompressed
+from lidar.dataset.formats.table import FrameInfo
+from lidar.dataset.recording import Contents
+from lidar.errors import FormatError
+
+
+def table(n=400, seed=0):
+    rng = np.random.default_rng(seed)
+    return {
+        **{axis: rng.normal(size=n).astype(np.float32) for axis in "xyz"},
+        "time_ns": np.sort(rng.integers(0, 10**8, n)).astype(np.uint32),
+        "ring": np.tile(np.arange(16, dtype=np.uint16), n // 16 + 1)[:n],
+        "instance": rng.integers(-1, 9, n).astype(np.int32),
+    }
+
+
+def as_array(data):
+    return np.frombuffer(data, np.uint8)
+
+
+TEXTS = st.one_of(
+    st.binary(max_size=2000),
+    st.builds(lambda word, times: word * times, st.binary(min_size=1, max_size=40), st.integers(1, 400)),
+    st.lists(st.sampled_from([b"abc", b"abcd", bytes(300), b"\xff"]), max_size=60).map(b"".join),
+)
+
+
+@settings(deadline=None, max_examples=100)
+@given(TEXTS)
+def test_lzf_is_read_by_liblzf_and_reads_what_liblzf_writes(data):
+    packed = compressed(as_array(data))
+    assert decompressed(packed, len(data)).tobytes() == data
+    if data:
+        assert reference.decompress(packed.tobytes(), len(data)) == data
+        theirs = reference.compress(data, 2 * len(data) + 16)
+        assert decompressed(as_array(theirs), len(data)).tobytes() == data
+        assert len(packed) <= len(data) + len(data) // 32 + 1
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.binary(max_size=80), st.integers(0, 2000))
+def test_no_bytes_make_lzf_read_or_write_outside_its_memory(data, size):
+    """Either they stand for exactly so many bytes, as LibLZF says too, or they are refused."""
+    try:
+        ours = decompressed(as_array(data), size).tobytes()
+    except ValueError:
+        ours = None
+    if not data or not size:
+        assert ours is None or (not data and size == 0)
+        return
+    try:
+        theirs = reference.decompress(data, size)
+    except ValueError:
+        theirs = None
+    assert ours == (theirs if theirs is not None and len(theirs) == size else None)
+
+
+def test_pypcd4_reads_our_compressed_pcd_and_we_read_that_of_pypcd4(tmp_path):
+    cloud = table()
+    pcd_compressed.write(tmp_path / "a.compressed.pcd", cloud)
+    other = PointCloud.from_path(tmp_path / "a.compressed.pcd")
+    for name, column in cloud.items():
+        np.testing.assert_array_equal(other.pc_data["t" if name == "time_ns" else name], column)
+    other.save(tmp_path / "b.pcd", encoding=Encoding.BINARY_COMPRESSED)
+    for name, column in read_table(tmp_path / "b.pcd").items():
+        np.testing.assert_array_equal(column, cloud[name])
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "says"),
+    [
+        (0, 10**6, "damaged"),
+        (0, 3, "3 compressed bytes cannot hold"),
+        (4, 10**6, "stated for"),
+        (4, 0, "stated for"),
+    ],
+)
+def test_compressed_pcd_with_sizes_that_cannot_be_is_refused(tmp_path, at, value, says):
+    path = tmp_path / "a.compressed.pcd"
+    pcd_compressed.write(path, table())
+    whole = path.read_bytes()
+    place = whole.index(b"binary_compressed\n") + 18 + at
+    path.write_bytes(whole[:place] + value.to_bytes(4, "little") + whole[place + 4 :])
+    with pytest.raises(FormatError, match=says):
+        read_table(path)
+
+
+def test_numpy_reads_our_npz_without_pickles(tmp_path):
+    cloud = table()
+    npz.write(tmp_path / "a.npz", cloud)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as file:
+        assert file.files == list(cloud)
+        for name, column in cloud.items():
+            assert file[name].dtype == column.dtype
+            np.testing.assert_array_equal(file[name], column)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "says"),
+    [
+        ({"x": np.zeros(3)}, "has no array y, z"),
+        ({"x": np.zeros(3), "y": np.zeros(3), "z": np.zeros(2)}, "differ in length"),
+        ({"x": np.zeros((3, 2)), "y": np.zeros(3), "z": np.zeros(3)}, "no column of numbers"),
+        ({k: np.array([None] * 3) for k in "xyz"}, "no column of numbers"),
+    ],
+)
+def test_npz_of_other_arrays_is_refused(tmp_path, arrays, says):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(FormatError, match=says):
+        read_table(tmp_path / "a.npz")
+
+
+def test_npz_that_states_more_numbers_than_it_holds_is_refused(tmp_path):
+    head = io.BytesIO()
+    np.lib.format.write_array_header_1_0(head, {"shape": (10**15,), "fortran_order": False, "descr": "<f8"})
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
+        file.writestr("x.npy", head.getvalue())
+    with pytest.raises(FormatError, match="does not hold"):
+        read_table(tmp_path / "a.npz")
+
+
+def test_parquet_files_of_a_drive_are_one_table(tmp_path):
+    clouds = {("top", 0): table(seed=0), ("top", 1): table(seed=1), ("front", 0): table(seed=2)}
+    for (sensor, frame), cloud in clouds.items():
+        path = FORMATS["parquet"].path(tmp_path / sensor, frame)
+        FORMATS["parquet"].write(path, cloud, frame=FrameInfo(sensor, frame, frame * 10**8))
+    whole = pyarrow.dataset.dataset(tmp_path, format="parquet").to_table()
+    assert whole.num_rows == 1200
+    for (sensor, frame), cloud in clouds.items():
+        of_sensor = pyarrow.dataset.field("sensor") == sensor
+        part = whole.filter(of_sensor & (pyarrow.dataset.field("frame") == frame))
+        assert set(part["start_ns"].to_pylist()) == {frame * 10**8}
+        for name, column in cloud.items():
+            assert part[name].to_numpy().dtype == column.dtype
+            np.testing.assert_array_equal(part[name].to_numpy(), column)
+        assert list(read_table(FORMATS["parquet"].path(tmp_path / sensor, frame))) == list(cloud)
+
+
+def test_parquet_of_other_tables_is_refused(tmp_path):
+    path = tmp_path / "a.parquet"
+    pyarrow.parquet.write_table(pyarrow.table({"x": [1.0], "y": [2.0]}), path)
+    with pytest.raises(FormatError, match="has no column z"):
+        parquet.read(path)
+    pyarrow.parquet.write_table(pyarrow.table({"x": [1.0], "y": [2.0], "z": ["high"]}), path)
+    with pytest.raises(FormatError, match="columns z are no numbers"):
+        parquet.read(path)
+
+
+@pytest.mark.parametrize("name", ["pcd-compressed", "npz", "parquet"])
+@settings(deadline=None, max_examples=40)
+@given(seed=st.integers(0, 2**32))
+def test_changed_bytes_are_read_or_refused_in_one_line(tmp_path_factory, name, seed):
+    form, rng = FORMATS[name], np.random.default_rng(seed)
+    path = tmp_path_factory.mktemp("damaged") / f"a{form.suffix}"
+    form.write(path, table(50))
+    data = bytearray(path.read_bytes())
+    for at in rng.integers(0, len(data), rng.integers(1, 6)):
+        data[at] = rng.integers(256)
+    path.write_bytes(data[: rng.integers(len(data))] if seed % 3 == 0 else data)
+    for function in (form.read, form.count):
+        said = ""
+        try:
+            function(path)
+        except FormatError as error:
+            said = str(error)
+        assert "\n" not in said
+
+
+@pytest.mark.parametrize(("name", "extra"), [("parquet", "gis"), ("e57", "e57")])
+def test_a_drive_names_the_extra_that_its_format_needs_before_it_starts(monkeypatch, name, extra):
+    monkeypatch.setitem(sys.modules, FORMATS[name].extra.split()[0], None)
+    with pytest.raises(MissingExtraError, match=rf"geoscene\[{extra}\]"):
+        Contents(formats=("pcd", name))
