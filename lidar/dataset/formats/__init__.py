@@ -103,6 +103,8 @@ class Format:
         """
         try:
             return int(self._functions().count(path))
+        except FormatError:
+            raise
         except (OSError, ValueError, IndexError, StopIteration) as error:
             text = " ".join(str(error).split())
             raise FormatError(f"{path}: its number of points cannot be read ({text})") from error

@@ -276,9 +276,8 @@ def _scans(path: Path) -> Iterator[tuple[Any, Any]]:
         image = e57.ImageFile(str(path), "r")
         yield image, image.root()["data3D"]
     except (e57.E57Exception, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise FormatError(
-            f"{path}: not a readable E57 file ({' '.join(str(error).split())[:120]})"
-        ) from error
+        text = " ".join(str(error).partition("****")[0].split())[:120]
+        raise FormatError(f"{path}: not a readable E57 file ({text})") from error
     finally:
         if image is not None:
             image.close()
