@@ -47,7 +47,6 @@ from lidar.options import (
 )
 
 if TYPE_CHECKING:
-    from lidar.maps.aggregate import MapSummary
     from lidar.scene_cache import OpenedScene
     from lidar.signal.effects import Counts
 
@@ -401,6 +400,8 @@ def map_(
 
     lidar map drive -o empty.laz --without vehicles,pedestrian
 
+    lidar map drive -o junction.laz --bbox 24.941,60.165,24.943,60.166 --time 5,15 --echo last
+
     Parameters
     ----------
     dataset
@@ -416,16 +417,11 @@ def map_(
         )
     if report.json:
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
-        counts |= {f"{name}_left_out": n for name, n in _left_out(summary).items()}
+        counts |= {"left_out": summary.left_out}
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         print_json({"path": str(out), **counts})
     else:
-        what = {
-            "noise": "noise (--noise keeps them)",
-            "moving": "moving road users (--moving keeps them)",
-            "classes": "--without",
-        }
-        left = [f"{n:,} of {what[name]}" for name, n in _left_out(summary).items() if n]
+        left = [f"{n:,} of {_LEFT_OUT.get(name, f'--{name}')}" for name, n in summary.left_out.items() if n]
         print(
             f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames"
             + (f"; left out: {', '.join(left)}" if left else "")
@@ -439,9 +435,17 @@ def map_(
     return 0
 
 
-def _left_out(summary: MapSummary) -> dict[str, int]:
-    """Numbers of returns that a map leaves out, by what they are of."""
-    return {"noise": summary.noise, "moving": summary.moving, "classes": summary.without}
+_LEFT_OUT = {
+    "noise": "noise (--noise keeps them)",
+    "moving": "moving road users (--moving keeps them)",
+    "time": "other times",
+    "region": "other places",
+    "only": "classes not in --only",
+    "without": "classes in --without",
+    "echo": "other echoes",
+    "origin": "other origins",
+}
+"""Returns that maps leave out, by the reason."""
 
 
 @app.command

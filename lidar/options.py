@@ -45,6 +45,12 @@ OUTPUT = Group("Output", sort_key=3)
 COLORS = ("class", "height", "intensity", "sensor")
 """What red, green and blue of a map can show."""
 
+ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
+"""Origins of returns, `lidar.physics.echoes.Origin` in lower case."""
+
+ECHOES = ("all", "first", "last", "single")
+"""Echoes of a pulse that a map can be made of."""
+
 _BY_FRAME = {
     frame: ", ".join(f.name for f in FORMATS.values() if f.frame == frame) for frame in ("sensor", "world")
 }
@@ -89,6 +95,15 @@ def _time(_: object, tokens: Sequence[Token]) -> datetime:
         return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
     except (ValueError, OverflowError):
         raise ValueError(f"{text}: not an ISO 8601 time such as 2026-06-21T08:00:00") from None
+
+
+def _span(_: object, tokens: Sequence[Token]) -> tuple[float, float]:
+    text = tokens[0].value.strip()
+    try:
+        first, last = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ValueError(f"{text}: give two numbers of seconds as FROM,TO") from None
+    return first, last
 
 
 def _lower(_: object, tokens: Sequence[Token]) -> str:
@@ -640,13 +655,44 @@ class MapOptions:
     """Classes of returns to leave out, separated by commas: names that lidar classes lists, or vehicles,
     which are all of them, parked ones too."""
 
+    only: Annotated[tuple[str, ...], WORDS] = ()
+    """Classes of returns to use, by the same names; all by default."""
+
+    bounds_deg: Annotated[Degrees | None, Parameter(name="--bbox"), degrees("W,S,E,N")] = None
+    """Use returns in this box only: degrees on WGS 84."""
+
+    polygon: Path | None = None
+    """Use returns in the polygons of this GeoJSON file only; with --bbox, in both."""
+
+    time: Annotated[tuple[float, float] | None, Parameter(converter=_span, n_tokens=1, metavar="FROM,TO")] = (
+        None
+    )
+    """Use returns of this time only: seconds since the drive's start, the end excluded."""
+
+    echo: str = "all"
+    """Echoes of each pulse to use: all, first, last, or single (of pulses with one echo)."""
+
+    origin: Annotated[tuple[str, ...], WORDS] = ()
+    """Origins of returns to use, separated by commas, by the ground truth of stages: surface, weather,
+    interference, injected, replayed, moved, receiver; all by default, but for noise."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.color not in COLORS:
-            raise InputError(f"`color` {self.color}: one of {', '.join(COLORS)}")
+        for name, known in (("color", COLORS), ("echo", ECHOES)):
+            if getattr(self, name) not in known:
+                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
         if self.voxel is not None and not 0 < self.voxel < math.inf:
             raise InputError(f"`voxel` {self.voxel}: give a positive number of metres")
         classes_of(self.without)
+        classes_of(self.only, option="only")
+        if unknown := [name for name in self.origin if name not in ORIGINS]:
+            raise InputError(f"`origin` {unknown[0]}: one of {', '.join(ORIGINS)}")
+        if self.time is not None and not self.time[0] < self.time[1]:
+            raise InputError(f"`time` {self.time[0]:g},{self.time[1]:g}: ends before it begins")
+        if self.bounds_deg is not None:
+            west, south, east, north = self.bounds_deg
+            if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+                raise InputError("`bounds_deg`: give west, south, east and north in degrees, in this order")
 
 
 @Parameter(name="*")
@@ -790,8 +836,10 @@ class DenoiseOptions:
     docs/weather.md lists their parameters."""
 
 
-def classes_of(names: Iterable[str]) -> list[int]:
+def classes_of(names: Iterable[str], *, option: str = "without") -> list[int]:
     """Codes of classes by name; ``vehicles`` stands for all of them, with and without riders.
+
+    option : that names them, for errors
 
     Raises InputError for an unknown name.
     """
@@ -800,7 +848,9 @@ def classes_of(names: Iterable[str]) -> list[int]:
     if unknown := [name for name in names if name not in known]:
         near = get_close_matches(unknown[0], known, 3, 0.6)
         hint = f"is {' or '.join(near)} meant? " if near else ""
-        raise InputError(f"`without` {unknown[0]}: {hint}lidar classes lists all names; vehicles is one, too")
+        raise InputError(
+            f"`{option}` {unknown[0]}: {hint}lidar classes lists all names; vehicles is one, too"
+        )
     return [int(code) for name in names for code in known[name]]
 
 

@@ -13,7 +13,7 @@ from geoscene.progress import Progress
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, cloud_table, records
-from lidar.maps.aggregate import nearest_to_centre
+from lidar.maps.voxels import nearest_to_centre
 from lidar.rig.devices import Scanner
 from lidar.time_scales import gps_seconds
 from lidar.tradeoff.comparison import Listing, Record

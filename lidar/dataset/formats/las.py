@@ -48,6 +48,7 @@ _EXTRA = {
     "incidence": ("float32", "rad, beam to normal"),
     "true_range": ("float32", "metres, without noise"),
     "velocity": ("float32", "m/s along the beam, + away"),
+    "frame": ("uint32", "frame of the scanner"),
 }
 
 
@@ -217,8 +218,8 @@ def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator
     """Yield a function that appends tables to a LAS or LAZ file, by the suffix.
 
     columns : of the tables. They need x, y, z (projected, float64) and label; they may have gps_time,
-              intensity, ring, instance, range, incidence, true_range, velocity, echo, echoes (up to 15),
-              source (point source id), red, green and blue
+              intensity, ring, instance, range, incidence, true_range, velocity, frame, echo, echoes (up to
+              15), source (point source id), red, green and blue
     """
     encoder = Encoder(path, info, columns=columns)
     with atomic_path(path) as part:

@@ -14,6 +14,7 @@ echo, echoes  uint8, number of the echo (from 1) and number of echoes of its pul
 velocity   float32, m/s along the beam, positive away; FMCW scanners only
 gps_time   float64, adjusted standard GPS time in seconds; in the world frame
 source     uint16, number of the scanner; in maps
+frame      uint32, number of the scanner's frame; in maps
 red, green, blue  uint8
 """
 

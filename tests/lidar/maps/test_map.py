@@ -24,7 +24,8 @@ from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.maps.aggregate import aggregate
-from lidar.options import MapOptions
+from lidar.options import ORIGINS, MapOptions
+from lidar.physics.echoes import Origin
 from lidar.time_scales import gps_seconds
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
@@ -162,7 +163,7 @@ def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
 
 @pytest.mark.parametrize("voxel", [None, 0.5])
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, voxel):
-    monkeypatch.setattr("lidar.maps.aggregate._SHRINK_AT", 200_000)
+    monkeypatch.setattr("lidar.maps.voxels._SHRINK_AT", 200_000)
     peaks = []
     for frames in (10, 60):
         data = dataset(tmp_path / f"d{frames}", first=100, frames=frames, n=5000)  # at rest
@@ -190,11 +191,129 @@ def test_the_same_dataset_gives_the_same_bytes(tmp_path):
         ("m.laz", {"color": "mood"}, "`color` mood"),
         ("m.laz", {"without": ("carr",)}, "`without` carr: is car meant"),
         ("m.laz", {"sensors": ("bottom",)}, "no scanner bottom"),
+        ("m.laz", {"only": ("carr",)}, "`only` carr: is car meant"),
+        ("m.laz", {"echo": "loud"}, "`echo` loud"),
+        ("m.laz", {"origin": ("mars",)}, "`origin` mars"),
+        ("m.laz", {"time": (3.0, 3.0)}, "`time` 3,3"),
+        ("m.laz", {"bounds_deg": (25.0, 60.0, 24.0, 61.0)}, "`bounds_deg`"),
     ],
 )
 def test_bad_options_are_named(tmp_path, out, change, words):
     with pytest.raises(InputError, match=words):
         aggregate(dataset(tmp_path / "d"), tmp_path / out, options=MapOptions(**change))
+
+
+def kept_by(tmp_path, data, **options):
+    """The map with options; the instance of a test point is its row in its frame."""
+    summary = aggregate(data, tmp_path / "m.laz", options=MapOptions(**options), overwrite=True)
+    las = laspy.read(tmp_path / "m.laz")
+    assert summary.points == len(las) == summary.points_in - sum(summary.left_out.values())
+    return las
+
+
+def test_points_keep_their_frame_and_time(tmp_path):
+    las = kept_by(tmp_path, dataset(tmp_path / "d", first=3, frames=4))
+    assert np.array_equal(las.frame, np.repeat([3, 4, 5, 6], 400))
+    seconds = np.asarray(las.gps_time) - gps_seconds(START, np.zeros(1, np.int64))
+    assert np.array_equal(np.floor(seconds * 10 + 1e-4), las.frame)
+
+
+def test_a_time_selects_the_returns_within_it(tmp_path):
+    data = dataset(tmp_path / "d")
+    las = kept_by(tmp_path, data, time=(0.15, 0.32))
+    seconds = np.asarray(las.gps_time) - gps_seconds(START, np.zeros(1, np.int64))
+    assert seconds.min() >= 0.15
+    assert seconds.max() < 0.32
+    every = (np.arange(6)[:, None] * 0.1 + np.linspace(0, 0.099, 400)).ravel()
+    assert len(las) == np.count_nonzero((every >= 0.15) & (every < 0.32))
+    with pytest.raises(InputError, match="no frames at that time"):
+        kept_by(tmp_path, data, time=(60.0, 70.0))
+
+
+def test_a_box_and_a_polygon_select_the_returns_within_both(tmp_path):
+    data = dataset(tmp_path / "d")
+    xyz = np.concatenate([world_points(k, 400) for k in range(6)])
+    lon, lat = FRAME.to_geographic(xyz[:, 0], xyz[:, 1])
+    west, south, east, north = np.quantile(lon, 0.3), lat.min() - 1, np.quantile(lon, 0.8), np.median(lat)
+    inside = (lon > west) & (lon < east) & (lat < north)
+    assert len(kept_by(tmp_path, data, bounds_deg=(west, south, east, north))) == inside.sum()
+
+    left, low, wide, high = lon.min() - 1e-5, lat.min() - 1e-5, np.ptp(lon), np.ptp(lat)
+    corners = [[left, low], [left + wide, low], [left, low + high], [left, low]]
+    area = {"type": "Polygon", "coordinates": [corners]}
+    share = (lon - left) / wide + (lat - low) / high
+    assert np.abs(share - 1).min() > 1e-7  # no point on the hypotenuse
+    for document in (area, {"type": "Feature", "properties": {}, "geometry": area}):
+        (tmp_path / "area.geojson").write_text(json.dumps(document))
+        found = kept_by(tmp_path, data, polygon=tmp_path / "area.geojson")
+        assert len(found) == np.count_nonzero(share < 1)
+    both = kept_by(tmp_path, data, polygon=tmp_path / "area.geojson", bounds_deg=(west, south, east, north))
+    assert len(both) == np.count_nonzero(inside & (share < 1))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('{"type": "Point", "coordinates": [24.9, 60.1]}', "no polygons"),
+        ("not json", "not a readable GeoJSON"),
+        (
+            '{"type": "Polygon", "coordinates": [[[385000, 1], [385100, 1], [385100, 9], [385000, 1]]]}',
+            "degrees",
+        ),
+    ],
+)
+def test_a_file_that_is_no_region_is_named(tmp_path, text, words):
+    (tmp_path / "area.geojson").write_text(text)
+    with pytest.raises(InputError, match=words):
+        kept_by(tmp_path, dataset(tmp_path / "d", frames=1), polygon=tmp_path / "area.geojson")
+    with pytest.raises(InputError, match="no such file"):
+        kept_by(tmp_path, open_dataset(tmp_path / "d"), polygon=tmp_path / "none.geojson")
+
+
+@pytest.mark.parametrize("kinds", [("laz",), ("pcd",)])
+def test_echoes_and_classes_select_returns(tmp_path, kinds):
+    data = dataset(tmp_path / "d", frames=1, kinds=kinds)
+    path = next((tmp_path / "d" / "top").rglob("000000.*"))
+    form = las if kinds == ("laz",) else pcd
+    second = np.arange(400) % 3 == 1  # of three rows the first two are echoes of one pulse
+    first_of_two = np.append(second[1:], False)
+    table = dict(form.read(path)) | {
+        "echo": np.where(second, 2, 1).astype(np.uint8),
+        "echoes": np.where(second | first_of_two, 2, 1).astype(np.uint8),
+    }
+    info = {"info": LasInfo(CRS_OUT, Georeference(FRAME, CRS_OUT).offset, START)} if form is las else {}
+    form.write(path, {k: table[k] for k in table if k != "classification"}, **info)
+    rows_of = {
+        "all": np.full(400, True),
+        "first": ~second,
+        "last": ~first_of_two,
+        "single": ~second & ~first_of_two,
+    }
+    for echo, expected_rows in rows_of.items():
+        found = kept_by(tmp_path, data, echo=echo)
+        assert np.array_equal(found.instance, np.flatnonzero(expected_rows))
+        assert np.array_equal(found.return_number, table["echo"][expected_rows])
+    only = kept_by(tmp_path, data, only=("road",), echo="last")
+    assert np.array_equal(only.instance, np.flatnonzero(~first_of_two & (table["label"] == Class.ROAD)))
+
+
+def test_origins_are_those_of_the_truth_of_stages(tmp_path):
+    data = dataset(tmp_path / "d", frames=2)
+    truth = tmp_path / "d" / "top" / "truth"
+    truth.mkdir()
+    origin = np.where(np.arange(400) < 30, Origin.INJECTED, Origin.SURFACE).astype(np.uint8)
+    np.savez(truth / "000001.npz", origin=origin)
+    assert len(kept_by(tmp_path, data, origin=("injected",))) == 30
+    assert len(kept_by(tmp_path, data, origin=("surface",))) == 770
+    assert len(kept_by(tmp_path, data, origin=("surface", "injected"))) == 800
+    assert set(kept_by(tmp_path, data, origin=("injected",)).frame) == {1}
+    np.savez(truth / "000001.npz", origin=origin[:100])
+    with pytest.raises(DatasetError, match=r"000001\.npz"):
+        kept_by(tmp_path, data, origin=("injected",))
+
+
+def test_origins_of_options_are_those_of_echoes():
+    assert tuple(one.name.lower() for one in Origin) == ORIGINS
 
 
 def test_noise_is_left_out_and_counted_by_default(tmp_path):
@@ -203,9 +322,9 @@ def test_noise_is_left_out_and_counted_by_default(tmp_path):
     table = dict(pcd.read(path))
     pcd.write(path, table | {"label": np.where(np.arange(400) < 7, Class.NOISE, table["label"])})
     summary = aggregate(data, tmp_path / "m.laz")
-    assert (summary.points, summary.noise, summary.points_in) == (793, 7, 800)
+    assert (summary.points, summary.left_out["noise"], summary.points_in) == (793, 7, 800)
     kept = aggregate(data, tmp_path / "n.laz", options=MapOptions(noise=True))
-    assert (kept.points, kept.noise) == (800, 0)
+    assert (kept.points, kept.left_out.get("noise", 0)) == (800, 0)
 
 
 def test_moving_road_users_are_left_out_by_default_and_classes_on_request(tmp_path):
@@ -222,7 +341,7 @@ def test_moving_road_users_are_left_out_by_default_and_classes_on_request(tmp_pa
 
     def counts(**options):
         made = aggregate(data, tmp_path / "m.laz", options=MapOptions(**options), overwrite=True)
-        return made.points, made.moving, made.without
+        return made.points, made.left_out.get("moving", 0), made.left_out.get("without", 0)
 
     assert counts() == (789, 11, 0)
     assert counts(moving=True) == (800, 0, 0)

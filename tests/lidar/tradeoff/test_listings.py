@@ -9,7 +9,7 @@ import pytest
 from geoscene.frames import Frame
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
-from lidar.maps.aggregate import nearest_to_centre
+from lidar.maps.voxels import nearest_to_centre
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.tradeoff.engine import tradeoff
 from lidar.tradeoff.errors import cloud_distances

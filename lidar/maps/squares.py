@@ -1,0 +1,111 @@
+"""Points sorted into squares of the plane, in files beside the map: what does not fit memory is on disk."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lidar.dataset.formats.table import Table, records, rows
+
+Square = tuple[int, int]
+"""Column and row of a square: its lower left corner over its side."""
+
+_CHUNK = 1_000_000
+"""Points of a table that is read back."""
+
+
+class Squares:
+    """Records of points by square; coordinates are less a whole-metre offset, so that borders are exact.
+
+    side : metres
+    """
+
+    def __init__(self, folder: Path, side: float, *, offset: tuple[float, float, float]) -> None:
+        self.side = side
+        self._folder = folder
+        self._offset = offset
+        self._kinds = np.dtype([])
+        self._found: set[Square] = set()
+
+    def path(self, square: Square) -> Path:
+        """The file of a square."""
+        return self._folder / f"{square[0]}_{square[1]}"
+
+    def records(self, table: Table) -> NDArray[np.void]:
+        """Records of a table, less the offset."""
+        data = records(table)
+        self._kinds = data.dtype
+        for axis, shift in zip("xyz", self._offset, strict=True):
+            data[axis] -= shift
+        return data
+
+    def add(self, data: NDArray[np.void]) -> list[Square]:
+        """Append records of `records`; return the squares that they are in."""
+        column, row = (np.floor(data[axis] / self.side).astype(np.int64) for axis in "xy")
+        order = np.lexsort((row, column))  # stable: points of a square keep their order
+        column, row = column[order], row[order]
+        begins = np.flatnonzero(np.r_[True, (np.diff(column) != 0) | (np.diff(row) != 0)][: len(order)])
+        touched = [(int(column[k]), int(row[k])) for k in begins]
+        for square, mine in zip(touched, np.split(order, begins[1:]), strict=True):
+            with self.path(square).open("ab") as file:
+                file.write(data[mine].tobytes())
+        self._found.update(touched)
+        return touched
+
+    def __iter__(self) -> Iterator[Square]:
+        """Squares with points, in order."""
+        return iter(sorted(self._found))
+
+    def all_of(self, square: Square) -> NDArray[np.void]:
+        """Records of a square, on disk until they are used; none of a square without points."""
+        if square not in self._found:
+            return np.empty(0, self._kinds)
+        mapped: NDArray[np.void] = np.memmap(self.path(square), self._kinds, "r")
+        return mapped
+
+    def tables(self, square: Square) -> Iterator[Table]:
+        """Tables of a square's points, with the offset again."""
+        whole = self.all_of(square)
+        for start in range(0, len(whole), _CHUNK):
+            yield self.table(whole[start : start + _CHUNK])
+
+    def table(self, data: NDArray[Any]) -> Table:
+        """The table of records, with the offset again."""
+        table = {name: np.array(data[name]) for name in data.dtype.names or ()}
+        for axis, shift in zip("xyz", self._offset, strict=True):
+            table[axis] += shift
+        return table
+
+
+@contextmanager
+def squares_beside(
+    out: Path, side: float, *, offset: tuple[float, float, float], what: str
+) -> Iterator[Squares]:
+    """Yield empty `Squares` in a temporary folder beside a map; ``what`` is part of its name."""
+    folder = out.with_name(f"{out.name}.{os.getpid()}.{what}")
+    folder.mkdir(parents=True)
+    try:
+        yield Squares(folder, side, offset=offset)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def sorted_into(squares: Squares, tables: Iterator[Table]) -> None:
+    """Append all points of tables, many at a time."""
+    waiting: list[NDArray[np.void]] = []
+    count = 0
+    for table in tables:
+        waiting.append(squares.records(table))
+        count += rows(table)
+        if count >= _CHUNK:
+            squares.add(np.concatenate(waiting))
+            waiting, count = [], 0
+    if count:
+        squares.add(np.concatenate(waiting))
