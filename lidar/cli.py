@@ -419,6 +419,8 @@ def map_(
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
         counts |= {"left_out": summary.left_out}
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
+        counts |= {"beside": [str(path) for path in summary.beside]}
+        counts |= {"distances": [asdict(row) for row in summary.distances]}
         print_json({"path": str(out), **counts})
     else:
         left = [f"{n:,} of {_LEFT_OUT.get(name, f'--{name}')}" for name, n in summary.left_out.items() if n]
@@ -426,6 +428,13 @@ def map_(
             f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames"
             + (f"; left out: {', '.join(left)}" if left else "")
         )
+        for row in summary.distances:
+            print(
+                f"  {row.name:20} {row.points:>12,} points  mean {1000 * row.mean_m:8.1f} mm"
+                f"  median {1000 * row.median_m:8.1f}  95 % {1000 * row.p95_m:8.1f}"
+            )
+        if summary.beside:
+            print(f"also written: {', '.join(map(str, summary.beside))}")
     if summary.missing:
         lost = ", ".join(f"{count} of {name}" for name, count in summary.missing.items())
         print(

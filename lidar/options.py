@@ -45,6 +45,9 @@ OUTPUT = Group("Output", sort_key=3)
 COLORS = ("class", "height", "intensity", "sensor")
 """What red, green and blue of a map can show."""
 
+RASTERS = ("dsm", "dtm", "density", "intensity")
+"""Rasters of a map."""
+
 ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
 """Origins of returns, `lidar.physics.echoes.Origin` in lower case."""
 
@@ -676,17 +679,31 @@ class MapOptions:
     """Origins of returns to use, separated by commas, by the ground truth of stages: surface, weather,
     interference, injected, replayed, moved, receiver; all by default, but for noise."""
 
+    raster: Annotated[tuple[str, ...], WORDS] = ()
+    """Rasters to write beside the map as GeoTIFF, separated by commas: dsm (highest return), dtm (mean height
+    of the ground's returns), density (returns per square metre), intensity (mean)."""
+
+    resolution: float = 0.5
+    """Side of the rasters' cells in metres."""
+
+    compare: Path | None = None
+    """Scene to compare with: distances from the map's points to its surfaces, as a table and a picture beside
+    the map."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
         for name, known in (("color", COLORS), ("echo", ECHOES)):
             if getattr(self, name) not in known:
                 raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
-        if self.voxel is not None and not 0 < self.voxel < math.inf:
-            raise InputError(f"`voxel` {self.voxel}: give a positive number of metres")
+        for name in ("voxel", "resolution"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise InputError(f"`{name}` {value}: give a positive number of metres")
         classes_of(self.without)
         classes_of(self.only, option="only")
-        if unknown := [name for name in self.origin if name not in ORIGINS]:
-            raise InputError(f"`origin` {unknown[0]}: one of {', '.join(ORIGINS)}")
+        for name, known in (("origin", ORIGINS), ("raster", RASTERS)):
+            if unknown := [word for word in getattr(self, name) if word not in known]:
+                raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(known)}")
         if self.time is not None and not self.time[0] < self.time[1]:
             raise InputError(f"`time` {self.time[0]:g},{self.time[1]:g}: ends before it begins")
         if self.bounds_deg is not None:

@@ -11,12 +11,15 @@ import numpy as np
 
 from geoscene.classes import class_codes
 from geoscene.progress import Progress, silent
+from geoscene.scene import open_scene
 from lidar.dataset.formats import format_of, map_suffixes
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.maps.colors import distinct, ramp
+from lidar.maps.compare import Comparison, Distances
+from lidar.maps.rasters import Rasters
 from lidar.maps.selection import Selection
 from lidar.maps.source import COLUMNS, Source
 from lidar.maps.voxels import thinned
@@ -33,6 +36,8 @@ class MapSummary:
     frames    : frames read
     missing   : number of missing frames, by scanner
     path      : the file
+    beside    : further files: rasters, and those of comparisons
+    distances : to the surfaces of the scene that the map was compared with
     """
 
     points_in: int
@@ -41,6 +46,8 @@ class MapSummary:
     frames: int
     missing: dict[str, int]
     path: Path
+    beside: list[Path]
+    distances: list[Distances]
 
 
 def aggregate(
@@ -58,6 +65,8 @@ def aggregate(
 
     overwrite : replace an existing file
 
+    Rasters and comparisons are beside it, have its name and replace files of earlier maps.
+
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
     out = Path(out)
@@ -72,9 +81,26 @@ def aggregate(
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
         stream = thinned(stream, options.voxel, out=out, offset=source.geo.offset)
+    comparison = None
+    if options.compare is not None:
+        comparison = Comparison(open_scene(options.compare), dataset.frame, crs=dataset.crs)
+        stream = comparison.measured(stream)
+    rasters = Rasters(options.raster, options.resolution)
+    if options.raster:
+        stream = rasters.measured(stream)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
     written = _write(out, (_colored(t, options.color, limits=limits) for t in stream), source=source)
-    return MapSummary(read.points, written, dict(read.left_out), len(read.frames), source.missing(), out)
+    beside = rasters.write(out, crs=dataset.crs)
+    return MapSummary(
+        read.points,
+        written,
+        dict(read.left_out),
+        len(read.frames),
+        source.missing(),
+        out,
+        beside=beside + (comparison.write(out) if comparison else []),
+        distances=comparison.rows() if comparison else [],
+    )
 
 
 def _scanners(dataset: Dataset, options: MapOptions) -> list[str]:

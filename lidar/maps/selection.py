@@ -37,7 +37,7 @@ class Selection:
         self._begin = float(gps_seconds(dataset.start, np.zeros(1, np.int64))[0])
 
     def may_hold(self, start_ns: int, period_ns: int) -> bool:
-        """Whether a frame that lasts from ``start_ns`` of the drive can have returns of the time asked for."""
+        """Whether a frame that lasts from ``start_ns`` can have returns of the time asked for."""
         if self._options.time is None:
             return True
         first, last = (seconds * 1e9 for seconds in self._options.time)
@@ -73,7 +73,7 @@ class Selection:
             yield "moving", np.isin(table["instance"], self._moving(name, frame))
 
     def _origin(self, table: Table, name: str, *, frame: int, row: int) -> NDArray[np.uint8]:
-        """Origins (n,) of returns, by the truth file of stages; without one: surfaces, noise of the receiver."""
+        """Origins (n,) of returns by the truth of stages; without one: surfaces, noise of the receiver."""
         truth = read_truth(self._dataset.frame_file(self._dataset.paths.truth(name, frame)))
         if truth is None:
             noise = table["label"] == Class.NOISE
