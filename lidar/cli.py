@@ -400,7 +400,9 @@ def map_(
 
     lidar map drive -o empty.laz --without vehicles,pedestrian
 
-    lidar map drive -o junction.laz --bbox 24.941,60.165,24.943,60.166 --time 5,15 --echo last
+    lidar map drive -o junction.laz --bbox 24.941,60.165,24.943,60.166 --time 0,10 --echo last
+
+    lidar map drive -o map.laz --raster dsm,dtm --resolution 0.5 --compare scene
 
     Parameters
     ----------

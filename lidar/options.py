@@ -701,9 +701,9 @@ class MapOptions:
                 raise InputError(f"`{name}` {value}: give a positive number of metres")
         classes_of(self.without)
         classes_of(self.only, option="only")
-        for name, known in (("origin", ORIGINS), ("raster", RASTERS)):
-            if unknown := [word for word in getattr(self, name) if word not in known]:
-                raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(known)}")
+        for name, words in (("origin", ORIGINS), ("raster", RASTERS)):
+            if unknown := [word for word in getattr(self, name) if word not in words]:
+                raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(words)}")
         if self.time is not None and not self.time[0] < self.time[1]:
             raise InputError(f"`time` {self.time[0]:g},{self.time[1]:g}: ends before it begins")
         if self.bounds_deg is not None:

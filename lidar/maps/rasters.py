@@ -155,10 +155,12 @@ def _empty() -> _Block:
 def _values(block: _Block, kind: str, *, side: float) -> NDArray[np.float32]:
     """The cells of a block, NaN without points."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = {
-            "dsm": lambda: np.where(block.points > 0, block.top, np.nan),
-            "dtm": lambda: block.ground / block.ground_points,
-            "density": lambda: block.points / side**2,
-            "intensity": lambda: block.intensity / block.points,
-        }[kind]()
+        if kind == "dsm":
+            found = np.where(block.points > 0, block.top, np.nan)
+        elif kind == "dtm":
+            found = block.ground / block.ground_points
+        elif kind == "density":
+            found = block.points / side**2
+        else:
+            found = block.intensity / block.points
     return found.astype(np.float32)

@@ -1,0 +1,98 @@
+"""Maps against true surfaces: distances are those to the nearest triangle, of whatever tile."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.classes import Class
+from geoscene.frames import Frame
+from lidar.errors import InputError
+from lidar.geometry.georeference import Georeference, export_crs
+from lidar.maps.compare import LIMIT, Comparison
+from lidar.maps.surfaces import TrueSurfaces
+from lidar.raycast.nearest import lower_to_nearest
+from lidar.raycast.tree import tree_of
+
+
+def brute_force(points, corners):
+    """Least distances (n,) from points to triangles by trimesh, of all pairs."""
+    best = np.full(len(points), np.inf)
+    for triangle in corners:
+        many = np.broadcast_to(triangle, (len(points), 3, 3))
+        near = trimesh.triangles.closest_point(many, points)
+        best = np.minimum(best, np.linalg.norm(near - points, axis=1))
+    return best
+
+
+@settings(deadline=None, max_examples=60)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 90), flat=st.booleans())
+def test_distances_to_triangles_are_those_of_all_pairs(seed, count, flat):
+    rng = np.random.default_rng(seed)
+    centre = rng.uniform(-20, 20, (count, 1, 3))
+    corners = centre + rng.normal(0, 3, (count, 3, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
+    points = np.concatenate([rng.uniform(-30, 30, (40, 3)), corners[:5, 0], corners[:5].mean(axis=1)])
+    squared = np.full(len(points), np.inf)
+    lower_to_nearest(points, corners, *tree_of(corners.min(axis=1), corners.max(axis=1)), squared)
+    np.testing.assert_allclose(np.sqrt(squared), brute_force(points, corners), rtol=1e-9, atol=1e-9)
+
+
+def test_a_nearer_distance_that_is_known_is_kept():
+    corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    squared = np.array([0.25, 0.25])
+    lower_to_nearest(
+        np.array([[0.2, 0.2, 3.0], [0.2, 0.2, 0.1]]),
+        corners,
+        *tree_of(corners.min(axis=1), corners.max(axis=1)),
+        squared,
+    )
+    np.testing.assert_allclose(squared, [0.25, 0.01])
+
+
+def on_surfaces(scene, count, *, seed=0):
+    """Points (count, 3) on triangles of all tiles and copies of shapes of a scene."""
+    corners = []
+    shapes = [mesh.vertices[mesh.faces] for mesh in scene.shapes().values()]
+    for tile in scene.tiles():
+        corners.append(tile.mesh.vertices[tile.mesh.faces] + tile.origin)
+        for shape, transform in zip(tile.instances.shape, tile.instances.transform, strict=True):
+            placed = shapes[shape] @ transform[:, :3].T + transform[:, 3]
+            corners.append(placed + tile.origin)
+    corners = np.concatenate(corners)
+    rng = np.random.default_rng(seed)
+    share = rng.dirichlet(np.ones(3), count)
+    return np.einsum("nc,ncd->nd", share, corners[rng.integers(len(corners), size=count)]), corners
+
+
+def test_points_on_the_surfaces_of_a_scene_are_at_distance_zero(scene):
+    points, corners = on_surfaces(scene, 3000)
+    assert TrueSurfaces(scene, limit=LIMIT).distances(points).max() < 1e-7  # slivers
+    above = points[:200] + np.random.default_rng(1).normal(0, 1.5, (200, 3))
+    low, high = above[:8].min(axis=0) - LIMIT, above[:8].max(axis=0) + LIMIT
+    near = corners[((corners.max(axis=1) > low) & (corners.min(axis=1) < high)).all(axis=1)]
+    found = TrueSurfaces(scene, limit=LIMIT).distances(above[:8])
+    np.testing.assert_allclose(found, brute_force(above[:8], near), atol=1e-7)
+    far = points[:5] + np.array([0.0, 0.0, 500.0])
+    assert np.isinf(TrueSurfaces(scene, limit=LIMIT).distances(far)).all()
+
+
+def test_percentiles_are_those_of_all_distances(scene):
+    crs = export_crs(scene.frame)
+    points, _ = on_surfaces(scene, 3000)
+    points[:, 2] += np.linspace(0, 3, 3000)
+    true = TrueSurfaces(scene, limit=LIMIT).distances(points)
+    east, north, up = Georeference(scene.frame, crs, exact=True).points(points).T
+    comparison = Comparison(scene, scene.frame, crs=crs)
+    label = np.full(3000, Class.ROAD, np.uint8)
+    list(comparison.measured(iter([{"x": east, "y": north, "z": up, "label": label}])))
+    row = comparison.rows()[0]
+    assert row.median_m == pytest.approx(np.median(true), abs=2e-4)
+    assert row.p95_m == pytest.approx(np.percentile(true, 95), abs=3e-3)
+    assert row.mean_m == pytest.approx(true.mean(), abs=1e-6)
+
+
+def test_a_scene_with_other_heights_is_refused(scene):
+    frame = Frame(scene.frame.wkt, scene.frame.origin, "ellipsoidal")
+    with pytest.raises(InputError, match="ellipsoidal"):
+        Comparison(scene, frame, crs=export_crs(scene.frame))
