@@ -1,10 +1,13 @@
 """Maps against true surfaces: distances are those to the nearest triangle, of whatever tile."""
 
+import csv
+
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
@@ -75,6 +78,33 @@ def test_points_on_the_surfaces_of_a_scene_are_at_distance_zero(scene):
     np.testing.assert_allclose(found, brute_force(above[:8], near), atol=1e-7)
     far = points[:5] + np.array([0.0, 0.0, 500.0])
     assert np.isinf(TrueSurfaces(scene, limit=LIMIT).distances(far)).all()
+
+
+def test_rows_and_files_of_a_comparison_hold_the_distances(scene, tmp_path):
+    crs = export_crs(scene.frame)
+    geo = Georeference(scene.frame, crs, exact=True)
+    points, _ = on_surfaces(scene, 4000)
+    points[1000:1010, 2] += 400.0
+    label = np.full(4000, Class.BUILDING, np.uint8)
+    label[:500] = Class.CAR
+    east, north, up = geo.points(points).T
+    table = {"x": east, "y": north, "z": up, "label": label}
+    comparison = Comparison(scene, scene.frame, crs=crs)
+    halves = [{k: v[:2000] for k, v in table.items()}, {k: v[2000:] for k, v in table.items()}]
+    assert sum(len(t["x"]) for t in comparison.measured(iter(halves))) == 4000
+    rows = {row.name: row for row in comparison.rows()}
+    assert set(rows) == {"all", "all but road users", "building", "car"}
+    assert (rows["all"].points, rows["car"].points, rows["all but road users"].points) == (4000, 500, 3500)
+    assert rows["building"].beyond == 10
+    assert rows["building"].largest_m == LIMIT
+    assert rows["building"].mean_m == pytest.approx(10 * LIMIT / 3500, abs=1e-6)
+    assert rows["all"].median_m < 1e-4
+    table_path, picture = comparison.write(tmp_path / "m.laz")
+    read = list(csv.DictReader(table_path.read_text().splitlines()))
+    assert [row["name"] for row in read] == list(rows)
+    assert float(read[0]["mean_m"]) == pytest.approx(rows["all"].mean_m, rel=1e-5)
+    pixels = np.asarray(Image.open(picture))
+    assert len(np.unique(pixels.reshape(-1, 3), axis=0)) > 5
 
 
 def test_percentiles_are_those_of_all_distances(scene):
