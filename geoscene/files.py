@@ -177,7 +177,12 @@ def write_atomically(path: Path, *data: bytes | NDArray[Any]) -> None:
 
 def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> None:
     """Write a document as indented UTF-8 JSON."""
-    write_atomically(path, (json.dumps(document, indent=indent, ensure_ascii=False) + "\n").encode("utf-8"))
+    write_atomically(path, json_bytes(document, indent=indent))
+
+
+def json_bytes(document: Mapping[str, Any], *, indent: int = 2) -> bytes:
+    """A document as `write_json` writes it."""
+    return (json.dumps(document, indent=indent, ensure_ascii=False) + "\n").encode("utf-8")
 
 
 @contextmanager

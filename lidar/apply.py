@@ -20,6 +20,7 @@ from lidar.attacks.sight import Seen, check_sight
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.camera.render import Frame as Image
 from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.foreign import (
     KITTI,
@@ -37,6 +38,7 @@ from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples, record_fixes, record_samples
+from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.record_clouds import sent_pulses
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import Surroundings, situation_of, situation_of_unit, surroundings_of
@@ -118,6 +120,8 @@ def apply_stages(
             done = _apply_to_dataset(dataset, part, stages=options.all_stages, progress=progress)
         else:
             done = _apply_to_clouds(clouds, source, out=part, options=options, progress=progress)
+            write_folder_provenance(source, part, by="apply")
+        write_checksums(part)
     return replace(done, path=out)
 
 
@@ -175,7 +179,8 @@ def _apply_to_dataset(
         merge_box_files(out)
     applied = [*recipe.get("applied_stages", ()), *(listed(s, seed=chosen.seed) for s in chosen.stages)]
     recipe |= {"applied_stages": applied, "settings": with_stage_settings(recipe["settings"], stages)}
-    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points})
+    parents = derived_from(dataset.path, dataset.manifest, by="apply")
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points} | parents)
     sight = ("returns" if around is None else "scene") if has_devices else ""
     effects = chosen.effects(recording.effects.counts)
     return ApplySummary(out, len(jobs) + len(units), before, sum(points.values()), effects, sight)

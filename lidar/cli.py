@@ -1003,18 +1003,22 @@ def verify(
     json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> int:
-    """Find what was tampered with in signed data: files, frames, blocks of a ring by 10 degrees, points.
+    """Find files that were changed, lost or added, and with keys what was tampered with in signed data.
 
-    Exits with 1 if anything was.
+    Without keys all files are compared with checksums.sha256. With keys the watermark, the signed hash chain
+    or both are verified: files, frames, blocks of a ring by 10 degrees, points. Exits with 1 if anything is
+    found.
 
     For example:
+
+    lidar verify drive
 
     lidar verify signed --watermark secret.key --chain secret.key
 
     Parameters
     ----------
     dataset
-        Directory of the dataset, or of clouds of KITTI or nuScenes.
+        Directory of the dataset or export, or of clouds of KITTI or nuScenes; without keys also a URL.
     noise
         Standard deviation in metres that coordinates got since the watermark, such as by another format.
     false_alarms

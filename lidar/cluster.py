@@ -48,12 +48,12 @@ class _Task:
 class _Done:
     """What a task has recorded.
 
-    frames  : sensor, frame, points, digest
+    frames  : sensor, frame, points, SHA-256 of the files
     seconds : by stage
     effects : what stages of signals did
     """
 
-    frames: tuple[tuple[str, int, int, str], ...]
+    frames: tuple[tuple[str, int, int, bytes], ...]
     seconds: dict[str, float]
     effects: Counts
 
@@ -84,8 +84,8 @@ def record_on_cluster(
     write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=plan.jobs[:0])))
     try:
         for result in cluster.run_tasks(_recorded, tasks):
-            for sensor, frame, points, digest in result.frames:
-                journal.add(sensor, frame, points=points, digest=digest)
+            for sensor, frame, points, digests in result.frames:
+                journal.add(sensor, frame, points=points, digests=digests)
             recording.watch.add(result.seconds)
             for stage, counts in result.effects.items():
                 recording.effects.add(stage, counts)
@@ -129,5 +129,5 @@ def _recorded(task: _Task) -> _Done:
         sensor = _station.sensors[row]
         points = record_frame(recording, sensor, frame=frame, worlds=worlds)
         with recording.watch.stage("digest"):
-            frames.append((sensor.name, frame, points, recording.digest(sensor, frame)))
+            frames.append((sensor.name, frame, points, recording.digests(sensor, frame)))
     return _Done(tuple(frames), dict(recording.watch.seconds), dict(recording.effects.counts))

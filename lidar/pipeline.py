@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import hashlib
 import os
 import shutil
 import sys
@@ -20,14 +21,15 @@ from numba.core.event import Event, Listener, install_listener
 
 from geoscene.cluster import Cluster, connected
 from geoscene.errors import GeosceneError
-from geoscene.files import exclusive, write_json
+from geoscene.files import exclusive, json_bytes, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.attacks.sight import Seen, check_sight, sent_only
 from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
-from lidar.dataset.journal import Entries, Journal, read_journal
+from lidar.dataset.checksums import write_checksums
+from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
@@ -183,10 +185,13 @@ def _driven(
         if plan.actors is not None:
             merge_box_files(out)
         manifest |= {"points": points, "frames_done": manifest["frames"]}
-        write_json(Paths(out).manifest, manifest)
-        wall = time.perf_counter() - began
+        checking_from = time.perf_counter()
         if check is not None:
-            write_json(Paths(out).manifest, manifest | dict(check(plan)))
+            write_json(Paths(out).manifest, manifest)
+            manifest |= check(plan)
+        began += time.perf_counter() - checking_from  # what a drive takes is without measuring its errors
+        _finish(recording, plan.jobs, manifest=manifest, journal=journal)
+        wall = time.perf_counter() - began
     return DriveSummary(
         out,
         int(manifest["frames"]),
@@ -201,6 +206,20 @@ def _driven(
         stages=recording.watch.seconds,
         effects=recording.contents.stages.effects(recording.effects.counts),
     )
+
+
+def _finish(recording: Recording, jobs: Sequence[Job], *, manifest: dict[str, Any], journal: Journal) -> None:
+    """Write the checksums of all files and then the manifest, which marks a finished drive."""
+    path, known = Paths(recording.out).manifest, dict[str, bytes]()
+    for job in jobs:
+        files = recording.paths(job.sensor, job.frame).values()
+        digests = journal.file_digests(job.sensor.name, job.frame, count=len(files))
+        names = (file.relative_to(recording.out).as_posix() for file in files)
+        known |= zip(names, digests, strict=True)
+    known[path.name] = hashlib.sha256(json_bytes(manifest)).digest()
+    with recording.watch.stage("checksums"):
+        write_checksums(recording.out, known=known)
+    write_json(path, manifest)
 
 
 def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Situation, Callable[[], Seen]]]:
@@ -249,7 +268,7 @@ def _write_plan(plan: DrivePlan, recording: Recording, *, manifest: dict[str, An
 def _verified(recording: Recording, jobs: Sequence[Job], *, progress: Progress) -> Journal:
     """The journal of the dataset, with only those of the frames whose files are as they were written."""
     path = Paths(recording.out).journal
-    old, kept = read_journal(path), Entries()
+    old, journal = read_journal(path), Journal(path)
     tables = {name: old.of(name) for name in old.sensors}
     for k, job in enumerate(jobs if tables else ()):
         progress("verifying", k, total=len(jobs))
@@ -257,10 +276,11 @@ def _verified(recording: Recording, jobs: Sequence[Job], *, progress: Progress) 
         row = -1 if table is None else table.row(job.frame)
         if table is None or row < 0:
             continue
-        points, digest = int(table.points[row]), table.digest[row].decode()
-        if digest == recording.digest(job.sensor, job.frame):
-            kept.add(job.sensor.name, job.frame, points=points, digest=digest)
-    return Journal(path, kept)
+        digests = recording.digests(job.sensor, job.frame)
+        if digests and table.digest[row].decode() == frame_digest(digests):
+            journal.keep(job.sensor.name, job.frame, points=int(table.points[row]), digests=digests)
+    journal.begin()
+    return journal
 
 
 def _pending(plan: DrivePlan, journal: Journal) -> Jobs:
@@ -338,8 +358,8 @@ def _record(recording: Recording, job: Job, *, worlds: Worlds, journal: Journal)
     """Record one frame and add it to the journal."""
     points = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
     with recording.watch.stage("digest"):
-        digest = recording.digest(job.sensor, job.frame)
-    journal.add(job.sensor.name, job.frame, points=points, digest=digest)
+        digests = recording.digests(job.sensor, job.frame)
+    journal.add(job.sensor.name, job.frame, points=points, digests=digests)
 
 
 def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:

@@ -20,6 +20,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar import __version__
 from lidar.attacks.placed_object import with_objects
+from lidar.dataset.provenance import scene_provenance, versions
 from lidar.dataset.recording import Recording
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs
@@ -177,8 +178,8 @@ class DrivePlan:
         manifest = {
             "schema": 1,
             "generator": f"geoscene lidar {__version__}",
-            "scene": {"name": scene.manifest.get("name", ""), "path": scene.location},
-            "attribution": scene.manifest.get("attribution", ""),
+            "versions": versions(),
+            **scene_provenance(scene),
             "frame": scene.frame.to_json(),
             "export_crs": self.geo.crs.to_wkt(),
             "start_time": self.start.isoformat(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,11 +11,13 @@ from numpy.typing import NDArray
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
+from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import read_rows, table_cloud
 from lidar.dataset.layout import Dataset, Paths
+from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.record_clouds import write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Recording
@@ -98,7 +99,9 @@ def sign_dataset(
             raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
         if Paths(source).integrity.exists() and not overwrite:
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
-        return _chained(given, signer, summary=SignSummary(source), progress=progress)
+        summary = _chained(given, signer, summary=SignSummary(source), progress=progress)
+        add_to_checksums(source, below=given.integrity.name)
+        return summary
     out = Path(out)
     check_target(out, source=source, overwrite=overwrite)
     with complete_folder(out) as part:
@@ -110,6 +113,7 @@ def sign_dataset(
         else:
             summary = _marked(dataset, summary, watermark=watermark, progress=progress)
         summary = _chained(signable(part), signer, summary=summary, progress=progress)
+        write_checksums(part)
     return replace(summary, path=out)
 
 
@@ -145,7 +149,8 @@ def _marked(
         squares, points = squares + float(moved @ moved), points + len(moved)
     progress("watermark", len(jobs), total=len(jobs))
     recipe = recipe | {"watermark": watermark.step}
-    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe})
+    parents = derived_from(dataset.path, dataset.manifest, by="sign")
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe} | parents)
     return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
 
 
@@ -171,6 +176,7 @@ def _marked_clouds(
         squares, points = squares + float(moved @ moved), points + len(moved)
     progress("watermark", len(clouds), total=len(clouds))
     marks.parent.mkdir(exist_ok=True)
+    write_folder_provenance(source, out, by="sign")
     write_json(marks, {"schema": SCHEMA, "step": watermark.step, "clouds": len(clouds)})
     return replace(summary, marked=len(clouds), rms=float(np.sqrt(squares / max(points, 1))))
 
@@ -222,12 +228,6 @@ def _mark_frame(
     cloud = replace(cloud, xyz=xyz, range=cloud.range + longer)
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=table.get("velocity"))
     return moved
-
-
-def file_digest(path: Path) -> bytes:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
 
 
 def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:

@@ -1,4 +1,4 @@
-"""Verifies the watermark and the signed hash chain of datasets, and names what was tampered with."""
+"""Verifies checksums, the watermark and the signed hash chain of datasets, and names what was changed."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.files import digest
 from geoscene.progress import Progress, silent
+from geoscene.storage import Stored, cache_folder, shown, url_of
 from geoscene.typing import Ints
-from lidar.dataset.layout import reading_file
+from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
+from lidar.dataset.layout import Paths, open_dataset, reading_file
 from lidar.dataset.signable import Signable, is_truth, signable
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.integrity.blocks import SECTORS
@@ -23,7 +26,10 @@ from lidar.integrity.merkle import START, link, signed_message
 from lidar.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
 from lidar.integrity.watermark import SPREAD, Watermark
 from lidar.marked_clouds import MarkedCloud, cloud_files
-from lidar.sign import SCHEMA, blocks_in, file_digest
+from lidar.sign import SCHEMA, blocks_in
+
+SCENE = "scene.json"
+"""The manifest of a scene."""
 
 
 @dataclass(frozen=True)
@@ -130,17 +136,32 @@ class WatermarkReport:
 
 
 @dataclass(frozen=True)
-class VerifyReport:
-    """What watermark and hash chain say; None for what was not asked for."""
+class ChecksumReport:
+    """What the checksums of a folder say.
 
-    watermark: WatermarkReport | None
-    chain: ChainReport | None
+    files  : that have checksums
+    digest : of the folder, hexadecimal; empty if it has no checksums
+    """
+
+    files: int
+    digest: str
+    findings: tuple[Finding, ...]
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """What watermark, hash chain and checksums say; None for what was not asked for."""
+
+    watermark: WatermarkReport | None = None
+    chain: ChainReport | None = None
+    checksums: ChecksumReport | None = None
 
     @property
     def intact(self) -> bool:
         """Whether nothing was found."""
         marks = self.watermark is None or not (self.watermark.frames or self.watermark.findings)
-        return marks and (self.chain is None or not self.chain.findings)
+        lists = [one for one in (self.chain, self.checksums) if one is not None]
+        return marks and not any(one.findings for one in lists)
 
     def to_json(self) -> dict[str, Any]:
         """The report as a document."""
@@ -150,11 +171,17 @@ class VerifyReport:
             document["watermark"] = asdict(self.watermark) | rates
         if self.chain is not None:
             document["chain"] = asdict(self.chain)
+        if self.checksums is not None:
+            document["checksums"] = asdict(self.checksums)
         return document
 
     def to_text(self, name: str) -> list[str]:
         """Lines: what was found, and a summary of the dataset called ``name``."""
         lines = []
+        if (sums := self.checksums) is not None:
+            lines += [finding.to_text() for finding in sums.findings]
+            found = f"{len(sums.findings)} findings" if sums.findings else "all as written"
+            lines.append(f"{name}: checksums of {sums.files:,} files: {found}")
         if (chain := self.chain) is not None:
             lines += [finding.to_text() for finding in chain.findings]
             counts = f"{chain.frames} frames, {chain.files} files"
@@ -181,16 +208,20 @@ def verify_dataset(
     false_alarms: float = 0.01,
     progress: Progress = silent,
 ) -> VerifyReport:
-    """What was tampered with since `lidar.sign.sign_dataset`.
+    """What was changed since a folder was written or, with keys, tampered with since `sign_dataset`.
+
+    Without ``watermark`` and ``signer`` the checksums of the folder, which may be at a URL, are compared:
+    they find damage, but whoever changes files can also change them.
 
     noise        : standard deviation in metres that coordinates got since, such as by another format
     false_alarms : blocks of a cloud that the watermark's test may report wrongly
 
-    Raises InputError and DatasetError for a dataset without a watermark or signature that is asked for.
+    Raises InputError and DatasetError for a dataset without a watermark or signature that is asked for, and
+    for a folder that never had checksums.
     """
-    data = signable(Path(path))
     if watermark is None and signer is None:
-        raise InputError("give `watermark`, `chain` or both")
+        return VerifyReport(checksums=_checksum_report(path, progress=progress))
+    data = signable(Path(path))
     if not 0 <= noise <= 1:
         raise InputError(f"`noise` {noise:g}: give 0 to 1 metre")
     if not 0 < false_alarms <= 100:
@@ -200,6 +231,45 @@ def verify_dataset(
     if watermark is not None:
         marks = _watermark_report(data, watermark, noise=noise, false_alarms=false_alarms, progress=progress)
     return VerifyReport(marks, chain)
+
+
+def _checksum_report(path: str | Path, *, progress: Progress) -> ChecksumReport:
+    folder = Path(path)
+    if url := url_of(path):
+        folder = cache_folder() / "datasets" / digest(url.encode())
+        Stored(url).mirror(folder, progress=progress)
+    place = Paths(folder).checksums
+    if not place.is_file():
+        _check_lost(folder, shown(Path(path)))
+        how = "files cannot be compared; the command that made the folder writes it again"
+        return ChecksumReport(0, "", (Finding("missing", place.name, how),))
+    stated = read_checksums(place)
+    found = (
+        Finding(one.what, one.name, one.detail) for one in differences(folder, stated, progress=progress)
+    )
+    return ChecksumReport(len(stated.sha256), stated.digest, tuple(found))
+
+
+def _check_lost(folder: Path, name: str) -> None:
+    """Check that a folder without checksums has lost them.
+
+    Raises DatasetError for one that cannot have had them.
+    """
+    if not folder.is_dir():
+        raise DatasetError(
+            f"{name}: {'is a file; give its directory' if folder.exists() else 'is not there'}"
+        )
+    if Paths(folder).manifest.exists():
+        dataset = open_dataset(folder)
+        if dataset.manifest["frames_done"] != dataset.frames:
+            raise DatasetError(f"{name}: the drive was not finished; the same lidar drive command resumes it")
+    elif (folder / SCENE).is_file():
+        raise DatasetError(f"{name}: is a scene; geoscene validate checks it")
+    else:
+        raise DatasetError(
+            f"{name}: has no {CHECKSUMS}, which folders written by lidar have; `watermark` and `chain`"
+            " verify signed ones"
+        )
 
 
 def block_text(blocks: Ints, *, world: bool, rings: bool = True, most: int = 4) -> str:

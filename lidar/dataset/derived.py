@@ -53,10 +53,11 @@ def complete_folder(out: Path) -> Iterator[Path]:
 
 
 def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:
-    """Copy a directory but for some files, named as in ``out``."""
+    """Copy a directory but for its checksums and some files, named as in ``out``."""
+    left = leave_out | {Paths(out).checksums}
 
     def skip(folder: str, names: list[str]) -> list[str]:
         place = out / Path(folder).relative_to(source)
-        return [name for name in names if place / name in leave_out]
+        return [name for name in names if place / name in left]
 
     shutil.copytree(source, out, ignore=skip, dirs_exist_ok=True)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from geoscene.columns import Columns
 from geoscene.csv_tables import table_blocks, write_blocks
 from geoscene.typing import Ints
+from lidar.dataset.checksums import file_digest
 
 _HEADER = ("sensor", "frame", "points", "digest")
 _DIGEST = 20
@@ -24,17 +25,17 @@ _DIGEST = 20
 _LARGEST = 1 << 62
 
 
-def digest_of_files(paths: Iterable[Path]) -> str:
-    """Digest of the contents of files in order; empty if one of them cannot be read."""
-    digest = hashlib.sha256()
+def digests_of_files(paths: Iterable[Path]) -> bytes:
+    """SHA-256 of files, one after another; empty if one of them cannot be read."""
     try:
-        for path in paths:
-            data = path.read_bytes()
-            digest.update(len(data).to_bytes(8))
-            digest.update(data)
+        return b"".join(file_digest(path) for path in paths)
     except OSError:
-        return ""
-    return digest.hexdigest()[:_DIGEST]
+        return b""
+
+
+def frame_digest(digests: bytes) -> str:
+    """Digest of a frame by the digests of its files; empty without any."""
+    return hashlib.sha256(digests).hexdigest()[:_DIGEST] if digests else ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,16 +129,38 @@ class Journal:
     entries : those of earlier runs among them
     """
 
-    def __init__(self, path: Path, entries: Entries) -> None:
-        self.path, self.entries, self._lock = path, entries, threading.Lock()
-        write_journal(path, self.entries)
+    def __init__(self, path: Path) -> None:
+        self.path, self.entries, self._lock = path, Entries(), threading.Lock()
+        self._files: dict[str, bytearray] = {}
 
-    def add(self, sensor: str, frame: int, *, points: int, digest: str) -> None:
-        """Add a frame whose files are written."""
+    def keep(self, sensor: str, frame: int, *, points: int, digests: bytes) -> None:
+        """Keep a frame of an earlier run; before `begin`."""
+        self.entries.add(sensor, frame, points=points, digest=frame_digest(digests))
+        own = self._files.setdefault(sensor, bytearray())
+        at = frame * len(digests)
+        own.extend(bytes(max(at + len(digests) - len(own), 0)))
+        own[at : at + len(digests)] = digests
+
+    def begin(self) -> None:
+        """Write the file with the frames that were kept."""
+        write_journal(self.path, self.entries)
+
+    def add(self, sensor: str, frame: int, *, points: int, digests: bytes) -> None:
+        """Add a frame whose files are written.
+
+        digests : SHA-256 of the files, one after another; as many of each frame of a sensor
+        """
         with self._lock:
-            self.entries.add(sensor, frame, points=points, digest=digest)
+            self.keep(sensor, frame, points=points, digests=digests)
             with self.path.open("a", encoding="utf-8") as file:
-                file.write(f"{sensor},{frame},{points},{digest}\n")
+                file.write(f"{sensor},{frame},{points},{frame_digest(digests)}\n")
+
+    def file_digests(self, sensor: str, frame: int, *, count: int) -> list[bytes]:
+        """SHA-256 of the files of a finished frame, of which there are ``count``."""
+        size = hashlib.sha256().digest_size
+        at = frame * count * size
+        own = self._files[sensor][at : at + count * size]
+        return [bytes(own[k : k + size]) for k in range(0, len(own), size)]
 
     def close(self) -> None:
         """Write the file anew, in order."""

@@ -8,6 +8,7 @@ DATASET/
   gnss.csv, imu.csv       measured, by the receivers' and units' names
   boxes.csv               road users in 3D, at the frames of the first scanner
   frames.csv              finished frames, with their points and digests of their files
+  checksums.sha256        checksums of all other files
   <sensor>/<format>/<frame>.<ext>
   <sensor>/truth/<frame>.npz  changes by stages; only with stages
   integrity/              digests and the signature of `lidar sign`
@@ -36,6 +37,7 @@ from geoscene.files import digest
 from geoscene.frames import Frame
 from geoscene.storage import Stored, cache_folder, url_of
 from geoscene.typing import Ints
+from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
@@ -65,6 +67,11 @@ class Paths:
     def journal(self) -> Path:
         """Finished frames with their points and digests; a drive that is resumed verifies them."""
         return self.root / "frames.csv"
+
+    @property
+    def checksums(self) -> Path:
+        """Checksums of all other files; written when the dataset is complete."""
+        return self.root / CHECKSUMS
 
     @property
     def calibration(self) -> Path:
@@ -343,6 +350,7 @@ def remove_dataset(path: Path) -> None:
     with suppress(DatasetError):
         sensors = set(read_sensors(paths))
     top = {paths.calibration, paths.trajectory, paths.poses, paths.boxes, paths.journal, paths.manifest}
+    top.add(paths.checksums)
     top |= {
         paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea", ".truth.csv")
     }

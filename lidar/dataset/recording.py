@@ -20,7 +20,7 @@ from lidar.camera.settings import CameraSettings
 from lidar.dataset.deskew import MOMENTS
 from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
 from lidar.dataset.formats.las import LasInfo
-from lidar.dataset.journal import digest_of_files
+from lidar.dataset.journal import digests_of_files
 from lidar.dataset.layout import Paths
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
@@ -178,9 +178,9 @@ class Recording:
             files[f"labels {row.name}"] = row.path(paths.sensor(name), frame)
         return files
 
-    def digest(self, sensor: Scanner | Camera, frame: int) -> str:
-        """Digest of the files of a frame; empty if one is missing."""
-        return digest_of_files(self.paths(sensor, frame).values())
+    def digests(self, sensor: Scanner | Camera, frame: int) -> bytes:
+        """SHA-256 of the files of a frame in the order of `paths`; empty if one is missing."""
+        return digests_of_files(self.paths(sensor, frame).values())
 
     def has_stages(self, sensor: Scanner | Camera) -> bool:
         """Whether stages act on a sensor's clouds or colour images."""

@@ -7,6 +7,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
+from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.layout import Dataset, Paths, open_dataset
 from lidar.errors import DatasetError
@@ -14,6 +15,9 @@ from lidar.errors import DatasetError
 _FRAME = re.compile(r"(\d{6,})[._].*")
 _KEYFRAME = re.compile(r".*__(\d{16})[._].*")
 """Names of nuScenes, which end in microseconds."""
+
+_NOT_SIGNED = ("integrity", CHECKSUMS)
+"""Signatures, and checksums, which are of signatures, too."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,6 @@ def _files_of_folder(path: Path) -> SignedFiles:
 
 
 def _places(path: Path) -> list[Path]:
-    """Paths of the files in a directory, relative to it, in order; without signatures and truth."""
+    """Paths of the files in a directory, relative to it, in order; no signatures, checksums or truth."""
     places = [file.relative_to(path) for file in sorted(path.rglob("*")) if not file.is_dir()]
-    return [place for place in places if place.parts[0] != "integrity" and not is_truth(place)]
+    return [place for place in places if place.parts[0] not in _NOT_SIGNED and not is_truth(place)]

@@ -15,6 +15,7 @@ from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.foreign import (
     foreign_clouds,
@@ -25,6 +26,7 @@ from lidar.dataset.foreign import (
 )
 from lidar.dataset.formats import Format, read_table
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.truth_files import read_truth
 from lidar.denoise.filters import Bools, Filter
@@ -102,6 +104,7 @@ def denoise(
         raise InputError(f"`out` takes the clouds of one method, not of {len(methods)}")
     with complete_folder(out) as part:
         scores = _scores(source, methods, out=part, progress=progress)
+        write_checksums(part)
     return Denoised(source, out, scores)
 
 
@@ -131,8 +134,10 @@ def _scores(
     if out is not None:
         if job is not None:
             job.finish(next(iter(methods)))
-        elif acted := read_foreign_stages(source):
-            write_foreign_stages(out, acted)
+        else:
+            write_folder_provenance(source, out, by="denoise")
+            if acted := read_foreign_stages(source):
+                write_foreign_stages(out, acted)
     return scores
 
 
@@ -185,7 +190,8 @@ class _DatasetJob:
             merge_box_files(self.out)
         manifest = self.dataset.manifest
         recipe = manifest["recipe"] | {"denoised": method}
-        write_json(Paths(self.out).manifest, manifest | {"recipe": recipe, "points": self.points})
+        parents = derived_from(self.dataset.path, manifest, by="denoise")
+        write_json(Paths(self.out).manifest, manifest | {"recipe": recipe, "points": self.points} | parents)
 
 
 class _DatasetFrame(_Frame):

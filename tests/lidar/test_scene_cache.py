@@ -106,6 +106,7 @@ def same_drives(a, b):
         document["recipe"].pop("map", None)
         documents.append(document)
         (folder / "dataset.json").unlink()
+        (folder / "checksums.sha256").unlink()  # of dataset.json, too
     assert documents[0] == documents[1]
     same_files(a, b)
 

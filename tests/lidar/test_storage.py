@@ -30,6 +30,7 @@ def test_drive_and_map_through_a_bucket_have_the_bytes_of_local_ones(s3, scene, 
     assert documents[0] == documents[1]
     for name in ("drive", "fetched"):
         (tmp_path / name / "dataset.json").unlink()
+        (tmp_path / name / "checksums.sha256").unlink()  # of dataset.json, too
     same_files(tmp_path / "drive", tmp_path / "fetched")
     assert open_dataset("s3://bucket/drives/one").scene_path.name == "scene"
 

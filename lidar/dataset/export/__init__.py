@@ -64,11 +64,19 @@ class Exporter:
         """
         if out.exists() and not overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+        from lidar.dataset.checksums import write_checksums  # noqa: PLC0415
+        from lidar.dataset.provenance import write_export_provenance  # noqa: PLC0415
+
         module = importlib.import_module(f"{__name__}.{self.module}")
-        with atomic_folder(out, mark=self.mark, names=self.names) as folder:
+        with atomic_folder(out, mark=self.mark, names=f"{self.names}|{_OURS}") as folder:
             counts = module.export(dataset, folder, progress=progress)
+            write_export_provenance(dataset, folder, by=f"export --to {self.name}")
+            write_checksums(folder)
         return ExportSummary(out, counts, self.hint.format(path=out))
 
+
+_OURS = r"provenance\.json|checksums\.sha256"
+"""Files that every export has."""
 
 EXPORTERS = {
     row.name: row

@@ -13,6 +13,7 @@ from geoscene.errors import InputError as FolderError
 from geoscene.files import write_json
 from geoscene.frames import Frame
 from lidar.dataset.boxes import COLUMNS
+from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.export import EXPORTERS, exporter
 from lidar.dataset.export.kitti_drive import KittiDrive
 from lidar.dataset.export.kitti_objects import truncation
@@ -232,6 +233,7 @@ def test_a_replaced_export_keeps_and_names_the_files_of_others(dataset, tmp_path
     row, out = EXPORTERS["tum"], tmp_path / "tum"
     row.export(dataset, out)
     fresh = {path: path.read_bytes() for path in out.rglob("*.tum")}
+    ours = [out / "provenance.json", out / CHECKSUMS]
     mine = [out / "thesis.txt", out / "sensors" / "top.tum.bak", out / "notes" / "a.md"]
     for path in mine:
         path.parent.mkdir(exist_ok=True)
@@ -239,7 +241,7 @@ def test_a_replaced_export_keeps_and_names_the_files_of_others(dataset, tmp_path
     (out / "sensors" / "gone.tum").write_text("of an earlier rig")
     (out / "sensors" / "top.tum").write_text("damaged")
     row.export(dataset, out, overwrite=True)
-    assert {path for path in out.rglob("*") if path.is_file()} == {*fresh, *mine}
+    assert {path for path in out.rglob("*") if path.is_file()} == {*fresh, *mine, *ours}
     assert {path: path.read_bytes() for path in fresh} == fresh
     assert [path.read_text() for path in mine] == [path.name for path in mine]
     assert all(f"{path}: kept" in caplog.text for path in mine)
