@@ -378,6 +378,46 @@ def tradeoff(
     return 0
 
 
+@app.command
+def info(
+    dataset: Path,
+    /,
+    *,
+    full: Annotated[bool, Parameter(negative=())] = False,
+    json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> int:
+    """Describe recorded data: sensors, frames, points, gaps, stages, extent, sources, licence, size.
+
+    For example:
+
+    lidar info drive
+
+    lidar info drive --full --json
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of a dataset, or directory with clouds of KITTI or nuScenes.
+    full
+        Read all clouds and tables, too: points by class, road users, rates of large tables.
+    json
+        Print all of it as JSON.
+    quiet
+        Show no progress bars.
+    """
+    from lidar.dataset.info import describe  # noqa: PLC0415
+    from lidar.dataset.info_text import info_text  # noqa: PLC0415
+
+    with progress_bar(quiet=quiet) as progress:
+        document = describe(dataset, full=full, progress=progress)
+    if json:
+        print_json(document)
+    else:
+        print(info_text(document))
+    return 0
+
+
 @app.command(name="map")
 def map_(
     dataset: Path,
