@@ -138,10 +138,10 @@ def _dataset(dataset: Dataset, name: str, *, full: bool, progress: Progress) -> 
 
 
 def _stage(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage with its kind: weather, attack or stage."""
+    """A stage with its group: weather, attack or stage."""
     name = str(table["name"])
-    kind = "attack" if name in attack_names() else "weather" if name.startswith("weather") else "stage"
-    return {"kind": kind, **table}
+    group = "attack" if name in attack_names() else "weather" if name.startswith("weather") else "stage"
+    return {"group": group, **table}
 
 
 def _crs_name(dataset: Dataset) -> str:

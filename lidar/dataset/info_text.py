@@ -31,7 +31,7 @@ def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "options", f"route {route}, seed {d['seed']}, fidelity {fidelity}"
     yield "traffic", traffic or "none"
     for stage in d["stages"]:
-        yield stage["kind"], _stage_text(stage)
+        yield stage["group"], _stage_text(stage)
     yield "denoised", d["denoised"]
     if place := d["extent"]:
         lon = f"lon {place['west']:.6f} to {place['east']:.6f}"
@@ -59,7 +59,7 @@ def _folder_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         )
         yield "clouds", f"{place}: {row['frames']:,} {row['format']} clouds, {row['points']:,} points{broken}"
     for stage in d["stages"]:
-        yield stage["kind"], _stage_text(stage)
+        yield stage["group"], _stage_text(stage)
     yield "attribution", str(known.get("attribution", ""))
     yield "made by", str(known.get("generator", ""))
     yield from _state_rows(d, known.get("derived_from", ()))
@@ -83,9 +83,7 @@ def _state_rows(d: Mapping[str, Any], parents: Any) -> Iterator[tuple[str, str]]
 
 
 def _stage_text(stage: Mapping[str, Any]) -> str:
-    values = (
-        f"{k}={_short(v)}" for k, v in stage.items() if k not in ("kind", "name") and v not in (None, "", [])
-    )
+    values = {k: v for k, v in stage.items() if k not in ("group", "name") and v not in (None, "", [])}
     return f"{stage['name']}: {', '.join(f'{k}={_short(v)}' for k, v in values.items())}"
 
 
