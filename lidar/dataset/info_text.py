@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import fields
 from typing import Any
 
+from lidar.errors import InputError
 from lidar.rig.catalog import columns
+from lidar.signal.registry import stage_class
+
+_TOLD = ("kind", "amount", "shape")
+"""Parameters of stages that are stated also if they have their default."""
 
 
 def info_text(document: Mapping[str, Any]) -> str:
@@ -83,8 +90,12 @@ def _state_rows(d: Mapping[str, Any], parents: Any) -> Iterator[tuple[str, str]]
 
 
 def _stage_text(stage: Mapping[str, Any]) -> str:
-    values = {k: v for k, v in stage.items() if k not in ("group", "name") and v not in (None, "", [])}
-    return f"{stage['name']}: {', '.join(f'{k}={_short(v)}' for k, v in values.items())}"
+    """Name of a stage, with what it is of and its parameters that are not the default."""
+    usual: dict[str, Any] = {"seed": None, "sensor": ""}
+    with suppress(InputError):  # a stage of another version
+        usual |= {f.name: f.default for f in fields(stage_class(stage["name"])) if f.name not in _TOLD}
+    own = {k: v for k, v in stage.items() if k not in ("group", "name") and v != usual.get(k)}
+    return ": ".join(filter(None, (stage["name"], ", ".join(f"{k}={_short(v)}" for k, v in own.items()))))
 
 
 def _short(value: Any) -> str:
