@@ -71,9 +71,18 @@ def derived_from(source: Path, former: Mapping[str, Any], *, by: str) -> dict[st
 
 def write_export_provenance(dataset: Dataset, folder: Path, *, by: str) -> None:
     """Write what is known of a dataset to a folder in another layout."""
+    _write_known(dataset, folder / PROVENANCE, by=by)
+
+
+def write_map_provenance(dataset: Dataset, out: Path) -> None:
+    """Write what is known of a dataset beside a map that was made from it."""
+    _write_known(dataset, out.with_name(f"{out.name}.{PROVENANCE}"), by="map")
+
+
+def _write_known(dataset: Dataset, path: Path, *, by: str) -> None:
     manifest = dataset.manifest
     known = {name: manifest[name] for name in _CARRIED if name in manifest}
-    write_json(folder / PROVENANCE, known | derived_from(dataset.path, manifest, by=by))
+    write_json(path, known | derived_from(dataset.path, manifest, by=by))
 
 
 def write_folder_provenance(source: Path, folder: Path, *, by: str) -> None:

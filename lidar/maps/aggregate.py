@@ -16,6 +16,7 @@ from lidar.dataset.formats import format_of, map_suffixes
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
+from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.maps.colors import distinct, ramp
 from lidar.maps.compare import Comparison, Distances
@@ -60,6 +61,8 @@ def aggregate(
 ) -> MapSummary:
     """Write the map of a dataset in the format of the suffix of ``out`` (see `map_suffixes`).
 
+    Sources, licence and the dataset's digest are written beside it, to ``<out>.provenance.json``.
+
     LAS, LAZ, COPC, E57 and PLY hold easting, northing and height in the dataset's export CRS. PCD, whose
     readers take float32, holds the same minus the whole-metre offset that its comment line states.
 
@@ -90,6 +93,7 @@ def aggregate(
         stream = rasters.measured(stream)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
     written = _write(out, (_colored(t, options.color, limits=limits) for t in stream), source=source)
+    write_map_provenance(dataset, out)
     beside = rasters.write(out, crs=dataset.crs)
     return MapSummary(
         read.points,

@@ -26,6 +26,7 @@ from lidar.denoise.filters import read_methods
 from lidar.errors import DatasetError
 from lidar.integrity.keys import Hmac
 from lidar.integrity.watermark import Watermark
+from lidar.maps.aggregate import aggregate
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.pipeline import drive
 from lidar.sign import sign_dataset
@@ -167,6 +168,11 @@ def test_what_is_made_from_a_dataset_names_it_and_has_its_sources(driven, signed
     ]
     for name in ("sources", "licence", "attribution", "scene", "versions", "seed"):
         assert open_dataset(tmp_path / "clean").manifest[name] == manifest[name]
+
+    aggregate(open_dataset(driven), tmp_path / "map.ply")
+    known = json.loads((tmp_path / "map.ply.provenance.json").read_text())
+    assert known["attribution"] == manifest["attribution"]
+    assert known["derived_from"] == [{"by": "lidar map", "from": first}]
 
     EXPORTERS["kitti"].export(open_dataset(driven), tmp_path / "kitti")
     known = json.loads((tmp_path / "kitti/provenance.json").read_text())
