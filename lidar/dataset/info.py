@@ -171,7 +171,8 @@ def _extent(dataset: Dataset) -> dict[str, Any] | None:
     if np.ptp(lon) > 180:  # over the antimeridian: west is then the greater number
         lon = np.where(lon < 0, lon + 360, lon)
     west, east = (float((value + 180) % 360 - 180) for value in (lon.min(), lon.max()))
-    (south, low), (north, high) = places[:, 1:].min(axis=0).tolist(), places[:, 1:].max(axis=0).tolist()
+    south, low = places[:, 1:].min(axis=0).tolist()
+    north, high = places[:, 1:].max(axis=0).tolist()
     return {"west": west, "south": south, "east": east, "north": north, "low_m": low, "high_m": high}
 
 

@@ -43,7 +43,8 @@ def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if place := d["extent"]:
         lon = f"lon {place['west']:.6f} to {place['east']:.6f}"
         lat = f"lat {place['south']:.6f} to {place['north']:.6f}"
-        yield "extent", f"{lon}, {lat}, h {place['low_m']:.1f} to {place['high_m']:.1f} m"
+        low, high = (round(place[name], 1) + 0.0 for name in ("low_m", "high_m"))  # without -0.0
+        yield "extent", f"{lon}, {lat}, h {low:.1f} to {high:.1f} m"
     yield "CRS", f"scene {crs['scene']}, heights {crs['vertical']}; LAS and maps {crs['export']}"
     digest = f", digest {scene['digest']}" if scene.get("digest") else ""
     yield "scene", f"{scene.get('name') or scene.get('path', '')}{digest}"
