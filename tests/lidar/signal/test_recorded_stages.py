@@ -73,9 +73,13 @@ def altered(scene, options, tmp_path_factory):
     return out
 
 
+NAMING = ("dataset.json", "checksums.sha256")
+"""Files that state options and parents of a dataset, and the digest of what states them."""
+
+
 def files(folder):
     """Hash of every file but the manifest, by name."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "dataset.json")
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in NAMING)
     return {str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in paths}
 
 

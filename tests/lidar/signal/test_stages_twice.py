@@ -69,9 +69,13 @@ def snowy(plain, tmp_path_factory):
     return out
 
 
+NAMING = ("dataset.json", "checksums.sha256")
+"""Files that state options and parents of a dataset, and the digest of what states them."""
+
+
 def files(folder):
     """Hash of every file but the manifest and truth files, by name."""
-    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name != "dataset.json")
+    paths = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in NAMING)
     named = {p.relative_to(folder): p for p in paths}
     return {
         str(name): hashlib.sha256(path.read_bytes()).hexdigest()
