@@ -30,7 +30,7 @@ from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
-from lidar.dataset.layout import Paths, prepare
+from lidar.dataset.layout import Paths, own_files, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
 from lidar.dataset.recording import Recording
@@ -218,7 +218,7 @@ def _finish(recording: Recording, jobs: Sequence[Job], *, manifest: dict[str, An
         known |= zip(names, digests, strict=True)
     known[path.name] = hashlib.sha256(json_bytes(manifest)).digest()
     with recording.watch.stage("checksums"):
-        write_checksums(recording.out, known=known)
+        write_checksums(recording.out, known=known, own=own_files(recording.out))
     write_json(path, manifest)
 
 

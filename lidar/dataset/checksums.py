@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -73,12 +73,18 @@ def files_in(folder: Path) -> Iterator[str]:
                     yield name
 
 
-def write_checksums(folder: Path, *, known: Mapping[str, bytes] | None = None) -> str:
-    """Write the checksums of all files of a folder; return the folder's digest.
+def write_checksums(
+    folder: Path,
+    *,
+    known: Mapping[str, bytes] | None = None,
+    own: Callable[[str], bool] = lambda _: True,
+) -> str:
+    """Write the checksums of the files of a folder; return the folder's digest.
 
     known : SHA-256 of files that need not be read
+    own   : which paths are listed; by default all
     """
-    data = _to_bytes(_digests(folder, known or {}))
+    data = _to_bytes(_digests(folder, known or {}, own=own))
     write_atomically(folder / CHECKSUMS, data)
     return _digest_of(data)
 
@@ -142,9 +148,12 @@ def differences(folder: Path, stated: Checksums, *, progress: Progress = silent)
     progress("verify", len(names), total=len(names))
 
 
-def _digests(folder: Path, known: Mapping[str, bytes]) -> dict[str, bytes]:
-    """SHA-256 of all files of a folder."""
-    return {name: known.get(name) or file_digest(folder / name) for name in files_in(folder)}
+def _digests(
+    folder: Path, known: Mapping[str, bytes], *, own: Callable[[str], bool] = lambda _: True
+) -> dict[str, bytes]:
+    """SHA-256 of files of a folder."""
+    names = filter(own, files_in(folder))
+    return {name: known.get(name) or file_digest(folder / name) for name in names}
 
 
 def _to_bytes(sha256: Mapping[str, bytes]) -> bytes:

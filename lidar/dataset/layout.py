@@ -22,7 +22,7 @@ import logging
 import os
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -346,14 +346,7 @@ def remove_dataset(path: Path) -> None:
     paths = Paths(path)
     if (paths.integrity / "chain.json").is_file():
         shutil.rmtree(paths.integrity)
-    sensors: set[str] = set()
-    with suppress(DatasetError):
-        sensors = set(read_sensors(paths))
-    top = {paths.calibration, paths.trajectory, paths.poses, paths.boxes, paths.journal, paths.manifest}
-    top.add(paths.checksums)
-    top |= {
-        paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea", ".truth.csv")
-    }
+    sensors, top = _own_names(paths)
     folders: list[Path] = []
     for entry in sorted(path.rglob("*")):
         place = entry.relative_to(path).parts
@@ -369,6 +362,30 @@ def remove_dataset(path: Path) -> None:
         if not any(folder.iterdir()):
             folder.rmdir()
     paths.manifest.unlink()
+
+
+def own_files(path: Path) -> Callable[[str], bool]:
+    """Whether a path relative to a dataset is that of a file which drives write; others may stand beside."""
+    sensors, top = _own_names(Paths(path))
+
+    def own(name: str) -> bool:
+        place = Path(name).parts
+        return path / name in top or (len(place) > 1 and place[0] in sensors and _of_a_sensor(place[1:]))
+
+    return own
+
+
+def _own_names(paths: Paths) -> tuple[set[str], set[Path]]:
+    """Names of the sensors of a dataset, and its files outside of their folders."""
+    sensors: set[str] = set()
+    with suppress(DatasetError):
+        sensors = set(read_sensors(paths))
+    top = {paths.calibration, paths.trajectory, paths.poses, paths.boxes, paths.journal, paths.manifest}
+    top.add(paths.checksums)
+    top |= {
+        paths.measurements(name, suffix) for name in sensors for suffix in (".csv", ".nmea", ".truth.csv")
+    }
+    return sensors, top
 
 
 _FRAME_FILE = re.compile(r"\d{6,}[._][\w.]+")

@@ -148,6 +148,14 @@ def test_a_resumed_drive_has_the_checksums_of_an_uninterrupted_one(scene, driven
     assert set(read_checksums(again / CHECKSUMS).sha256) == names_in(driven) - {CHECKSUMS}
 
 
+def test_files_of_others_beside_a_drive_are_not_in_its_checksums(scene, driven, tmp_path):
+    again = shutil.copytree(driven, tmp_path / "again")
+    (again / "notes.txt").write_text("mine")
+    drive(scene, again, options=OPTIONS)
+    assert (again / CHECKSUMS).read_bytes() == (driven / CHECKSUMS).read_bytes()
+    assert named(again) == {"notes.txt": "added"}
+
+
 def test_what_is_made_from_a_dataset_names_it_and_has_its_sources(driven, signed, tmp_path):
     first = folder_digest(driven)
     assert first == read_checksums(driven / CHECKSUMS).digest
