@@ -202,7 +202,7 @@ def _write(file: IO[bytes], points: _Bucket, *, encoder: Encoder) -> None:
     file.write(start)
 
     compressor = lazrs.LasZipCompressor(file, laz)
-    keys = []
+    keys: list[Key] = []
     for key, node in _nodes(points, (0, 0, 0, 0), low=facts.low, side=facts.side):
         if keys:
             compressor.finish_current_chunk()
