@@ -23,7 +23,7 @@ from lidar.options import MapOptions
 from lidar.pipeline import drive
 
 _EXTRA = ("ring", "label", "instance", "range", "incidence", "true_range")
-_KINDS = {"ring": "uint16", "label": "uint8", "instance": "int32"}
+_KINDS = {"ring": "uint16", "label": "uint8", "instance": "int32", "frame": "uint32"}
 _VOXEL = 0.1
 
 
@@ -212,17 +212,20 @@ def mapping(setup: Setup) -> Iterator[Case]:
 
 def laspy_map(dataset: Path, out: Path, *, info: LasInfo, voxel: float | None) -> None:
     """The LAS files of a dataset as one, with colours of classes, by laspy and numpy alone."""
-    files = [laspy.read(path) for path in sorted(dataset.rglob("*.las"))]
+    paths = sorted(dataset.rglob("*.las"))
+    files = [laspy.read(path) for path in paths]
     points = np.concatenate([file.points.array for file in files])
+    frame = np.repeat([int(path.stem) for path in paths], [len(file.points) for file in files])
     if voxel:
         xyz = np.column_stack([points[axis] for axis in "XYZ"])
         _, first = np.unique(np.floor(xyz * (SCALE / voxel)).astype(np.int64), axis=0, return_index=True)
-        points = points[np.sort(first)]
-    las = laspy.LasData(_las_header(info, point_format=7, extra=("ring", "label", "instance")))
+        points, frame = points[np.sort(first)], frame[np.sort(first)]
+    las = laspy.LasData(_las_header(info, point_format=7, extra=("ring", "label", "instance", "frame")))
     las.points = laspy.ScaleAwarePointRecord.zeros(len(points), header=las.header)
     for name in las.points.array.dtype.names:
         if name in points.dtype.names:
             las.points.array[name] = points[name]
+    las.frame = frame
     color = class_codes().color[points["label"]].astype(np.uint16) * 257
     las.red, las.green, las.blue = color.T
     las.write(out)
