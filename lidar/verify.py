@@ -13,6 +13,7 @@ import numpy as np
 
 from geoscene.files import digest
 from geoscene.progress import Progress, silent
+from geoscene.scene.layout import SceneFiles
 from geoscene.storage import Stored, cache_folder, shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
@@ -27,9 +28,6 @@ from lidar.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
 from lidar.integrity.watermark import SPREAD, Watermark
 from lidar.marked_clouds import MarkedCloud, cloud_files
 from lidar.sign import SCHEMA, blocks_in
-
-SCENE = "scene.json"
-"""The manifest of a scene."""
 
 
 @dataclass(frozen=True)
@@ -263,7 +261,7 @@ def _check_lost(folder: Path, name: str) -> None:
         dataset = open_dataset(folder)
         if dataset.manifest["frames_done"] != dataset.frames:
             raise DatasetError(f"{name}: the drive was not finished; the same lidar drive command resumes it")
-    elif (folder / SCENE).is_file():
+    elif SceneFiles(folder).manifest.is_file():
         raise DatasetError(f"{name}: is a scene; geoscene validate checks it")
     else:
         raise DatasetError(

@@ -15,6 +15,7 @@ import numpy as np
 
 from geoscene.classes import Class
 from geoscene.progress import Progress, silent
+from geoscene.scene.layout import SceneFiles
 from geoscene.storage import shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
@@ -77,7 +78,7 @@ def describe(path: str | Path, *, full: bool = False, progress: Progress = silen
     if not folder.is_dir():
         what = "is a file; give the directory of a dataset" if folder.exists() else "is not there"
         raise DatasetError(f"{folder}: {what}")
-    if (folder / "scene.json").is_file():
+    if SceneFiles(folder).manifest.is_file():
         raise DatasetError(f"{folder}: is a scene; geoscene info describes it")
     if (folder / "sweep.json").is_file():
         raise DatasetError(f"{folder}: holds the drives of a sweep; give one of its directories")
