@@ -69,7 +69,7 @@ def snowy(plain, tmp_path_factory):
     return out
 
 
-NAMING = ("dataset.json", "checksums.sha256")
+NAMING = ("dataset.json", "provenance.json", "checksums.sha256")
 """Files that state options and parents of a dataset, and the digest of what states them."""
 
 
