@@ -19,14 +19,14 @@ from lidar.dataset.record_clouds import sent_pulses
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Recording
 from lidar.dataset.signable import Signable
-from lidar.errors import FormatError, InputError
+from lidar.errors import DatasetError, FormatError, InputError
 from lidar.integrity.directions import cells_by_direction, is_marked
 from lidar.integrity.watermark import Cells
 from lidar.rerecord import recording_again
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.specs import rig_of
-from lidar.sign import cells_of, cloud_place, finite, marked_formats
+from lidar.sign import cells_of, cloud_place, marked_formats
 from lidar.time_scales import drive_ns
 
 _STEPS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
@@ -76,7 +76,7 @@ class CloudFile:
         """The cloud; raises LidarError for a file that is missing or damaged."""
         if self.data.dataset is None:
             table = self.form.read(self.path)
-            points = finite(_xyz(table).astype(np.float32), self.path)
+            points = _finite(_xyz(table).astype(np.float32), self.path)
             points = points[is_marked(points)]
             cells = cells_by_direction(points, sensor=self.sensor, frame=self.frame)
             return MarkedCloud(self.place, self.sensor, self.frame, points, cells, coarseness(points))
@@ -188,3 +188,10 @@ def _fired(ring: NDArray[np.int64], time_ns: NDArray[np.int64], *, sent: Firings
 
 def _xyz(table: Table) -> NDArray[np.floating]:
     return np.column_stack([table[axis] for axis in "xyz"])
+
+
+def _finite(xyz: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
+    """Coordinates as they are; raises DatasetError for those that are no numbers."""
+    if not np.isfinite(xyz).all():
+        raise DatasetError(f"{path}: damaged (coordinates that are not numbers)")
+    return xyz

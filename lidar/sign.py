@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.files import write_atomically, write_json
 from geoscene.progress import Progress, silent
@@ -170,7 +169,7 @@ def _marked_clouds(
         progress("watermark", done, total=len(clouds))
         rows = read_rows(path, len(form.columns))
         sensor, frame = cloud_place(source, path)
-        xyz = with_mark(watermark, finite(rows[:, :3], path), sensor=sensor, frame=frame)
+        xyz = with_mark(watermark, rows[:, :3], sensor=sensor, frame=frame)
         moved = np.linalg.norm(xyz - rows[:, :3].astype(np.float64), axis=1)
         write_atomically(out / places[done], np.column_stack([xyz, rows[:, 3:]]).astype("<f4"))
         squares, points = squares + float(moved @ moved), points + len(moved)
@@ -190,13 +189,6 @@ def cloud_place(source: Path, path: Path) -> tuple[str, int]:
     if found is None:
         raise DatasetError(f"{path}: its name has no frame number of six digits or more, nor a time stamp")
     return found
-
-
-def finite(xyz: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """Coordinates as they are; raises DatasetError for those that are no numbers."""
-    if not np.isfinite(xyz).all():
-        raise DatasetError(f"{path}: damaged (coordinates that are not numbers)")
-    return xyz
 
 
 def _kept(name: str) -> bool:

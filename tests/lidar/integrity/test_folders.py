@@ -14,7 +14,7 @@ from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.layout import open_dataset
-from lidar.errors import DatasetError, InputError
+from lidar.errors import DatasetError, FormatError, InputError
 from lidar.integrity.directions import LEAST, cells_by_direction, is_marked, with_mark
 from lidar.integrity.keys import Hmac
 from lidar.integrity.tampering import frame_verdict
@@ -241,7 +241,7 @@ def test_what_cannot_be_signed_is_refused_with_nothing_written(kitti, signed, tm
         sign_dataset(tmp_path / "odd", tmp_path / "out", watermark=MARK)
     np.full(8, np.nan, "<f4").tofile(odd / "000000.bin")
     (odd / "first.bin").unlink()
-    with pytest.raises(DatasetError, match="coordinates that are not numbers"):
+    with pytest.raises(FormatError, match="row 0 has a number that is not finite"):
         sign_dataset(tmp_path / "odd", tmp_path / "out", watermark=MARK)
     (odd / "000000.bin").write_bytes(b"123")
     (tmp_path / "key").write_text("00112233445566778899aabbccddeeff")
