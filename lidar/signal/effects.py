@@ -45,7 +45,7 @@ def row_changes(
     differs = np.zeros(len(new), bool)
     for name in columns:
         unequal = getattr(after, name)[new] != getattr(before, name)[old]
-        differs |= unequal.reshape(len(new), -1).any(axis=1)
+        differs |= unequal.any(axis=tuple(range(1, unequal.ndim)))
     gained = int((~still).sum()) - int((~known).sum())  # of what stages have added
     return {
         f"{unit} added": max(gained, 0),
