@@ -121,7 +121,7 @@ def inputs(tmp_path_factory):
     traffic = TrafficOptions(vehicles=60.0, parked=1.0)
     options = replace(options, duration=1.0, formats=("pcd",), route="random", traffic=traffic)
     trained = lidar.pipeline.drive(scene, folder / "drive1", options=options).path
-    for name in ("drive2", "drive3"):
+    for name in ("drive", "drive2", "drive3"):
         shutil.copytree(trained, folder / name)
     return folder
 
