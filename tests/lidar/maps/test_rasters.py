@@ -44,7 +44,7 @@ def test_each_cell_is_made_of_the_points_in_it(tmp_path_factory, seed, resolutio
         with rasterio.open(path) as raster:
             assert raster.crs.to_epsg() == 32635
             assert raster.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
-            row, column = raster.index(whole["x"], whole["y"])
+            row, column = rasterio.transform.rowcol(raster.transform, whole["x"], whole["y"])
             read[kind] = raster.read(1, masked=True)
             west, _, _, north = raster.bounds
     cells = np.stack([row, column], axis=1)
