@@ -215,7 +215,7 @@ def _finish(recording: Recording, jobs: Sequence[Job], *, manifest: dict[str, An
         files = recording.paths(job.sensor, job.frame).values()
         digests = journal.file_digests(job.sensor.name, job.frame, count=len(files))
         names = (file.relative_to(recording.out).as_posix() for file in files)
-        if digests:
+        if digests:  # none of a frame that was not recorded
             known |= zip(names, digests, strict=True)
     known[path.name] = hashlib.sha256(json_bytes(manifest)).digest()
     with recording.watch.stage("checksums"):

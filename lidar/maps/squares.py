@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.dataset.formats.table import Table, records, rows
+from lidar.dataset.formats.table import Table, records
 
 Square = tuple[int, int]
 """Column and row of a square: its lower left corner over its side."""
-
-_CHUNK = 1_000_000
-"""Points of a table that is read back."""
 
 
 class Squares:
@@ -70,12 +67,6 @@ class Squares:
         mapped: NDArray[np.void] = np.memmap(self.path(square), self._kinds, "r")
         return mapped
 
-    def tables(self, square: Square) -> Iterator[Table]:
-        """Tables of a square's points, with the offset again."""
-        whole = self.all_of(square)
-        for start in range(0, len(whole), _CHUNK):
-            yield self.table(whole[start : start + _CHUNK])
-
     def table(self, data: NDArray[Any]) -> Table:
         """The table of records, with the offset again."""
         table = {name: np.array(data[name]) for name in data.dtype.names or ()}
@@ -95,17 +86,3 @@ def squares_beside(
         yield Squares(folder, side, offset=offset)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def sorted_into(squares: Squares, tables: Iterator[Table]) -> None:
-    """Append all points of tables, many at a time."""
-    waiting: list[NDArray[np.void]] = []
-    count = 0
-    for table in tables:
-        waiting.append(squares.records(table))
-        count += rows(table)
-        if count >= _CHUNK:
-            squares.add(np.concatenate(waiting))
-            waiting, count = [], 0
-    if count:
-        squares.add(np.concatenate(waiting))
