@@ -192,7 +192,8 @@ def test_documented_commands_succeed(source, folder):
 
 def test_example_in_python_succeeds(folder, monkeypatch):
     (example,) = (ROOT / "README.md").read_text("utf-8").split("```python")[1:]
-    shutil.rmtree(folder / "scene")
+    for name in ("scene", "drive"):  # the example writes them
+        shutil.rmtree(folder / name)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(geoscene, "demo_path", geoscene.sources.demo_path)
     monkeypatch.setattr(lidar, "drive", lidar.pipeline.drive)
