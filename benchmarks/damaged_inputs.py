@@ -163,7 +163,7 @@ class Inputs:
             return path, ["lidar", "map", str(data), "-o", f"{f}/m{end}", "--overwrite", *more]
         if kind < 16:
             to = rng.choice(list(EXPORTERS))
-            return path, ["lidar", "export", str(data), "--to", to, "-o", f"{f}/to-{to}", "--overwrite"]
+            return path, ["lidar", "convert", str(data), "--to", to, "-o", f"{f}/to-{to}", "--overwrite"]
         if kind < 17:
             rig = ["--rig", f"{f}/rig0.toml", "--traffic=on"]
             return path, [*self.drive(data.name), f"--format={name}", *_DATASETS[name], *rig]

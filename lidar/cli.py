@@ -35,10 +35,10 @@ from lidar.options import (
     OUTPUT,
     AccuracyOptions,
     ApplyOptions,
+    ConvertOptions,
     DefendOptions,
     DenoiseOptions,
     DriveOptions,
-    ExportOptions,
     MapOptions,
     PlaceOptions,
     PlaybackOptions,
@@ -581,12 +581,12 @@ def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
 
 
 @app.command
-def export(
+def convert(
     dataset: Path,
     /,
     *,
     out: Out,
-    options: ExportOptions = ExportOptions(),
+    options: ConvertOptions,
     report: Reporting = Report(),
 ) -> int:
     """Write a recorded drive in the layout of another dataset.
@@ -595,11 +595,11 @@ def export(
 
     lidar drive scene --route random --rig nuscenes --traffic on --format pcd -o drive
 
-    lidar export drive --to nuscenes -o nuscenes
+    lidar convert drive --to nuscenes -o nuscenes
 
-    lidar export drive --to kitti -o odometry
+    lidar convert drive --to kitti -o odometry
 
-    lidar export drive --to ros2 -o bag
+    lidar convert drive --to ros2 -o bag
 
     Parameters
     ----------

@@ -749,10 +749,10 @@ class PlaybackOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class ExportOptions:
-    """Options of an export of a dataset."""
+class ConvertOptions:
+    """Options of a conversion of a dataset."""
 
-    to: Annotated[str, Parameter(help=_LAYOUTS)] = "nuscenes"
+    to: Annotated[str, Parameter(help=_LAYOUTS)]
 
 
 @Parameter(name="*")

@@ -126,14 +126,14 @@ def fetched_folders():
 
 def test_commands_fetch_the_frames_that_they_read(stored, tmp_path):
     local, url = stored
-    lidar("export", url, "--to", "tum", "-o", tmp_path / "tum")
+    lidar("convert", url, "--to", "tum", "-o", tmp_path / "tum")
     assert not fetched_folders()
     lidar("map", url, "--sensor", "rear", "-o", tmp_path / "stored.laz")
     assert {name: len(files) for name, files in fetched_folders().items()} == {"rear/laz": 3, "rear/boxes": 3}
     lidar("map", local, "--sensor", "rear", "-o", tmp_path / "local.laz")
     assert (tmp_path / "stored.laz").read_bytes() == (tmp_path / "local.laz").read_bytes()
-    lidar("export", url, "--to", "kitti", "-o", tmp_path / "stored")
-    lidar("export", local, "--to", "kitti", "-o", tmp_path / "local")
+    lidar("convert", url, "--to", "kitti", "-o", tmp_path / "stored")
+    lidar("convert", local, "--to", "kitti", "-o", tmp_path / "local")
     same_files(tmp_path / "stored", tmp_path / "local")
     new = {"top/velodyne", "top/labels", "front/rgb"}
     assert set(fetched_folders()) == {"rear/laz", "rear/boxes"} | new

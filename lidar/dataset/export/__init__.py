@@ -70,7 +70,7 @@ class Exporter:
         module = importlib.import_module(f"{__name__}.{self.module}")
         with atomic_folder(out, mark=self.mark, names=f"{self.names}|{_OURS}") as folder:
             counts = module.export(dataset, folder, progress=progress)
-            write_export_provenance(dataset, folder, by=f"export --to {self.name}")
+            write_export_provenance(dataset, folder, by=f"convert --to {self.name}")
             write_checksums(folder)
         return ExportSummary(out, counts, self.hint.format(path=out))
 

@@ -185,10 +185,10 @@ def test_what_is_made_from_a_dataset_names_it_and_has_its_sources(driven, signed
     EXPORTERS["kitti"].export(open_dataset(driven), tmp_path / "kitti")
     known = json.loads((tmp_path / "kitti/provenance.json").read_text())
     assert known["sources"] == manifest["sources"]
-    assert known["derived_from"] == [{"by": "lidar export --to kitti", "from": first}]
+    assert known["derived_from"] == [{"by": "lidar convert --to kitti", "from": first}]
     apply_stages(tmp_path / "kitti", tmp_path / "lossy", options=LOSSY)
     known = json.loads((tmp_path / "lossy/provenance.json").read_text())
-    assert [step["by"] for step in known["derived_from"]] == ["lidar export --to kitti", "lidar apply"]
+    assert [step["by"] for step in known["derived_from"]] == ["lidar convert --to kitti", "lidar apply"]
     assert known["derived_from"][1]["from"] == folder_digest(tmp_path / "kitti")
     assert known["attribution"] == manifest["attribution"]
     for folder in ("clean", "kitti", "lossy"):
