@@ -28,7 +28,6 @@ from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar import __version__
-from lidar.dataset.export import exporter
 from lidar.dataset.formats import map_suffixes
 from lidar.errors import InputError, LidarError
 from lidar.options import (
@@ -589,13 +588,18 @@ def convert(
     options: ConvertOptions,
     report: Reporting = Report(),
 ) -> int:
-    """Write a recorded drive in the layout of another dataset.
+    """Write a recorded drive in the layout of another dataset, or its clouds in another format.
+
+    With a format of clouds, the result is the same dataset with its clouds in this format: those of a drive
+    with --format, byte for byte, if the recorded format keeps all digits.
 
     For example:
 
     lidar drive scene --route random --rig nuscenes --traffic on --format pcd -o drive
 
     lidar convert drive --to nuscenes -o nuscenes
+
+    lidar convert drive --to laz -o drive_laz
 
     lidar convert drive --to kitti -o odometry
 
@@ -608,13 +612,11 @@ def convert(
     out
         Directory to make.
     """
-    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.conversion import convert as converted  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
-        summary = exporter(options.to).export(
-            open_dataset(dataset), out, overwrite=report.overwrite, progress=progress
-        )
+        summary = converted(dataset, out, to=options.to, overwrite=report.overwrite, progress=progress)
     if report.json:
         print_json({"path": str(out), **summary.counts})
     else:

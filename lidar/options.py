@@ -62,7 +62,13 @@ _FORMATS = (
     " (georeferenced)."
 )
 _LABELS = f"Label files in the codes of other datasets, separated by commas: {', '.join(LABELS)}."
-_LAYOUTS = "Layout: " + "; ".join(f"{row.name} ({row.meaning})" for row in EXPORTERS.values()) + "."
+CONVERTED_FORMATS = tuple(name for name in FORMATS if name not in EXPORTERS)
+"""Formats that clouds of datasets are converted to; those of KITTI and nuScenes are parts of layouts."""
+
+_LAYOUTS = (
+    f"Layout: {'; '.join(f'{row.name} ({row.meaning})' for row in EXPORTERS.values())}."
+    f" Or a format of clouds: {', '.join(CONVERTED_FORMATS)}."
+)
 
 
 def _route(_: object, tokens: Sequence[Token]) -> str | Path | list[tuple[float, float]]:

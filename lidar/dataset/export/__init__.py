@@ -143,10 +143,3 @@ EXPORTERS = {
     )
 }
 """Exporters by name."""
-
-
-def exporter(name: str) -> Exporter:
-    """The exporter of a name; raises InputError if there is none."""
-    if name not in EXPORTERS:
-        raise InputError(f"`to` {name}: one of {', '.join(EXPORTERS)}")
-    return EXPORTERS[name]

@@ -45,6 +45,7 @@ class Format:
               clouds are de-skewed to their frame's start, as KITTI's are
     maps    : its module has ``open_map``, which writes aggregated maps; it may have that and no ``write``
     framed  : its files state the frame that they are of
+    exact   : its files keep all digits of a cloud's columns
     extra   : optional dependency that its module needs: a package and the name of the extra
     """
 
@@ -57,6 +58,7 @@ class Format:
     kitti: bool = False
     maps: bool = False
     framed: bool = False
+    exact: bool = True
     extra: str = ""
 
     def path(self, folder: Path, frame: int) -> Path:
@@ -146,11 +148,11 @@ FORMATS = {
         Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
         Format("pcd-compressed", "pcd_compressed", ".compressed.pcd"),
         Format("ply", "ply", ".ply", maps=True),
-        Format("csv", "text", ".csv"),
+        Format("csv", "text", ".csv", exact=False),
         Format("npz", "npz", ".npz"),
         Format("parquet", "parquet", ".parquet", framed=True, extra="pyarrow gis"),
-        Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True),
-        Format("las", "las", ".las", frame="world", columns=_LAS, maps=True),
+        Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True, exact=False),
+        Format("las", "las", ".las", frame="world", columns=_LAS, maps=True, exact=False),
         Format(
             "e57",
             "e57",
@@ -159,6 +161,7 @@ FORMATS = {
             columns=_E57,
             maps=True,
             framed=True,
+            exact=False,
             extra="pye57 e57",
         ),
         Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", kitti=True),

@@ -14,7 +14,7 @@ from geoscene.files import write_json
 from geoscene.frames import Frame
 from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.checksums import CHECKSUMS
-from lidar.dataset.export import EXPORTERS, exporter
+from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.kitti_drive import KittiDrive
 from lidar.dataset.export.kitti_objects import truncation
 from lidar.dataset.export.kitti_raw import oxts_columns
@@ -253,5 +253,3 @@ def test_a_failed_export_leaves_no_files(dataset, tmp_path):
     with pytest.raises(DatasetError, match="was the drive finished"):
         EXPORTERS["tum"].export(dataset, tmp_path / "tum")
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
-    with pytest.raises(InputError, match="`to` waymo: one of kitti, kitti-raw, mcap, nuscenes, ros2, "):
-        exporter("waymo")
