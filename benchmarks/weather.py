@@ -24,9 +24,9 @@ import numpy as np
 from geoscene.scene import open_scene
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import situation_of
+from lidar.frame_loop import chunks
 from lidar.options import DriveOptions
 from lidar.physics.echoes import Origin
-from lidar.pipeline import chunks
 from lidar.plan import DrivePlan, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.sensors.scan import cast, measured

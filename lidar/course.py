@@ -15,9 +15,9 @@ import shapely
 
 from geoscene.reach import RoadMap
 from geoscene.typing import Float
+from lidar.frame_loop import CHUNK
 from lidar.navigation.satellite_visibility import BLOCK_M, REACH
 from lidar.options import DriveOptions
-from lidar.pipeline import CHUNK
 from lidar.plan import flight_options, sensors_of
 from lidar.planning.flight_planning import flight_course
 from lidar.planning.replay import read_replay

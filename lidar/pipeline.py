@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import os
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,8 +22,6 @@ from geoscene.errors import GeosceneError
 from geoscene.files import exclusive, json_bytes, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from geoscene.typing import Float
-from lidar.attacks.sight import Seen, check_sight, sent_only
 from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.checksums import write_checksums
@@ -34,23 +30,14 @@ from lidar.dataset.layout import Paths, own_files, prepare
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
 from lidar.dataset.recording import Recording
-from lidar.dataset.situations import situation_of
 from lidar.errors import LidarError
-from lidar.geometry.poses import Trajectory
+from lidar.frame_loop import check_attackers, recording_chunks, run_jobs
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.signal.effects import Counts
-from lidar.signal.situation import Situation
 from lidar.world.thread_worlds import Worlds
-from lidar.world.world import Region
-
-CHUNK = 200.0
-"""Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
-
-_FORGET_NS = 60 * 10**9
-"""Nanoseconds of a drive after which the memory of long motion is let go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +144,7 @@ def _driven(
     planning_s = time.perf_counter() - planning_from
     manifest = plan.manifest() | dict(notes)
     recording = plan.recording(out)
-    check_sight(recording.contents.stages, _scanner_frames(plan, recording))
+    check_attackers(plan, recording)
     prepare(out, manifest["recipe"], overwrite=overwrite)
     with _removed_if_nothing_recorded(out), exclusive(out):
         journal = _verified(recording, plan.jobs, progress=progress)
@@ -221,22 +208,6 @@ def _finish(recording: Recording, jobs: Sequence[Job], *, manifest: dict[str, An
     with recording.watch.stage("checksums"):
         write_checksums(recording.out, known=known, own=own_files(recording.out))
     write_json(path, manifest)
-
-
-def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Situation, Callable[[], Seen]]]:
-    """Where a drive's scanners take their frames, and what they see there; the world is loaded as needed."""
-    worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.contents.world)
-
-    def seen(scanner: Scanner, frame: int, *, region: Region) -> Seen:
-        worlds.follow(region)
-        world = worlds.during(*scanner.sensor.window_ns(frame))
-        return sent_only(scanner.sensor, situation_of(recording, scanner, frame=frame, world=world))
-
-    for chunk, region in chunks(plan.jobs, recording.trajectory):
-        for job in chunk:
-            if isinstance(job.sensor, Scanner):
-                at = situation_of(recording, job.sensor, frame=job.frame)
-                yield at, partial(seen, job.sensor, job.frame, region=region)
 
 
 def trim_memory() -> None:
@@ -320,94 +291,16 @@ def record_all(
     progress: Progress = silent,
 ) -> None:
     """Record frames and add them to the journal."""
-    done = released_ns = 0
-    progress("driving", done, total=len(jobs))
-    max_range = max((job.sensor.max_range for job in jobs), default=0.0)
-    worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
-    workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
-    with _pool(workers) as pool:
-        for chunk, region in recording_chunks(jobs, recording):
-            with recording.watch.stage("load"):
-                recording.release()
-                worlds.follow(region)
-            running: set[Future[None]] = set()
-            for job in chunk:
-                running.add(pool.submit(_record, recording, job, worlds=worlds, journal=journal))
-                if len(running) >= 2 * workers:
-                    done += _take(running, finished=wait(running, return_when=FIRST_COMPLETED).done)
-                    progress("driving", done, total=len(jobs))
-                if job.start_ns - released_ns > _FORGET_NS:
-                    recording.release()
-                    released_ns = job.start_ns
-            done += _take(running, finished=wait(running).done)
-            progress("driving", done, total=len(jobs))
+    progress("driving", 0, total=len(jobs))
+    task = partial(_record, recording=recording, journal=journal)
+    recorded = run_jobs(task, jobs, recording=recording, scene=scene, workers=workers)
+    for done, _ in enumerate(recorded, 1):
+        progress("driving", done, total=len(jobs))
 
 
-@contextmanager
-def _pool(workers: int) -> Iterator[ThreadPoolExecutor]:
-    """Threads; an error drops waiting tasks, and an interruption does not wait for running ones either."""
-    pool = ThreadPoolExecutor(workers)
-    try:
-        yield pool
-    except BaseException as error:
-        pool.shutdown(wait=isinstance(error, Exception), cancel_futures=True)
-        raise
-    pool.shutdown()
-
-
-def _record(recording: Recording, job: Job, *, worlds: Worlds, journal: Journal) -> None:
+def _record(job: Job, worlds: Worlds, *, recording: Recording, journal: Journal) -> None:
     """Record one frame and add it to the journal."""
     points = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
     with recording.watch.stage("digest"):
         digests = recording.digests(job.sensor, job.frame)
     journal.add(job.sensor.name, job.frame, points=points, digests=digests)
-
-
-def _take(running: set[Future[None]], *, finished: set[Future[None]]) -> int:
-    """Remove finished frames from ``running``, raising their errors; return how many there were."""
-    for future in finished:
-        running.remove(future)
-        future.result()
-    return len(finished)
-
-
-def recording_chunks(jobs: Sequence[Job], recording: Recording) -> Iterator[tuple[Sequence[Job], Region]]:
-    """`chunks` whose boxes also cover the places of earlier frames that stages ask for."""
-    back_ns = recording.contents.stages.lookback_ns
-    for run, box in chunks(jobs, recording.trajectory):
-        yield run, _widened(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
-
-
-def _widened(box: Region, jobs: Sequence[Job], *, trajectory: Trajectory, back_ns: int) -> Region:
-    """A box that also covers where the vehicle was within some time before jobs."""
-    until, spans = 0, []
-    for job in jobs:  # in order of time
-        first = max(job.start_ns - back_ns, until, 0)
-        spans.append(np.arange(first, job.start_ns, job.sensor.period_ns // 4))
-        until = max(until, job.start_ns)
-    places = trajectory.at(np.concatenate(spans)).position[:, :2]
-    xy = np.vstack([places, np.reshape(box, (2, 2))])
-    return _box(xy.min(axis=0), xy.max(axis=0))
-
-
-def chunks(jobs: Sequence[Job], trajectory: Trajectory) -> Iterator[tuple[Sequence[Job], Region]]:
-    """Runs of jobs during which the vehicle stays within a square of `CHUNK`, with the box it covers."""
-    first = 0
-    low = high = np.zeros(2)
-    for row, job in enumerate(jobs):
-        span = np.linspace(job.start_ns, job.start_ns + job.sensor.period_ns, 5).astype(np.int64)
-        xy = trajectory.at(span).position[:, :2]
-        new_low, new_high = xy.min(axis=0), xy.max(axis=0)
-        if row > first:
-            new_low, new_high = np.minimum(low, new_low), np.maximum(high, new_high)
-            if (new_high - new_low).max() > CHUNK:
-                yield jobs[first:row], _box(low, high)
-                first = row
-                new_low, new_high = xy.min(axis=0), xy.max(axis=0)
-        low, high = new_low, new_high
-    if len(jobs):
-        yield jobs[first:], _box(low, high)
-
-
-def _box(low: Float, high: Float) -> Region:
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -9,7 +9,7 @@ from typing import Any
 
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from lidar import pipeline
+from lidar import frame_loop, pipeline
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
@@ -218,7 +218,7 @@ def _planned(scene: Scene, options: DriveOptions, *, profile: Profile, progress:
     began, cpu_began = time.perf_counter(), time.process_time()
     plan = plan_drive(scene, options, progress=progress)
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
-    chunks = sum(1 for _ in pipeline.chunks(plan.jobs, plan.trajectory))
+    chunks = sum(1 for _ in frame_loop.chunks(plan.jobs, plan.trajectory))
     return Planned(plan, seconds, cpu_s=cpu_s, loading=chunks * profile.load_s.high)
 
 

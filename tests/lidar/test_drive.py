@@ -27,9 +27,10 @@ from geoscene.scene import open_scene
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset, prepare
 from lidar.errors import DatasetError, InputError, LidarError
+from lidar.frame_loop import _pool
 from lidar.geometry.attitude import quat_from_euler
 from lidar.options import DriveOptions
-from lidar.pipeline import _pool, drive
+from lidar.pipeline import drive
 from lidar.planning.road_drive import plan_road_drive
 from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.ego_drive import drive_with_signals
@@ -279,7 +280,7 @@ def test_the_number_of_threads_does_not_exceed_the_cores(scene, tmp_path, monkey
             sizes.append(size)
             super().__init__(size)
 
-    monkeypatch.setattr("lidar.pipeline.ThreadPoolExecutor", Pool)
+    monkeypatch.setattr("lidar.frame_loop.ThreadPoolExecutor", Pool)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     for workers in (1, 64):
         drive(scene, tmp_path / str(workers), options=replace(OPTIONS, duration=0.2, workers=workers))

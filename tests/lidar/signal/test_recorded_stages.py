@@ -16,9 +16,10 @@ from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
+from lidar.frame_loop import chunks, recording_chunks
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.physics.echoes import Origin
-from lidar.pipeline import chunks, drive, recording_chunks
+from lidar.pipeline import drive
 from lidar.plan import plan_drive
 from lidar.signal.registry import NamedStage, numbered, read_stage, read_stages
 from lidar.signal.stage import Stage, parameter
