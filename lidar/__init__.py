@@ -17,17 +17,31 @@ if TYPE_CHECKING:
     from lidar.pipeline import drive as drive
     from lidar.rig.scanner import load_sensor as load_sensor
     from lidar.rig.specs import load_rig as load_rig
+    from lidar.signal.registry import read_attacks as read_attacks
+    from lidar.signal.registry import read_stages as read_stages
+    from lidar.simulation import DriveFrame as DriveFrame
+    from lidar.simulation import Simulation as Simulation
+    from lidar.simulation import simulate as simulate
+    from lidar.traffic.populate import TrafficOptions as TrafficOptions
+    from lidar.weather.setting import read_weather as read_weather
 
 _HOMES = {
     "Dataset": "dataset.layout",
+    "DriveFrame": "simulation",
     "DriveOptions": "options",
     "MapOptions": "options",
+    "Simulation": "simulation",
+    "TrafficOptions": "traffic.populate",
     "aggregate": "maps.aggregate",
     "drive": "pipeline",
     "load_rig": "rig.specs",
     "load_sensor": "rig.scanner",
     "open_dataset": "dataset.layout",
+    "read_attacks": "signal.registry",
     "read_cloud": "dataset.formats",
+    "read_stages": "signal.registry",
+    "read_weather": "weather.setting",
+    "simulate": "simulation",
 }
 __all__ = list(_HOMES)
 

@@ -23,6 +23,7 @@ import geoscene.sources
 import geoscene.tradeoff.engine
 import lidar.cli
 import lidar.pipeline
+import lidar.simulation
 import lidar.tradeoff.engine
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
@@ -190,12 +191,21 @@ def test_documented_commands_succeed(source, folder):
         SUCCEEDED.add(named)
 
 
-def test_example_in_python_succeeds(folder, monkeypatch):
-    (example,) = (ROOT / "README.md").read_text("utf-8").split("```python")[1:]
-    for name in ("scene", "drive"):  # the example writes them
+@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+def test_examples_in_python_succeed(page, folder, monkeypatch):
+    """The blocks of a page, one after the other; simulated drives are as short as recorded ones."""
+    examples = [part.split("```")[0] for part in (ROOT / page).read_text("utf-8").split("```python")[1:]]
+    assert examples
+    for name in ("scene", "drive"):  # the examples write them
         shutil.rmtree(folder / name)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(geoscene, "demo_path", geoscene.sources.demo_path)
     monkeypatch.setattr(lidar, "drive", lidar.pipeline.drive)
-    exec(example.split("```")[0], {})  # noqa: S102
+    simulate = lidar.simulation.simulate
+    monkeypatch.setattr(
+        lidar, "simulate", lambda scene, options: simulate(scene, replace(options, duration=0.2))
+    )
+    names = {}
+    for example in examples:
+        exec(example, names)  # noqa: S102
     assert (folder / "drive" / "dataset.json").is_file()

@@ -1,9 +1,10 @@
-"""One frame of one sensor: measured in the simulated world and written as files."""
+"""One frame of one sensor: measured in the simulated world, and written as files."""
 
 from __future__ import annotations
 
-from lidar.dataset.record_clouds import record_cloud
-from lidar.dataset.record_images import record_images
+from lidar.dataset.measured import MeasuredCloud, MeasuredImages
+from lidar.dataset.record_clouds import measure_cloud, record_cloud
+from lidar.dataset.record_images import measure_images, record_images
 from lidar.dataset.recording import Recording
 from lidar.rig.devices import Camera, Scanner
 from lidar.world.thread_worlds import Worlds
@@ -18,3 +19,11 @@ def record_frame(recording: Recording, sensor: Scanner | Camera, *, frame: int, 
         record_images(recording, sensor, frame=frame, worlds=worlds)
         return 0
     return record_cloud(recording, sensor, frame=frame, worlds=worlds)
+
+
+def measure_frame(
+    recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds
+) -> MeasuredCloud | MeasuredImages:
+    """Simulate one frame as `record_frame` does, without files. Several threads may do so at once."""
+    measure = measure_images if isinstance(sensor, Camera) else measure_cloud
+    return measure(recording, sensor, frame=frame, worlds=worlds)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from geoscene.typing import Float
 from lidar.dataset.boxes import box_rows, count_points
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.dataset.formats.table import FrameInfo, Table, cloud_table, point_labels
+from lidar.dataset.measured import MeasuredCloud, firing_times, placed_cloud
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import situation_of
 from lidar.errors import LidarError
@@ -29,20 +31,49 @@ from lidar.world.world import World
 
 def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> int:
     """Scan one frame and write its clouds, labels and boxes; return the number of points."""
-    paths, world = recording.paths(scanner, frame), worlds.during(*scanner.sensor.window_ns(frame))
+    paths = recording.paths(scanner, frame)
+    measured = measure_cloud(recording, scanner, frame=frame, worlds=worlds)
+    cloud = measured.cloud
+    if "truth" in paths:
+        write_truth(paths["truth"], measured.truth)
+    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=measured.velocity)
+    for form in recording.contents.label_formats:
+        form.write(paths[f"labels {form.name}"], point_labels(cloud, recording.actors))
+    if "boxes" in paths:
+        with recording.watch.stage("boxes"):
+            write_columns(paths["boxes"], measured.boxes)
+    return len(cloud)
+
+
+def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:
+    """Scan one frame."""
+    world, truth = worlds.during(*scanner.sensor.window_ns(frame)), dict[str, NDArray[Any]]()
     if recording.has_stages(scanner):
         altered = _altered(recording, scanner, frame=frame, worlds=worlds)
-        write_truth(paths["truth"], cloud_truth(altered, start_ns=scanner.frame_start_ns(frame)))
+        truth = cloud_truth(altered, start_ns=scanner.frame_start_ns(frame))
         cloud: Cloud = altered.cloud
     else:
         cloud = _scanned(recording, scanner, frame=frame, world=world)
-    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths)
-    for form in recording.contents.label_formats:
-        form.write(paths[f"labels {form.name}"], point_labels(cloud, recording.actors))
+    boxes: dict[str, NDArray[Any]] = {}
     if recording.actors is not None:
         with recording.watch.stage("boxes"):
-            _write_boxes(recording, scanner, frame=frame, cloud=cloud, world=world, path=paths["boxes"])
-    return len(cloud)
+            boxes = _boxes(recording, scanner, frame=frame, cloud=cloud, world=world)
+    velocity = None
+    if scanner.sensor.fmcw:
+        with recording.watch.stage("velocity"):
+            velocity = _velocity(recording, scanner, frame=frame, cloud=cloud)
+    return MeasuredCloud(
+        scanner.name,
+        frame,
+        scanner.frame_start_ns(frame),
+        scanner.spec.mount,
+        recording.trajectory,
+        boxes,
+        truth,
+        cloud=cloud,
+        period_ns=scanner.period_ns,
+        velocity=velocity,
+    )
 
 
 def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Cloud:
@@ -51,7 +82,7 @@ def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World
         return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
         cloud = measured(_swept(recording, scanner, frame=frame, world=world))
-    return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, _times(cloud)))
+    return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, firing_times(cloud)))
 
 
 def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
@@ -74,7 +105,7 @@ def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worl
         altered = altered_sweep(sweep, recording.contents.stages, at=at)
     if recording.scanning_ns is None:
         return altered
-    return altered.where(lambda cloud: _while_on(recording, _times(cloud)))
+    return altered.where(lambda cloud: _while_on(recording, firing_times(cloud)))
 
 
 def _check_lookback(recording: Recording, scanner: Scanner, *, frames: int) -> None:
@@ -117,11 +148,6 @@ def _while_on(recording: Recording, time_ns: NDArray[np.int64]) -> NDArray[np.bo
     return (first >= 0) & (time_ns <= np.maximum.accumulate(on[:, 1])[first])
 
 
-def _times(cloud: Cloud) -> NDArray[np.int64]:
-    """Times (n,) of a cloud's returns, nanoseconds since the drive's start."""
-    return cloud.start_ns + cloud.time_ns.astype(np.int64)
-
-
 def write_clouds(
     recording: Recording,
     scanner: Scanner,
@@ -136,22 +162,19 @@ def write_clouds(
     velocity : (n,) radial velocities of a Doppler scanner, m/s; by default they are simulated
     """
     contents, watch = recording.contents, recording.watch
-    begin, time_ns = scanner.frame_start_ns(frame), _times(cloud)
+    begin, time_ns = scanner.frame_start_ns(frame), firing_times(cloud)
     table = cloud_table(cloud) | {"time_ns": (time_ns - begin).astype(np.uint32)}
     world_formats = [form for form in contents.cloud_formats if form.frame == "world"]
     placed = np.empty((0, 3))
     compensated = contents.deskew or any(form.kitti for form in contents.cloud_formats)
-    if world_formats or compensated or scanner.sensor.fmcw:
+    if world_formats or compensated:
         mount = scanner.spec.mount
         with watch.stage("georeference"):
-            placed = recording.trajectory.place(
-                cloud.xyz, time_ns, translation=mount.translation, rotation=mount.rotation
-            )
+            placed = placed_cloud(cloud, recording.trajectory, mount=mount)
     if scanner.sensor.fmcw:
-        with watch.stage("velocity"):
-            if velocity is None:
-                velocity = _velocity(recording, scanner, frame=frame, cloud=cloud, placed=placed)
-            table["velocity"] = velocity
+        if velocity is None:
+            velocity = _velocity(recording, scanner, frame=frame, cloud=cloud)
+        table["velocity"] = velocity
 
     def still_at(time_ns: int) -> Table:
         still = deskewed(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=time_ns)
@@ -191,16 +214,12 @@ def _pose_in_crs(recording: Recording, scanner: Scanner, *, time_ns: int) -> Flo
     return out
 
 
-def _velocity(
-    recording: Recording, scanner: Scanner, *, frame: int, cloud: Cloud, placed: Float
-) -> NDArray[np.float32]:
-    """Radial velocities (n,) as measured, m/s; with noise if ranges have noise.
-
-    placed : (n, 3) the returns, scene metres
-    """
+def _velocity(recording: Recording, scanner: Scanner, *, frame: int, cloud: Cloud) -> NDArray[np.float32]:
+    """Radial velocities (n,) as measured, m/s; with noise if ranges have noise."""
     moving = None
     if recording.actors is not None:
-        moving = surface_velocity(recording.actors, cloud.feature, placed=placed, time_ns=_times(cloud))
+        placed = placed_cloud(cloud, recording.trajectory, mount=scanner.spec.mount)
+        moving = surface_velocity(recording.actors, cloud.feature, placed=placed, time_ns=firing_times(cloud))
     mount, sigma = scanner.spec.mount, scanner.sensor.velocity_sigma
     velocity = radial_velocity(cloud, mount, trajectory=recording.trajectory, moving=moving)
     if sigma and recording.contents.scanner.range_noise != "none":
@@ -214,10 +233,10 @@ def _velocity(
     return velocity
 
 
-def _write_boxes(
-    recording: Recording, scanner: Scanner, *, frame: int, cloud: Cloud, world: World, path: Path
-) -> None:
-    """Write the 3D boxes of road users, with the number of points on each and its visibility."""
+def _boxes(
+    recording: Recording, scanner: Scanner, *, frame: int, cloud: Cloud, world: World
+) -> dict[str, NDArray[Any]]:
+    """Columns of the 3D boxes of road users, with the number of points on each and its visibility."""
     actors, visibility = recording.actors, recording.visibility
     assert actors is not None  # noqa: S101
     assert visibility is not None  # noqa: S101
@@ -234,4 +253,4 @@ def _write_boxes(
     points = count_points(actors, columns["id"], feature=cloud.feature)
     origin = recording.trajectory.at([begin]).mounted(mount.translation, mount.rotation).position[0]
     share = visibility.seen_from(origin, world, rows=columns["id"], time_ns=begin)
-    write_columns(path, {**columns, "points": points, "visibility": np.round(share, 4)})
+    return {**columns, "points": points, "visibility": np.round(share, 4)}

@@ -14,6 +14,7 @@ from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, w
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
 from lidar.dataset.boxes import ImageBoxes, image_boxes
+from lidar.dataset.measured import MeasuredImages
 from lidar.dataset.recording import Recording
 from lidar.dataset.situations import situation_of, sun_during
 from lidar.geometry.poses import Poses
@@ -28,6 +29,19 @@ from lidar.world.world import World
 def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> None:
     """Render one frame and write its images and boxes."""
     paths, watch = recording.paths(camera, frame), recording.watch
+    measured = measure_images(recording, camera, frame=frame, worlds=worlds)
+    if "boxes" in paths:
+        with watch.stage("boxes"):
+            write_columns(paths["boxes"], measured.boxes)
+    if "truth" in paths:
+        write_truth(paths["truth"], measured.truth)
+    for kind in camera.spec.images:
+        with watch.stage(f"write {kind}"):
+            _write_image(paths[kind], measured, kind=kind)
+
+
+def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
+    """Render one frame."""
     samples = recording.contents.camera.moments(camera.spec)
     times = exposure_times(camera.spec, camera.frame_start_ns(frame), samples=samples)
     rows = len(times) // samples
@@ -36,8 +50,9 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
     span_ns = start, max(int(times[-1]), start + 1)
     world = worlds.during(*span_ns)
     image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world)
+    boxes, truth = dict[str, NDArray[Any]](), dict[str, NDArray[Any]]()
     if recording.actors is not None:
-        with watch.stage("boxes"):
+        with recording.watch.stage("boxes"):
             middle = int(times[first + rows // 2])
             pose = _poses(recording, camera, times=times[[first + rows // 2]])
             found = image_boxes(
@@ -48,20 +63,28 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
                 instance=image.feature,
                 span_ns=(start, int(times[-1])),
             )
-            columns = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
-            write_columns(paths["boxes"], columns)
+            boxes = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
     if recording.has_stages(camera):
         original = image
         at = situation_of(recording, camera, frame=frame, world=world)
         image = altered_image(image, recording.contents.stages, at=at)
-        write_truth(paths["truth"], image_truth(image, original))
-    for kind in camera.spec.images:
-        with watch.stage(f"write {kind}"):
-            if kind == "flow":
-                flow = _flow(recording, camera, times=times[first : first + rows], worlds=worlds)
-                write_png(paths[kind], flow_to_image(flow))
-            else:
-                _write_image(paths[kind], image, kind=kind)
+        truth = image_truth(image, original)
+    flow = None
+    if "flow" in camera.spec.images:
+        with recording.watch.stage("flow"):
+            flow = _flow(recording, camera, times=times[first : first + rows], worlds=worlds)
+    return MeasuredImages(
+        camera.name,
+        frame,
+        start,
+        camera.spec.mount,
+        recording.trajectory,
+        boxes,
+        truth,
+        camera=camera.spec,
+        image=image,
+        flow=flow,
+    )
 
 
 def _rendered(
@@ -87,8 +110,11 @@ def _rendered(
         )
 
 
-def _write_image(path: Path, image: Image, *, kind: str) -> None:
-    if kind == "rgb" and image.rgb is not None:
+def _write_image(path: Path, measured: MeasuredImages, *, kind: str) -> None:
+    image, flow = measured.image, measured.flow
+    if kind == "flow" and flow is not None:
+        write_png(path, flow_to_image(flow))
+    elif kind == "rgb" and image.rgb is not None:
         write_png(path, image.rgb)
     elif kind == "depth":
         write_png(path, depth_to_counts(image.depth))

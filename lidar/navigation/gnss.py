@@ -105,6 +105,10 @@ class Fixes(Columns):
     used: NDArray[np.bool_]
     names: NDArray[np.str_]
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The columns by name; the satellites' names hold for all rows."""
+        return {name: column for name, column in Columns.columns(self).items() if name != "names"}
+
 
 def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:
     """Times (n,) of a receiver's fixes in a drive of ``duration_ns``, nanoseconds since its start."""
