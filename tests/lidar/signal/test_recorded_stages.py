@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from lidar import pipeline
+from lidar import frame_loop
 from lidar.apply import apply_stages
 from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
@@ -362,7 +362,7 @@ def test_stages_are_given_earlier_clouds_as_they_are_without_stages(
     scene, options, plain, tmp_path, chunk, monkeypatch
 ):
     """Whichever way a drive is cut into regions; on recorded data from the files."""
-    monkeypatch.setattr(pipeline, "CHUNK", chunk)
+    monkeypatch.setattr(frame_loop, "CHUNK", chunk)
     watching = (NamedStage("watching", Watching()),)
     formats = replace(options, stages=watching, formats=("pcd",), labels=(), deskew="")
     FORMER.clear()
