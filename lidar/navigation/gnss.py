@@ -281,6 +281,18 @@ def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
     return np.where(last >= 0, course[np.maximum(last, 0)], 0.0)
 
 
+def fix_variances(fixes: Fixes) -> Float:
+    """Variances (n, 3), m^2 east, north, up, as a receiver states them: 0 without a fix.
+
+    Those of the noise and of the slow error of the fix's state under an open sky, times the square of the
+    dilution of precision where that exceeds 1. Multipath, of which a receiver does not know, is not in them.
+    """
+    states = [STATES[name] for name in NAMES]
+    sizes = np.nan_to_num([np.hypot(state.white, state.bias) for state in states])[fixes.state]
+    dop = np.nan_to_num(np.maximum(fixes.dop[:, :2], 1.0), nan=1.0)
+    return np.asarray((sizes * dop)[:, [0, 0, 1]] ** 2, float)
+
+
 def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:
     """Columns of ``gnss.csv``: measurements, and ground truth prefixed ``true_``; degrees, metres, m/s."""
     return {

@@ -20,7 +20,7 @@ from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds, labell
 from lidar.geometry.attitude import body_rates, matrix_from_quat, quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, OPTICAL_QUAT
 from lidar.geometry.poses import Trajectory
-from lidar.navigation.gnss import NAMES, STATES, Fixes
+from lidar.navigation.gnss import Fixes, fix_variances
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.patterns.scanner2d import Scan2d
 from lidar.rig.specs import ImuSpec
@@ -157,18 +157,6 @@ def _fixes(drive: RosDrive, name: str, *, fixes: Fixes, lift: Float) -> Iterator
             systems=systems[k],
         )
         yield time_ns, make
-
-
-def fix_variances(fixes: Fixes) -> Float:
-    """Variances (n, 3), m^2 east, north, up, as a receiver states them: 0 without a fix.
-
-    Those of the noise and of the slow error of the fix's state under an open sky, times the square of the
-    dilution of precision where that exceeds 1. Multipath, of which a receiver does not know, is not in them.
-    """
-    states = [STATES[name] for name in NAMES]
-    sizes = np.nan_to_num([np.hypot(state.white, state.bias) for state in states])[fixes.state]
-    dop = np.nan_to_num(np.maximum(fixes.dop[:, :2], 1.0), nan=1.0)
-    return np.asarray((sizes * dop)[:, [0, 0, 1]] ** 2, float)
 
 
 def _scanner(drive: RosDrive, name: str) -> list[Topic]:

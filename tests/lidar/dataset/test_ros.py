@@ -25,11 +25,12 @@ from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.export import EXPORTERS, ros_topics
 from lidar.dataset.export.ros_drive import RosDrive, ros_name
 from lidar.dataset.export.ros_messages import laser_scan, point_cloud, typestore
-from lidar.dataset.export.ros_topics import fix_variances, topics_of
+from lidar.dataset.export.ros_topics import topics_of
 from lidar.dataset.formats import FORMATS, read_table
 from lidar.dataset.layout import open_dataset, read_rows
 from lidar.dataset.navigation_files import Heights, read_fixes
 from lidar.errors import DatasetError, FormatError
+from lidar.navigation.gnss import fix_variances
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
 from lidar.rig.camera_model import project
