@@ -13,7 +13,13 @@ from PIL import Image, ImageDraw, ImageFont
 from rich.console import Console
 from rich.table import Table
 
-_INK, _GREY, _CHOICE, _OTHER = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
+from geoscene.axes import log_axis
+from geoscene.canvas import INK, Color
+
+GREY: Color = (205, 208, 214)
+"""Of ticks and grids."""
+
+_CHOICE, _OTHER = (200, 60, 40), (60, 110, 180)
 _BAND = (250, 224, 160)
 _STYLE = (
     "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
@@ -93,26 +99,27 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
     picture = Image.new("RGB", (width, height), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
     left, right, top, bottom = 90, width - 130, 96, height - 70
-    x_ends, y_ends = _ends([x for p in points for x in p.xs]), _ends([y for p in points for y in p.ys])
+    x_axis, y_axis = log_axis(x for p in points for x in p.xs), log_axis(y for p in points for y in p.ys)
     nothing = any(y <= 0 for p in points for y in p.ys)
 
     def across(value: float) -> float:
-        return _place(value, x_ends, at=(left, right))
+        return left + (right - left) * x_axis.share(value)
 
     def up(value: float) -> float:
-        return _place(value, y_ends, at=(bottom - 40 * nothing, top)) if value > 0 else bottom
+        low = bottom - 40 * nothing
+        return low + (top - low) * y_axis.share(value) if value > 0 else bottom
 
     def text(place: tuple[float, float], words: str, *, anchor: str) -> None:
-        pen.text(place, words, fill=_INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white")
+        pen.text(place, words, fill=INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white")
 
     text((left, 16), axes.title, anchor="la")
     text(((left + right) / 2, height - 16), axes.x, anchor="ms")
     text((12, top - 10), axes.y, anchor="ls")
-    for value in _marks(x_ends):
-        pen.line((across(value), top, across(value), bottom), fill=_GREY)
+    for value in x_axis.ticks():
+        pen.line((across(value), top, across(value), bottom), fill=GREY)
         text((across(value), bottom + 8), f"{value:g}", anchor="mt")
-    for value in [*_marks(y_ends), *[0.0] * nothing]:
-        pen.line((left, up(value), right, up(value)), fill=_GREY)
+    for value in [*y_axis.ticks(), *[0.0] * nothing]:
+        pen.line((left, up(value), right, up(value)), fill=GREY)
         text((left - 8, up(value)), axes.y_text(value), anchor="rm")
     ordered = sorted(points, key=lambda p: (not p.best, p.x))
     line = [(across(p.x), up(p.y)) for p in ordered if p.best]
@@ -144,10 +151,11 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
     return _png(picture)
 
 
-_COLORS = (
+COLORS: tuple[Color, ...] = (
     *((200, 60, 40), (60, 110, 180), (70, 150, 90), (150, 90, 170), (220, 150, 40), (90, 90, 90)),
     *((40, 160, 170), (190, 110, 140), (130, 110, 60), (110, 140, 220), (160, 190, 60), (20, 60, 90)),
 )
+"""Of lines, by rank."""
 
 
 def curves(
@@ -165,22 +173,22 @@ def curves(
     def place(point: tuple[float, float]) -> tuple[float, float]:
         return left + (right - left) * point[0], bottom + (top - bottom) * point[1]
 
-    pen.text((left, 14), axes.title, fill=_INK, font=font)
-    pen.text(((left + right) / 2, size - 14), axes.x, fill=_INK, font=font, anchor="ms")
-    pen.text((12, top - 12), axes.y, fill=_INK, font=font, anchor="ls")
+    pen.text((left, 14), axes.title, fill=INK, font=font)
+    pen.text(((left + right) / 2, size - 14), axes.x, fill=INK, font=font, anchor="ms")
+    pen.text((12, top - 12), axes.y, fill=INK, font=font, anchor="ls")
     for value in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
-        pen.line((*place((value, 0)), *place((value, 1))), fill=_GREY)
-        pen.line((*place((0, value)), *place((1, value))), fill=_GREY)
-        pen.text((place((value, 0))[0], bottom + 6), f"{value:g}", fill=_INK, font=font, anchor="mt")
-        pen.text((left - 8, place((0, value))[1]), axes.y_text(value), fill=_INK, font=font, anchor="rm")
-    pen.line((*place((0, 0)), *place((1, 1))), fill=_GREY, width=2)
-    pen.line((*place((mark, 0)), *place((mark, 1))), fill=_INK, width=1)
+        pen.line((*place((value, 0)), *place((value, 1))), fill=GREY)
+        pen.line((*place((0, value)), *place((1, value))), fill=GREY)
+        pen.text((place((value, 0))[0], bottom + 6), f"{value:g}", fill=INK, font=font, anchor="mt")
+        pen.text((left - 8, place((0, value))[1]), axes.y_text(value), fill=INK, font=font, anchor="rm")
+    pen.line((*place((0, 0)), *place((1, 1))), fill=GREY, width=2)
+    pen.line((*place((mark, 0)), *place((mark, 1))), fill=INK, width=1)
     for k, (name, points) in enumerate(lines.items()):
-        color = _COLORS[k % len(_COLORS)]
+        color = COLORS[k % len(COLORS)]
         if len(points) > 1:
             pen.line([place(point) for point in points], fill=color, width=2)
         pen.line((right + 16, top + 10 + 20 * k, right + 36, top + 10 + 20 * k), fill=color, width=3)
-        pen.text((right + 44, top + 10 + 20 * k), name, fill=_INK, font=font, anchor="lm")
+        pen.text((right + 44, top + 10 + 20 * k), name, fill=INK, font=font, anchor="lm")
     return _png(picture)
 
 
@@ -200,9 +208,9 @@ def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
     picture = Image.new("RGB", (width, top + 26 * len(rows) + 50), (255, 255, 255))
     pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
     bottom = top + 26 * len(rows)
-    pen.text((left, 14), title, fill=_INK, font=font)
+    pen.text((left, 14), title, fill=INK, font=font)
     pen.rectangle((left, 42, left + 14, 54), fill=_BAND)
-    pen.text((left + 22, 48), "published", fill=_INK, font=font, anchor="lm")
+    pen.text((left + 22, 48), "published", fill=INK, font=font, anchor="lm")
 
     def across(share: float) -> float:
         return left + (right - left) * share
@@ -213,127 +221,21 @@ def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
             low, high = map(across, row.published)
             pen.rectangle((low - 2, v - 9, high + 2, v + 9), fill=_BAND)
     for value in (0.0, 0.25, 0.5, 0.75, 1.0):
-        pen.line((across(value), top, across(value), bottom), fill=_GREY)
-        pen.text((across(value), bottom + 8), f"{100 * value:g} %", fill=_INK, font=font, anchor="mt")
+        pen.line((across(value), top, across(value), bottom), fill=GREY)
+        pen.text((across(value), bottom + 8), f"{100 * value:g} %", fill=INK, font=font, anchor="mt")
     for k, row in enumerate(rows):
         v = top + 26 * k + 13
-        pen.text((left - 10, v), row.name, fill=_INK, font=font, anchor="rm")
+        pen.text((left - 10, v), row.name, fill=INK, font=font, anchor="rm")
         if math.isfinite(row.share):
             pen.line((across(row.interval[0]), v, across(row.interval[1]), v), fill=_CHOICE, width=2)
             pen.ellipse((across(row.share) - 4, v - 4, across(row.share) + 4, v + 4), fill=_CHOICE)
     return _png(picture)
 
 
-@dataclass(frozen=True, slots=True)
-class Series:
-    """A named line, or dots if these are single values such as published ones."""
-
-    name: str
-    points: Sequence[tuple[float, float]]
-    dots: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Panel:
-    """Series on common axes, each linear from 0 or logarithmic."""
-
-    axes: Axes
-    series: Sequence[Series]
-    x_log: bool = True
-    y_log: bool = True
-
-
-def panels(some: Sequence[Panel], *, columns: int = 2, size: tuple[int, int] = (760, 520)) -> bytes:
-    """A PNG of panels side by side, each with a legend; values of 0 are left out of logarithmic axes."""
-    rows = -(-len(some) // columns)
-    picture = Image.new("RGB", (columns * size[0], rows * size[1]), (255, 255, 255))
-    for k, panel in enumerate(some):
-        picture.paste(_panel(panel, size=size), ((k % columns) * size[0], (k // columns) * size[1]))
-    return _png(picture)
-
-
-def _panel(panel: Panel, *, size: tuple[int, int]) -> Image.Image:
-    picture = Image.new("RGB", size, (255, 255, 255))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
-    left, right, top, bottom = 72, size[0] - 230, 64, size[1] - 58
-    shown = [p for s in panel.series for p in s.points if _is_shown(p, panel)]
-    x_ends = _ends([x for x, _ in shown]) if panel.x_log else _linear_ends([x for x, _ in shown])
-    y_ends = _ends([y for _, y in shown]) if panel.y_log else _linear_ends([y for _, y in shown])
-
-    def place(point: tuple[float, float]) -> tuple[float, float]:
-        x, y = point
-        across = _place if panel.x_log else _even_place
-        up = _place if panel.y_log else _even_place
-        return across(x, x_ends, at=(left, right)), up(y, y_ends, at=(bottom, top))
-
-    pen.text((left, 12), panel.axes.title, fill=_INK, font=font)
-    pen.text(((left + right) / 2, size[1] - 12), panel.axes.x, fill=_INK, font=font, anchor="ms")
-    pen.text((10, top - 10), panel.axes.y, fill=_INK, font=font, anchor="ls")
-    for value in _marks(x_ends) if panel.x_log else _even_marks(x_ends):
-        u = place((value, y_ends[1]))[0]
-        pen.line((u, top, u, bottom), fill=_GREY)
-        pen.text((u, bottom + 6), f"{value:g}", fill=_INK, font=font, anchor="mt")
-    for value in _marks(y_ends) if panel.y_log else _even_marks(y_ends):
-        v = place((x_ends[1], value))[1]
-        pen.line((left, v, right, v), fill=_GREY)
-        pen.text((left - 8, v), panel.axes.y_text(value), fill=_INK, font=font, anchor="rm")
-    for k, one in enumerate(panel.series):
-        color, v = _COLORS[k % len(_COLORS)], top + 10 + 22 * k
-        points = [place(p) for p in one.points if _is_shown(p, panel)]
-        if one.dots:
-            for u, w in [*points, (right + 26, v)]:
-                pen.ellipse((u - 5, w - 5, u + 5, w + 5), outline=color, width=2, fill="white")
-        else:
-            if len(points) > 1:
-                pen.line(points, fill=color, width=2)
-            pen.line((right + 16, v, right + 36, v), fill=color, width=3)
-        pen.text((right + 44, v), one.name, fill=_INK, font=font, anchor="lm")
-    return picture
-
-
-def _is_shown(point: tuple[float, float], panel: Panel) -> bool:
-    x, y = point
-    return math.isfinite(x) and math.isfinite(y) and (x > 0 or not panel.x_log) and (y > 0 or not panel.y_log)
-
-
-def _linear_ends(values: Sequence[float]) -> tuple[float, float]:
-    return 0.0, _ends([max(values, default=1.0)])[1]
-
-
-def _even_marks(ends: tuple[float, float]) -> list[float]:
-    return [ends[1] * k / 5 for k in range(6)]
-
-
-def _even_place(value: float, ends: tuple[float, float], *, at: tuple[float, float]) -> float:
-    return at[0] + (at[1] - at[0]) * (min(max(value, ends[0]), ends[1]) - ends[0]) / (ends[1] - ends[0])
-
-
 def _png(picture: Image.Image) -> bytes:
     file = io.BytesIO()
     picture.save(file, "PNG")
     return file.getvalue()
-
-
-def _ends(values: Sequence[float]) -> tuple[float, float]:
-    """The powers of ten around values; 1, 2 or 5 of them."""
-    known = [v for v in values if v > 0] or [1.0]
-    marks = [m * 10.0**k for k in range(-9, 13) for m in (1, 2, 5)]
-    low = max((m for m in marks if m <= min(known)), default=marks[0])
-    high = min((m for m in marks if m >= max(known) and m > low), default=marks[-1])
-    return low, high
-
-
-def _marks(ends: tuple[float, float]) -> list[float]:
-    """Values to mark on an axis: powers of ten, and 2 and 5 of them on a short one."""
-    steps = (1, 2, 5) if ends[1] / ends[0] <= 100 else (1,)
-    every = (m * 10.0**k for k in range(-9, 13) for m in steps)
-    return [v for v in every if ends[0] * (1 - 1e-9) <= v <= ends[1] * (1 + 1e-9)]
-
-
-def _place(value: float, ends: tuple[float, float], *, at: tuple[float, float]) -> float:
-    low, high = map(math.log10, ends)
-    part = (math.log10(min(max(value, ends[0]), ends[1])) - low) / (high - low)
-    return at[0] + (at[1] - at[0]) * part
 
 
 def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:

@@ -41,9 +41,11 @@ from lidar.options import (
     MapOptions,
     PlaceOptions,
     PlaybackOptions,
+    PlotOptions,
     SignOptions,
     TradeoffOptions,
 )
+from lidar.plots import FIGURES
 
 if TYPE_CHECKING:
     from lidar.scene_cache import OpenedScene
@@ -66,6 +68,16 @@ app = App(
     """,
 )
 app.register_install_completion_command()
+
+_FIGURES = "; ".join(
+    [
+        *(f"{row.name} ({row.meaning})" for row in FIGURES.values()),
+        "weather (range by visibility, extinction and lost returns by rate, echoes of the air by range).",
+    ]
+)
+
+Plotted = Literal["weather", "range-image", "intensity", "returns", "speed", "coverage", "gnss"]
+"""Names of figures: `FIGURES`, and of models without a drive."""
 
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
 Reporting = Annotated[Report, Parameter(group=OUTPUT)]
@@ -674,41 +686,71 @@ def apply(
 
 @app.command
 def plot(
-    what: Literal["weather"],  # noqa: ARG001
+    what: Annotated[Plotted, Parameter(help=_FIGURES)],
+    dataset: Path | None = None,
     /,
     *,
-    sensor: str = "hdl64e_s2",
+    options: PlotOptions = PlotOptions(),
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Plot models against published values.
-
-    weather: range by visibility, extinction and lost returns by rate, and what air sends back by range.
+    """Plot a recorded drive, or models of weather against published values.
 
     For example:
+
+    lidar plot range-image drive -o sweep.png
+
+    lidar plot coverage drive -o coverage.svg
 
     lidar plot weather --sensor vlp16 -o weather.png
 
     Parameters
     ----------
-    what
-        What to plot: weather.
-    sensor
-        A built-in scanner (lidar sensors lists them) or a TOML file.
+    dataset
+        Directory or URL of the dataset; none for weather.
     out
-        PNG to write.
+        PNG or SVG to write.
     """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.plots import plot as drawn  # noqa: PLC0415
+
+    if what == "weather":
+        if dataset is not None:
+            raise InputError(f"`dataset` {dataset}: weather is plotted without one; leave it out")
+        return _plot_weather(options, out, report=report)
+    if dataset is None:
+        raise InputError(f"`dataset`: give the drive to plot: lidar plot {what} DRIVE -o {out}")
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        found = drawn(
+            open_dataset(dataset),
+            what,
+            out=out,
+            options=options,
+            overwrite=report.overwrite,
+            progress=progress,
+        )
+    if report.json:
+        print_json({"path": str(out), **found.numbers})
+    else:
+        print(f"{out}: {found.note}")
+    return 0
+
+
+def _plot_weather(options: PlotOptions, out: Path, *, report: Report) -> int:
+    """Plot models of weather against published values."""
     from geoscene.files import write_atomically  # noqa: PLC0415
+    from lidar.plots import check_out  # noqa: PLC0415
     from lidar.rig.scanner import load_sensor  # noqa: PLC0415
     from lidar.weather.figures import weather_figure  # noqa: PLC0415
 
-    if out.suffix != ".png":
-        raise InputError(f"`out` {out}: the plot is a PNG; give a name that ends with .png")
-    if out.exists() and not report.overwrite:
-        raise InputError(f"{out} exists; replace it with `overwrite`")
-    scanner = load_sensor(Path(sensor) if sensor.endswith(".toml") else sensor)
+    if options.frames or options.resolution is not None:
+        raise InputError("`frames` and `resolution` are of drives; leave them out for weather")
+    check_out(out, overwrite=report.overwrite)
+    name = options.sensor or "hdl64e_s2"
+    scanner = load_sensor(Path(name) if name.endswith(".toml") else name)
     note_new_folder(out)
-    write_atomically(out, weather_figure(scanner))
+    write_atomically(out, weather_figure(scanner).encoded(out.suffix.lower()))
     if report.json:
         print_json({"path": str(out)})
     else:

@@ -739,8 +739,7 @@ class PlaybackOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if not re.fullmatch(r"(\d*:\d*)?", self.frames):
-            raise InputError(f"`frames` {self.frames}: give FIRST:END, such as 100:200, 100: or :200")
+        _ = self.limits
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
         if not 0 < self.max_mb < math.inf:
@@ -749,8 +748,46 @@ class PlaybackOptions:
     @property
     def limits(self) -> tuple[int, float]:
         """The first frame, and the one after the last; infinity for all further ones."""
-        first, _, end = self.frames.partition(":")
-        return int(first or 0), int(end) if end else math.inf
+        return frame_limits(self.frames)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class PlotOptions:
+    """Options of a figure of a dataset."""
+
+    sensor: str = ""
+    """Scanner or receiver; by default the first one, for coverage all scanners. For weather a built-in
+    scanner (lidar sensors lists them) or a TOML file, hdl64e_s2 by default."""
+
+    frames: str = ""
+    """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
+    default. range-image shows the first of them."""
+
+    resolution: float | None = None
+    """Side of the cells of coverage in metres; by default as fits the picture."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        _ = self.limits
+        if self.resolution is not None and not 0 < self.resolution < math.inf:
+            raise InputError(f"`resolution` {self.resolution:g}: give a positive number of metres")
+
+    @property
+    def limits(self) -> tuple[int, float]:
+        """The first frame, and the one after the last; infinity for all further ones."""
+        return frame_limits(self.frames)
+
+
+def frame_limits(text: str) -> tuple[int, float]:
+    """The first frame of ``FIRST:END``, and the one after the last; infinity for all further ones.
+
+    Raises InputError for another text.
+    """
+    if not re.fullmatch(r"(\d*:\d*)?", text):
+        raise InputError(f"`frames` {text}: give FIRST:END, such as 100:200, 100: or :200")
+    first, _, end = text.partition(":")
+    return int(first or 0), int(end) if end else math.inf
 
 
 @Parameter(name="*")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from lidar.dataset.deskew import deskewed
 from lidar.dataset.formats import FORMATS, Format, format_of, read_table
 from lidar.dataset.formats.table import PointLabels, Table, placed_returns
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
-from lidar.errors import DatasetError
+from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
@@ -69,6 +69,41 @@ def labelled_clouds(dataset: Dataset, name: str) -> Stream | None:
     """
     streams = (clouds_in(dataset, name, form=form) for form in labelled_formats())
     return next((stream for stream in streams if stream is not None), None)
+
+
+def scanner_clouds(dataset: Dataset, name: str = "") -> Stream:
+    """A scanner's clouds in the sensor frame with times and labels; of the first that has some by default.
+
+    Raises InputError for an unknown scanner, and DatasetError if there are no such clouds.
+    """
+    lidars = dataset.sensors("lidar")
+    if name and name not in lidars:
+        known = f"there are {', '.join(lidars)}" if lidars else "there is none"
+        raise InputError(f"`sensor` {name}: no scanner in {dataset.path}; {known}")
+    for one in [name] if name else lidars:
+        if (clouds := labelled_clouds(dataset, one)) is not None:
+            return clouds
+    of = f" of {name}" if name else ""
+    raise DatasetError(
+        f"{dataset.path}: no clouds{of} in the sensor frame with times and labels; drive with --format pcd"
+    )
+
+
+def frames_within(clouds: Stream, limits: tuple[int, float], *, every: int = 1) -> Stream:
+    """Each n-th of the frames of a stream from the first of ``limits`` up to, not including, the second.
+
+    Raises InputError if there are none.
+    """
+    first, end = limits
+    rows = np.flatnonzero((clouds.frames >= first) & (clouds.frames < end))[::every]
+    if not len(rows):
+        low, high = clouds.frames[[0, -1]]
+        last = "" if end == float("inf") else f"{end:.0f}"
+        raise InputError(
+            f"`frames` {first}:{last}: {clouds.name} has frames {low} to {high}, and none of these"
+        )
+    files = tuple(clouds.files[row] for row in rows.tolist())
+    return replace(clouds, frames=clouds.frames[rows], time_ns=clouds.time_ns[rows], files=files)
 
 
 def clouds_in(dataset: Dataset, name: str, *, form: Format) -> Stream | None:

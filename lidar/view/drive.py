@@ -18,9 +18,9 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
-from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds, mount_of, nearest
+from lidar.dataset.recorded import Stream, cloud_points, frames_within, mount_of, nearest, scanner_clouds
 from lidar.dataset.truth_files import read_truth
-from lidar.errors import DatasetError, InputError
+from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Trajectory
 from lidar.maps.colors import distinct, ramp
@@ -94,14 +94,8 @@ class Drive:
     def __init__(self, dataset: Dataset, options: PlaybackOptions) -> None:
         self.dataset = dataset
         self.clouds, cameras = _chosen(dataset, options.sensors)
-        first, end = options.limits
-        rows = np.flatnonzero((self.clouds.frames >= first) & (self.clouds.frames < end))[:: options.every]
-        if not len(rows):
-            low, high = self.clouds.frames[[0, -1]]
-            raise InputError(
-                f"`frames` {options.frames}: {self.clouds.name} has frames {low} to {high}, and none of these"
-            )
-        self.rows: Ints = rows
+        shown = frames_within(self.clouds, options.limits, every=options.every)
+        self.rows: Ints = np.searchsorted(self.clouds.frames, shown.frames)
         self.cameras = [found for name in cameras if (found := self._images(name)) is not None]
         self.notes: list[str] = []
 
@@ -285,14 +279,7 @@ def _chosen(dataset: Dataset, names: Sequence[str]) -> tuple[Stream, list[str]]:
     scanners = [name for name in names if kinds[name] == "lidar"]
     if len(scanners) > 1:
         raise InputError(f"`sensors`: the page shows one scanner; choose from {', '.join(scanners)}")
-    clouds = None
-    for name in scanners or [name for name, kind in kinds.items() if kind == "lidar"]:
-        if (clouds := labelled_clouds(dataset, name)) is not None:
-            break
-    if clouds is None:
-        raise DatasetError(
-            f"{dataset.path}: no clouds in the sensor frame with times and labels; drive with --format pcd"
-        )
+    clouds = scanner_clouds(dataset, *scanners)
     cameras = [name for name in names if kinds[name] == "camera"]
     if not cameras:
         with_images = (

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-from geoscene.charts import Axes, Panel, Series, panels
+from geoscene.canvas import Canvas
+from geoscene.charts import Axes
+from geoscene.panels import Panel, Series, figure
 from geoscene.typing import Float
 from lidar.physics.link import amplitude
 from lidar.rig.scanner import Sensor
@@ -27,9 +29,9 @@ _LOST_GOODIN, _LOST_ULBRICH_ATLAS = ((10, 1 - 0.3013),), ((10, 1 - 0.8797),)
 _SKY = np.full(200_000, np.inf)  # ends of beams
 
 
-def weather_figure(sensor: Sensor) -> bytes:
-    """A PNG: range by visibility, extinction and lost returns by rate, and ranges of what air sends back."""
-    return panels([_ranges(sensor), _extinctions(), _lost(), _histogram(sensor)])
+def weather_figure(sensor: Sensor) -> Canvas:
+    """Range by visibility, extinction and lost returns by rate, and ranges of what air sends back."""
+    return figure([_ranges(sensor), _extinctions(), _lost(), _histogram(sensor)])
 
 
 def max_range(sensor: Sensor, reflectance: float, *, extinction: float) -> float:
