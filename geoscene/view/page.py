@@ -21,11 +21,12 @@ from geoscene.typing import Bools, Ints
 from geoscene.view.assembly import check_page, gzip, linked, part, script_text, write_blob, write_page
 from geoscene.view.attributes import tables
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
+from geoscene.view.looks import Looks, read_looks
 from geoscene.view.tiles import Groups, groups_of, only, pack_shapes, pack_tile
 
 SCRIPTS = (
     *("blob.js", "camera.js", "gestures.js", "program.js"),
-    *("data.js", "shaders.js", "draw.js", "panel.js", "main.js"),
+    *("data.js", "facades.js", "shaders.js", "draw.js", "panel.js", "main.js"),
 )
 """The viewer's parts, in the order in which they are joined."""
 
@@ -54,6 +55,7 @@ def view_scene(
     chosen = chosen[np.lexsort([chosen[:, 1], chosen[:, 0], _rings(chosen)])]  # from the middle outwards
     groups = groups_of(scene)
     kept = _kept(groups, layers)
+    looks = read_looks(scene)
     shapes, shape_bytes = pack_shapes(list(scene.shapes().values()))
     present = np.zeros(len(groups.of) - 1, np.bool_)
     tiles: list[dict[str, Any]] = []
@@ -63,20 +65,22 @@ def view_scene(
         write_blob(blobs, "shapes", data=shape_bytes)
         for done, (i, j, _) in enumerate(chosen.tolist()):
             progress("page", done, total=len(chosen))
-            tile = only(scene.tile(i, j), groups, kept=kept)
+            tile = looks.dressed(only(scene.tile(i, j), groups, kept=kept))
             faces += len(tile.mesh)
             for column in (tile.mesh.feature, tile.instances.feature):
                 present[column[column >= 0]] = True
-            entry, data = pack_tile(tile, groups)
+            entry, data = pack_tile(tile, groups, facades=looks.facades_of(tile.mesh))
             tiles.append({"index": [i, j], **entry})
             write_blob(blobs, f"tile-{done}", data=data)
             ends.append(blobs.tell())
             if blobs.tell() > max_mb * 1e6:
                 break
-        write_blob(blobs, "attributes", data=gzip(compact_json(tables(read_features(scene), present))))
+        write_blob(
+            blobs, "attributes", data=gzip(compact_json(tables(looks.told(read_features(scene)), present)))
+        )
         if blobs.tell() > max_mb * 1e6:
             raise InputError(_too_large(scene, chosen, sizes=ends, size=blobs.tell(), max_mb=max_mb))
-        head = _head(scene, tiles, groups=groups, shapes=shapes)
+        head = _head(scene, tiles, groups=groups, looks=looks, shapes=shapes)
         _join(file, scene, head=head, blobs=blobs)
     notes = []
     if len(tiles) < len(scene.tile_indices):
@@ -167,7 +171,7 @@ def _too_large(scene: Scene, tiles: Ints, *, sizes: Sequence[int], size: int, ma
 
 
 def _head(
-    scene: Scene, tiles: list[dict[str, Any]], *, groups: Groups, shapes: list[list[int]]
+    scene: Scene, tiles: list[dict[str, Any]], *, groups: Groups, looks: Looks, shapes: list[list[int]]
 ) -> dict[str, Any]:
     """Header that the viewer needs to read the bytes."""
     low = np.min([entry["low"] for entry in tiles], axis=0).tolist()
@@ -189,6 +193,7 @@ def _head(
             "lat": grid.lat.tolist(),
             "error": float(f"{grid.error:.2g}"),
         },
+        "region": looks.region,
         "groups": groups.names,
         "features": len(groups.of) - 1,
         "classes": {int(code): [code.name.lower(), colors[code]] for code in Class},

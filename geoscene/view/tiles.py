@@ -14,6 +14,7 @@ from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints
 from geoscene.view.assembly import gzip
+from geoscene.view.looks import Facades
 
 STEP = 1 / 128
 """Quantisation step of vertices in metres; a power of two, so that tiles share one grid and
@@ -68,16 +69,17 @@ def only(tile: Tile, groups: Groups, *, kept: Bools) -> Tile:
     return Tile(tile.origin, tile.mesh.take(faces), copies.take(whole))
 
 
-def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
+def pack_tile(tile: Tile, groups: Groups, *, facades: Facades) -> tuple[dict[str, Any], bytes]:
     """Header of a tile and its bytes, deflated.
 
     Vertex q of the bytes lies at (base + q) * step in scene metres. Faces are in order of group, ``ends`` of
     which are given; copies in order of group, shape and x, of which ``runs`` are (group, shape, number).
     The bytes are little-endian columns: corners (m, 3) uint32, feature (m,) int32, the copies' feature (k,)
-    int32, vertices (n, 3) uint16, class (m,), material (m,), surface (m,) and sRGB colour (m, 3) uint8. Last
-    are the copies' places: where all are ``upright`` (a scale across, one upwards, a turn about the vertical)
-    six columns of uint16, the low bytes of each before the high ones: steps from base in x (less that of the
-    copy before), y and z, turn in `TURN`, scales in `SCALE`. Else they are the twelve columns of
+    int32, the facades' feature (b,) int32 and base (b,) float32, vertices (n, 3) uint16, class (m,), material
+    (m,), surface (m,), sRGB colour (m, 3) and the facades' codes (b, 4) uint8. Last are the copies' places:
+    where all are ``upright`` (a scale across, one upwards, a turn about the vertical) six columns of uint16,
+    the low bytes of each before the high ones: steps from base in x (less that of the copy before), y and z,
+    turn in `TURN`, scales in `SCALE`. Else they are the twelve columns of
     transforms (k, 3, 4) float32 to metres from base * step, bytes of equal rank together, too.
     """
     mesh, copies = tile.mesh, tile.instances
@@ -109,6 +111,7 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
         "ends": np.cumsum(np.bincount(group, minlength=len(groups.names))).tolist(),
         "runs": [[int(g), int(s), int(n)] for (g, s), n in zip(runs, counts, strict=True)],
         "upright": upright is not None,
+        "facades": len(facades),
     }
     places = transform.reshape(-1, 12).T.astype("<f4") if upright is None else upright.astype("<u2")
     planes = np.moveaxis(
@@ -118,11 +121,14 @@ def pack_tile(tile: Tile, groups: Groups) -> tuple[dict[str, Any], bytes]:
         (mesh.faces[order], "<u4"),
         (mesh.feature[order], "<i4"),
         (copies.feature[rank], "<i4"),
+        (facades.feature, "<i4"),
+        (facades.base, "<f4"),
         (vertices, "<u2"),
         (mesh.klass[order], "u1"),
         (mesh.material[order], "u1"),
         (mesh.surface[order], "u1"),
         (mesh.color[order], "u1"),
+        (facades.codes, "u1"),
         (planes, "u1"),
     ]
     return header, gzip(b"".join(values.astype(kind).tobytes() for values, kind in columns))

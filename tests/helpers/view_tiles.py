@@ -6,11 +6,12 @@ import numpy as np
 
 from geoscene.mesh import Instances, Mesh
 from geoscene.scene.tile_files import Tile
+from geoscene.view.looks import Facades
 from geoscene.view.tiles import SCALE, TURN, _turned
 
 
 def unpack_tile(header, data):
-    """The tile that `pack_tile` made, its faces in the page's order; ``closed`` is not kept."""
+    """The tile that `pack_tile` made, faces in the page's order, and its facades; ``closed`` is not kept."""
     raw = zlib.decompress(data, 31)
     at = 0
 
@@ -22,10 +23,13 @@ def unpack_tile(header, data):
         return values
 
     n, m, k = header["vertices"], header["ends"][-1], sum(run[2] for run in header["runs"])
+    b = header["facades"]
     faces, feature = column("<u4", m, 3), column("<i4", m)
     copied = column("<i4", k)
+    owner, base = column("<i4", b), column("<f4", b)
     vertices = column("<u2", n, 3) * header["step"]
     klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
+    facades = Facades(owner, base, column("u1", b, 4))
     columns, size, kind = (6, 2, "<u2") if header["upright"] else (12, 4, "<f4")
     planes = np.moveaxis(column("u1", columns, size, k), 1, 2)
     places = np.ascontiguousarray(planes).view(kind).reshape(columns, k)
@@ -38,7 +42,8 @@ def unpack_tile(header, data):
     shape = np.repeat(
         np.array([run[1] for run in header["runs"]], np.int32), [run[2] for run in header["runs"]]
     ).astype(np.int32)
-    return Tile(np.array(header["base"]) * header["step"], mesh, Instances(shape, transform, copied))
+    tile = Tile(np.array(header["base"]) * header["step"], mesh, Instances(shape, transform, copied))
+    return tile, facades
 
 
 def _transforms(columns, step):

@@ -25,9 +25,11 @@ function readTile(told, buffer) {
   return {
     corners: take(Uint32Array, 3 * m), feature: take(Int32Array, m),
     copied: take(Int32Array, k),
+    facades: { feature: take(Int32Array, told.facades), base: take(Float32Array, told.facades) },
     vertices: take(Uint16Array, 3 * n),
     klass: take(Uint8Array, m), material: take(Uint8Array, m), surface: take(Uint8Array, m),
     color: take(Uint8Array, 3 * m),
+    facadeCodes: take(Uint8Array, 4 * told.facades),
     transform: told.upright ? readUpright(take(Uint8Array, 12 * k), k, told.step) : readTransforms(take(Uint8Array, 48 * k), k),
   };
 }

@@ -9,7 +9,7 @@ class Renderer {
   constructor(canvas, head, shapes) {
     const gl = canvas.getContext("webgl2", { antialias: true });
     if (!gl) throw new Error("This browser does not support WebGL 2, which the page needs.");
-    Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, glow: 0, shadows: false, sunAzimuth: 2.6 });
+    Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, glow: 0, shadows: false, guesses: true, sunAzimuth: 2.6 });
     this.hidden = new Set();
     this.programs = {};
     for (const pass of ["VIEW", "PICK", "DEPTH"])
@@ -69,6 +69,7 @@ class Renderer {
     gl.bindVertexArray(faces);
     this.buffer(vertexBytes(tile, told.step));
     this.perVertex(true);
+    const walled = this.walled(told, tile);
     const runs = [];
     const transforms = this.buffer(tile.transform), features = this.buffer(tile.copied);
     let first = 0;
@@ -82,8 +83,24 @@ class Renderer {
       first += count;
     }
     gl.bindVertexArray(null);
-    this.tiles.push({ told, faces, runs, origin: told.base.map((b) => b * told.step) });
+    this.tiles.push({ told, faces, walled, runs, origin: told.base.map((b) => b * told.step) });
     this.stale = true;
+  }
+
+  /** The faces of buildings, with the columns of walls; null if there are none. */
+  walled(told, tile) {
+    const { gl, head } = this;
+    const group = head.groups.indexOf("buildings"), first = group > 0 ? told.ends[group - 1] : 0;
+    if (group < 0 || told.ends[group] === first) return null;
+    const bytes = gl.getParameter(gl.ARRAY_BUFFER_BINDING), array = gl.createVertexArray();
+    gl.bindVertexArray(array);
+    gl.bindBuffer(gl.ARRAY_BUFFER, bytes);
+    this.perVertex(true, 3 * first * VERTEX_BYTES);
+    this.buffer(wallBytes(tile, told, first, told.ends[group]));
+    for (const place of [8, 9]) gl.enableVertexAttribArray(place);
+    gl.vertexAttribPointer(8, 4, gl.UNSIGNED_SHORT, false, WALL_BYTES, 0);
+    gl.vertexAttribPointer(9, 4, gl.UNSIGNED_BYTE, false, WALL_BYTES, 8);
+    return { group, array };
   }
 
   /** Attributes of copies, from the first on. */
@@ -110,18 +127,18 @@ class Renderer {
   }
 
   /** Attributes of the bound buffer that `vertexBytes` made; those of tiles with position and feature. */
-  perVertex(tile) {
+  perVertex(tile, start = 0) {
     const { gl } = this;
     if (tile) {
       gl.enableVertexAttribArray(0);
-      gl.vertexAttribIPointer(0, 3, gl.UNSIGNED_SHORT, VERTEX_BYTES, 0);
+      gl.vertexAttribIPointer(0, 3, gl.UNSIGNED_SHORT, VERTEX_BYTES, start);
       gl.enableVertexAttribArray(1);
-      gl.vertexAttribIPointer(1, 1, gl.INT, VERTEX_BYTES, 8);
+      gl.vertexAttribIPointer(1, 1, gl.INT, VERTEX_BYTES, start + 8);
     }
     for (const k of [2, 3, 4]) gl.enableVertexAttribArray(k);
-    gl.vertexAttribPointer(2, 3, gl.BYTE, true, VERTEX_BYTES, 12);
-    gl.vertexAttribIPointer(3, 3, gl.UNSIGNED_BYTE, VERTEX_BYTES, 16);
-    gl.vertexAttribPointer(4, 3, gl.UNSIGNED_BYTE, true, VERTEX_BYTES, 20);
+    gl.vertexAttribPointer(2, 3, gl.BYTE, true, VERTEX_BYTES, start + 12);
+    gl.vertexAttribIPointer(3, 3, gl.UNSIGNED_BYTE, VERTEX_BYTES, start + 16);
+    gl.vertexAttribPointer(4, 3, gl.UNSIGNED_BYTE, true, VERTEX_BYTES, start + 20);
   }
 
   /** Give each feature its colour for mode 3; grey where `colorOf` gives null. */
@@ -145,6 +162,7 @@ class Renderer {
       gl.useProgram(program);
       gl.uniformMatrix4fv(at.uMatrix, false, matrix);
       gl.uniform1i(at.uMode, this.mode);
+      gl.uniform1i(at.uGuesses, this.guesses ? 1 : 0);
       gl.uniform1i(at.uCodes, 0);
       gl.uniform1i(at.uFeatures, 1);
       gl.uniform1i(at.uSunDepth, 2);
@@ -154,7 +172,7 @@ class Renderer {
       gl.uniform1i(at.uShadows, this.shadows ? 1 : 0);
       gl.uniform1f(at.uSunPixel, this.sunPixel || 0);
       if (at.uSunMatrix) gl.uniformMatrix4fv(at.uSunMatrix, false, this.sunMatrix || new Float32Array(16));
-      for (const { told, faces, runs, offset } of seen) {
+      for (const { told, faces, walled, runs, offset } of seen) {
         gl.uniform3fv(at.uOffset, offset);
         if (copies) {
           const metres = pixel * Math.hypot(...eye.map((v, k) => v - Math.min(told.high[k], Math.max(told.low[k], v))));
@@ -167,10 +185,12 @@ class Renderer {
           continue;
         }
         gl.uniform1f(at.uStep, told.step);
-        gl.bindVertexArray(faces);
         told.ends.forEach((end, group) => {
           const start = group ? told.ends[group - 1] : 0;
-          if (end > start && !this.hidden.has(head.groups[group])) gl.drawArrays(gl.TRIANGLES, 3 * start, 3 * (end - start));
+          if (end <= start || this.hidden.has(head.groups[group])) return;
+          const own = walled && walled.group === group;
+          gl.bindVertexArray(own ? walled.array : faces);
+          gl.drawArrays(gl.TRIANGLES, own ? 0 : 3 * start, 3 * (end - start));
         });
       }
     });
@@ -238,7 +258,8 @@ class Renderer {
     if (number[0] === 0) return null;
     const relative = [...new Float32Array(number.buffer, 4, 3)];
     return {
-      feature: number[0] - 2, klass: code[0] & 255, material: (code[0] >> 8) & 255, surface: (code[0] >> 16) & 255,
+      feature: number[0] - 2, klass: code[0] & 255, material: (code[0] >> 8) & 255, surface: (code[0] >> 16) & SIDE,
+      guessed: Boolean((code[0] >> 16) & GUESSED),
       relative, point: relative.map((v, k) => v + camera.target[k]),
     };
   }

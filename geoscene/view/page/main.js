@@ -1,7 +1,7 @@
 // Main program: loading, events, and the loop that redraws after changes.
 
 const $ = (id) => document.getElementById(id);
-const MODES = { look: 0, material: 1, class: 2, source: 3, sigma: 3 };
+const MODES = { look: 0, material: 1, class: 2, source: 3, sigma: 3, guesses: 3 };
 
 async function start() {
   if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot decompress the page's data.");
@@ -154,7 +154,7 @@ function color(view, mode) {
   if (mode === "material") rows = byCode(head.materials, used.material);
   if (mode === "class") rows = byCode(head.classes, used.class);
   if (MODES[mode] === 3) {
-    const key = mode === "source" ? bySource(attributes) : bySigma(attributes);
+    const key = { source: bySource, sigma: bySigma, guesses: byLook }[mode](attributes);
     renderer.colorFeatures(key.colorOf);
     rows = key.rows;
   }
@@ -175,7 +175,7 @@ function layers(view) {
   }
 }
 
-/** #view=…&color=…&off=a,b&shadows=0&select=way/1&pick=x,y, any of them. */
+/** #view=…&color=…&off=a,b&shadows=0&guesses=0&select=way/1&pick=x,y, any of them. */
 function fromAddress(view) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("color")) color(view, given.get("color"));
@@ -183,7 +183,8 @@ function fromAddress(view) {
     const box = $(`layer-${group}`);
     if (box && box.checked) box.click();
   }
-  if (given.has("shadows") && $("shadows").checked !== (given.get("shadows") !== "0")) $("shadows").click();
+  for (const box of ["shadows", "guesses"])
+    if (given.has(box) && $(box).checked !== (given.get(box) !== "0")) $(box).click();
   if (given.has("select")) find(view, given.get("select"));
   if (given.has("view")) view.camera.fromText(given.get("view"));
   if (given.has("pick")) click(view, ...given.get("pick").split(",").map(Number));
@@ -242,11 +243,13 @@ function listen(view) {
     view.dirty = true;
   };
   $("sun").oninput();
-  $("shadows").onchange = () => {
-    renderer.shadows = $("shadows").checked;
-    view.dirty = true;
-  };
-  $("shadows").onchange();
+  for (const box of ["shadows", "guesses"]) {
+    $(box).onchange = () => {
+      renderer[box] = $(box).checked;
+      view.dirty = true;
+    };
+    $(box).onchange();
+  }
   const list = () => {
     const found = search(view.attributes, view.boxes, $("search").value);
     $("found").replaceChildren(...found.map(([feature, title]) => {

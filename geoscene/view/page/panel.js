@@ -30,7 +30,7 @@ const OTHER_SOURCE = ["of another source", [200, 60, 150]];
 const SIGMAS = [[0.5, [26, 120, 80]], [1, [110, 170, 70]], [2, [200, 200, 70]], [4, [244, 170, 50]], [8, [226, 90, 40]], [Infinity, [140, 20, 50]]];
 
 function isGuess(source) {
-  return /default|inferred|assumed/.test(source);
+  return /default|inferred|assumed|guess/.test(source);
 }
 
 /** An element with text or children. */
@@ -101,6 +101,7 @@ function describe(head, attributes, feature, hit) {
     const face = [["class", words((head.classes[hit.klass] || ["unknown"])[0])], ["material", words(material)]];
     if (reflectance) face.push(["reflectance", `${reflectance[0]} at 905 nm, ${reflectance[2]} at 1550 nm`]);
     if (hit.surface) face.push(["surface", SURFACES[hit.surface]]);
+    if (hit.guessed) face.push(["colour", make("span", "guess", { className: "guessed" })]);
     face.push(["x, y, z", `${hit.point.map((v) => metres(v)).join(", ")} m in ${head.frame}, heights ${head.vertical}`]);
     const [lon, lat] = toLonLat(head.lonlat, hit.point[0], hit.point[1]);
     face.push(["lat, lon", `${lat.toFixed(7)}, ${wrapped(lon).toFixed(7)}`]);
@@ -133,6 +134,16 @@ function bySource(attributes) {
   const order = [...Object.values(HEIGHT_SOURCES), OTHER_SOURCE].map(([text]) => text);
   const rows = [...counts].sort(([a], [b]) => order.indexOf(a) - order.indexOf(b)).map(([text, { n, rgb }]) => [`${text} (${n})`, rgb]);
   return { colorOf, rows: [...rows, ["no height of its own", null]] };
+}
+
+/** The same by what is guessed of a building's look. */
+function byLook(attributes) {
+  const kinds = [["walls and roof mapped", [46, 150, 84]], ["walls or roof guessed", [242, 158, 44]], ["walls and roof guessed", [226, 88, 34]]];
+  const counts = [0, 0, 0];
+  const kindOf = (feature) => ["wall_look_source", "roofing_source"].filter((column) => attributes.value(feature, column) !== null).length;
+  for (const feature of attributes.rows.keys()) if (attributes.layer(feature) === "buildings") counts[kindOf(feature)]++;
+  const colorOf = (feature) => (attributes.layer(feature) === "buildings" ? kinds[kindOf(feature)][1] : null);
+  return { colorOf, rows: [...kinds.map(([text, rgb], k) => [`${text} (${counts[k]})`, rgb]), ["windows are drawn, not mapped", null]] };
 }
 
 /** The same by the standard deviation of the height. */

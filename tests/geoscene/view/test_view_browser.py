@@ -5,14 +5,18 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+import shapely
 from helpers.browser import CHROMIUM, DRIVER, browser
 from PIL import Image
 
 from geoscene.classes import Class
 from geoscene.cli import app
+from geoscene.frames import Frame
 from geoscene.options import BuildOptions
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
+from geoscene.sources.data import Area, OsmData
+from geoscene.view import view_scene
 
 BOX = (24.9405, 60.1655, 24.9450, 60.1680)
 SKY = (185, 207, 228)
@@ -179,10 +183,106 @@ def test_assumed_values_have_their_own_colours_and_a_legend(scene, opened):
     legend = opened.text("legend")
     sources = scene.features("buildings").columns["height_source"]
     assert f"from its storeys ({(sources == 'levels').sum()})" in legend
-    for mode in ("material", "class", "sigma", "look"):
+    for mode in ("material", "class", "sigma", "guesses", "look"):
         opened.js("const c = document.getElementById('color'); c.value = arguments[0]; c.onchange();", mode)
         assert (mode == "look") == (opened.text("legend") == "")
     assert np.array_equal(middle(opened), before)
+
+
+HOUSE = (
+    10.0,
+    50.0,
+    12.0,
+    30.0,
+)  # metres: x, y, width, depth of a tagged house; its copy east of it is untagged
+
+
+@pytest.fixture(scope="module")
+def houses(tmp_path_factory):
+    """A page with a house of five storeys whose colours are mapped, and one without any tags."""
+    frame = Frame.at(8.7, 49.4)
+    x, y, width, depth = HOUSE
+    tags = {"building": "apartments", "height": "15", "building:levels": "5", "building:colour": "#ffffff"}
+    areas = []
+    for k, own in enumerate((tags | {"roof:colour": "#ff0000"}, {"building": "apartments", "height": "15"})):
+        shape = shapely.box(x + 60 * k, y, x + 60 * k + width, y + depth)
+        lonlat = shapely.transform(shape, lambda xy: np.column_stack(frame.to_geographic(xy[:, 0], xy[:, 1])))
+        areas.append(Area(f"way/{k + 1}", own, lonlat, np.empty(0, np.int64)))
+    lon, lat = frame.to_geographic([-50, 150], [-50, 100])
+    osm = OsmData((lon[0], lat[0], lon[1], lat[1]), [], areas, [], [])
+    scene = build(osm, tmp_path_factory.mktemp("houses") / "scene", options=BuildOptions(name="houses"))
+    out = tmp_path_factory.mktemp("page") / "houses.html"
+    view_scene(scene, out)
+    return out
+
+
+def look_at_wall(window, way):
+    """Look level at the wall of a house that faces east, and deselect it."""
+    window.js(
+        "const v = geoscene; v.select(arguments[0]);"
+        "const f = +document.getElementById('panel').dataset.feature, [x, y] = v.boxes.middle(f);"
+        "const c = v.camera; c.lookAt([v.boxes.high[3 * f], y, 7.5], 45);"
+        "c.azimuth = -Math.PI / 2; c.tilt = 0.02;"
+        "v.click(-1, -1); v.redraw();",
+        way,
+    )
+    window.settle()
+
+
+def runs(line):
+    """Number of runs of true in a line."""
+    return int(np.count_nonzero(np.diff(np.concatenate([[0], line.astype(int)])) == 1))
+
+
+def test_windows_stand_in_the_storeys_of_a_wall_and_can_be_switched_off(window, houses):
+    window.open(houses)
+    look_at_wall(window, "way/1")
+    drawn = picture(window)[:, 260:]
+    window.js("document.getElementById('guesses').click()")
+    bare = picture(window)[:, 260:]
+    glass = np.abs(drawn - bare).max(axis=2) > 60
+    assert max(runs(column) for column in glass.T) == 5  # building:levels
+    rows = [runs(row) for row in glass]
+    assert 5 <= max(rows) <= 15  # of a wall of 30 m
+    assert np.ptp(bare[glass], axis=0).max() < 12  # the mapped colour lies behind the windows
+    window.js("document.getElementById('guesses').click()")
+    assert np.array_equal(picture(window)[:, 260:], drawn)
+
+
+def test_the_inspector_says_what_is_a_guess_and_never_of_a_mapped_colour(window, houses):
+    window.open(houses)
+    told = {}
+    for way in ("way/1", "way/2"):
+        look_at_wall(window, way)
+        window.js("geoscene.click(innerWidth / 2, innerHeight / 2 - 20)")
+        rows = window.js(
+            "const rows = [...document.querySelectorAll('#panel tr')];"
+            "return rows.map((row) => [...row.children].map((cell) => cell.innerText))"
+        )
+        told[way] = {row[0]: row[1:] for row in rows}
+        assert window.js("return [...document.querySelectorAll('#panel .guessed')].length") > 0
+    assert told["way/1"]["windows"][1] == told["way/2"]["windows"][1] == "guess"
+    assert not {"wall look", "roofing", "storeys", "colour"} & set(told["way/1"])
+    assert told["way/1"]["levels"][0] == "5"
+    for row in ("wall look", "roofing", "storeys"):
+        assert told["way/2"][row][1] == "guess"
+    assert told["way/2"]["colour"] == ["guess"]
+    assert told["way/2"]["surface"] == ["wall"]
+    window.js("const c = document.getElementById('color'); c.value = 'guesses'; c.onchange();")
+    legend = window.text("legend")
+    assert "walls and roof mapped (1)" in legend
+    assert "walls and roof guessed (1)" in legend
+    assert "windows are drawn, not mapped" in legend
+
+
+def test_without_guesses_an_unmapped_house_has_its_default_colour(window, houses):
+    window.open(houses, "#guesses=0")
+    look_at_wall(window, "way/2")
+    plaster = picture(window)[200:300, 450:550].reshape(-1, 3)
+    window.js("document.getElementById('guesses').click()")
+    guessed = picture(window)[200:300, 450:550].reshape(-1, 3)
+    assert len(np.unique(plaster, axis=0)) <= 3
+    assert np.abs(np.median(guessed, axis=0) - np.median(plaster, axis=0)).max() > 5
 
 
 def test_mouse_and_keys_rotate_move_and_zoom(opened):
