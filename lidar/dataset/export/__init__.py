@@ -82,6 +82,14 @@ EXPORTERS = {
     row.name: row
     for row in (
         Exporter(
+            "coco",
+            "coco",
+            "images with COCO's boxes, masks and panoptic segments",
+            mark="annotations/instances.json",
+            names=r"images/[^/]+_\d{6,}\.png|annotations/((instances|panoptic)\.json|panoptic/[^/]+_\d{6,}\.png)",
+            hint="open it with pycocotools: COCO('{path}/annotations/instances.json')",
+        ),
+        Exporter(
             "kitti",
             "kitti",
             "a sequence of KITTI's odometry benchmark, with labels of SemanticKITTI and of objects",
