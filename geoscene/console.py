@@ -44,6 +44,9 @@ _HINTS = {
     errno.EPERM: _PERMISSION,
     errno.EROFS: "; give a path that you may write to",
 }
+_TEMPORARY = re.compile(r"\.\d+\.part(?=$|[./])|(\.new|\.old)?\.part(?=$|/)|\.lock$")
+"""What names of files have more than those that they become."""
+
 _BROKEN_PIPE = 141
 
 _INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
@@ -159,7 +162,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
         sys.exit(FAILURE)
     except OSError as error:
         # Files are first written as <name>.<process>.part; the message names the final file.
-        name = re.sub(r"\.\d+\.part(?=$|[./])|\.part(?=$|/)", "", str(error.filename or "the system"))
+        name = _TEMPORARY.sub("", str(error.filename or "the system"))
         hint = _HINTS.get(error.errno or 0, "")
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)

@@ -12,7 +12,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -78,9 +78,7 @@ def atomic_file(path: Path) -> Iterator[IO[bytes]]:
 
 @contextmanager
 def atomic_folder(path: Path, *, mark: str, names: str) -> Iterator[Path]:
-    """Yield a temporary folder that replaces ``path`` unless the block raises.
-
-    Files of the replaced folder that are not of its kind are kept, with a warning for each.
+    """Yield a temporary folder that replaces ``path`` unless the block raises, as `replaced_folder` does.
 
     mark  : name of a file that marks folders of this kind
     names : regular expression of the paths, relative to the folder, of the files in folders of this kind
@@ -89,42 +87,66 @@ def atomic_folder(path: Path, *, mark: str, names: str) -> Iterator[Path]:
     """
     if path.exists() and not (path / mark).is_file() and not (path.is_dir() and not any(path.iterdir())):
         raise InputError(f"{path}: exists and holds no {mark}; give another folder")
-    place = path.resolve()
-    part, old = (place.with_name(f"{place.name}.{os.getpid()}.{end}") for end in ("part", "old"))
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
+    own = re.compile(names)
+    with replaced_folder(path, own=lambda _: lambda name: own.fullmatch(name) is not None) as part:
         yield part
-        if place.exists():
-            place.rename(old)
-        part.rename(place)
-        if old.exists():
-            for entry in _foreign_files(old, names=names):
-                _move(entry, place / entry.relative_to(old))
-                log.warning("%s: kept, though not of the export", path / entry.relative_to(old))
-            shutil.rmtree(old)
-    finally:
+
+
+@contextmanager
+def replaced_folder(path: Path, *, own: Callable[[Path], Callable[[str], bool]]) -> Iterator[Path]:
+    """Yield a temporary folder that replaces ``path`` unless the block raises.
+
+    Files of the replaced folder that are not of its kind are kept, with a warning for each. A replacement
+    that was killed is completed or undone by the next one.
+
+    own : from a folder, which paths relative to it, with slashes, are of its kind
+
+    Raises InputError for the current directory, which cannot be replaced, a folder around it or the root of a
+    disk, and if another process writes the folder.
+    """
+    place, here = path.resolve(), Path.cwd()
+    if place.is_mount() or place in (here, *here.parents):
+        kind = "the root of a disk" if place.is_mount() else "the current directory or holds it"
+        raise InputError(f"{path}: is {kind} and cannot be replaced; give a directory in it")
+    part, old = (place.with_name(f"{place.name}.{end}.part") for end in ("new", "old"))
+    with exclusive(place):
         if old.exists() and not place.exists():
             old.rename(place)
+        elif old.exists():
+            _keep_foreign(old, path, own=own(old))
         shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        try:
+            yield part
+            if place.exists():
+                place.rename(old)
+            part.rename(place)
+            if old.exists():
+                _keep_foreign(old, path, own=own(old))
+        finally:
+            if old.exists() and not place.exists():
+                old.rename(place)
+            shutil.rmtree(part, ignore_errors=True)
 
 
-def _foreign_files(folder: Path, *, names: str) -> list[Path]:
-    """Files and links below a folder whose relative paths do not match a regular expression."""
-    own = re.compile(names)
-    entries = sorted(entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    return [entry for entry in entries if not own.fullmatch(entry.relative_to(folder).as_posix())]
-
-
-def _move(source: Path, target: Path) -> None:
-    """Move a file on its disk, to another folder that is made for it."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    source.rename(target)
+def _keep_foreign(old: Path, path: Path, *, own: Callable[[str], bool]) -> None:
+    """Move files and links that are not ``own`` from a replaced folder to the new one; delete the rest."""
+    for entry in sorted(entry for entry in old.rglob("*") if entry.is_symlink() or not entry.is_dir()):
+        name = entry.relative_to(old)
+        target = path / name
+        if own(name.as_posix()) or target.exists() or target.is_symlink():
+            continue
+        target.parent.mkdir(parents=True, exist_ok=True)
+        entry.rename(target)
+        log.warning("%s: kept, though it is not of what was written", target)
+    shutil.rmtree(old)
 
 
 @contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Hold the right to write a directory against other processes; ``<path>.lock`` exists meanwhile.
+    """Hold the right to write a path against other processes; ``<path>.lock`` exists meanwhile.
+
+    Temporary files beside it of processes that were killed are deleted.
 
     Raises InputError if another process holds it. It ends with its process, however that ends.
     """
@@ -136,11 +158,65 @@ def exclusive(path: Path) -> Iterator[None]:
             or not lock.exists()
             or not os.path.samestat(lock.stat(), os.fstat(file.fileno()))
         ):
-            raise InputError(f"{path}: another process is writing it; wait for it, or give another directory")
+            raise InputError(f"{path}: another process is writing it; wait for it, or give another path")
         try:
+            delete_leftovers(path.parent, stem=path.stem, below=False)
             yield
         finally:
             lock.unlink(missing_ok=True)
+
+
+@contextmanager
+def temporary_folder(path: Path, what: str) -> Iterator[Path]:
+    """Yield a folder beside ``path`` that is deleted afterwards; ``what`` is part of its name.
+
+    If the process is killed, the next one that writes ``path`` deletes it, see `exclusive`.
+    """
+    folder = path.with_name(f"{path.name}.{what}.{os.getpid()}.part")
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def delete_leftovers(folder: Path, *, stem: str = "", below: bool = True) -> None:
+    """Delete temporary files and folders, as of `atomic_path`, of processes that have ended.
+
+    stem  : with which, and a dot, their names begin; by default all
+    below : also those in folders of the folder
+    """
+    for place, folders, files in os.walk(folder):
+        for name in [*folders, *files]:
+            found = _TEMPORARY.fullmatch(name)
+            if found is None or (stem and not name.startswith(f"{stem}.")) or _runs(int(found[1])):
+                continue
+            entry = Path(place, name)
+            if entry.is_dir() and not entry.is_symlink():
+                shutil.rmtree(entry)
+                folders.remove(name)
+            else:
+                entry.unlink(missing_ok=True)
+        if not below:
+            break
+
+
+_TEMPORARY = re.compile(r".+\.(\d+)\.part(?:\.[.\w]+)?")
+"""Names of temporary files with the number of the process."""
+
+
+def _runs(process: int) -> bool:
+    """Whether a process with a number runs; True where that is not known."""
+    if sys.platform == "win32":
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def _locked(file: IO[bytes]) -> bool:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -26,7 +25,7 @@ from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
-from lidar.dataset.layout import Paths, own_files, prepare
+from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
 from lidar.dataset.recording import Recording
@@ -145,10 +144,9 @@ def _driven(
     manifest = plan.manifest() | dict(notes)
     recording = plan.recording(out)
     check_attackers(plan, recording)
-    prepare(out, manifest["recipe"], overwrite=overwrite)
-    with _removed_if_nothing_recorded(out), exclusive(out):
+    with exclusive(out), _begun(out, manifest, overwrite=overwrite):
         journal = _verified(recording, plan.jobs, progress=progress)
-        _write_plan(plan, recording, manifest=manifest)
+        _write_plan(plan, recording)
         pending = _pending(plan, journal)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
         trim_memory()
@@ -218,11 +216,9 @@ def trim_memory() -> None:
             trim(0)
 
 
-def _write_plan(plan: DrivePlan, recording: Recording, *, manifest: dict[str, Any]) -> None:
+def _write_plan(plan: DrivePlan, recording: Recording) -> None:
     """Write all files of the dataset that do not depend on recorded frames."""
     paths = Paths(recording.out)
-    if not paths.manifest.exists():
-        write_json(paths.manifest, manifest | {"frames_done": 0})
     write_trajectory(paths.trajectory, plan.trajectory)
     write_metadata(
         recording.out,
@@ -270,14 +266,22 @@ def _points(plan: DrivePlan, journal: Journal) -> dict[str, int]:
 
 
 @contextmanager
-def _removed_if_nothing_recorded(out: Path) -> Iterator[None]:
-    """Remove a dataset that was begun here if an error ends the drive before any frame is recorded."""
-    begun = not Paths(out).manifest.exists()
+def _begun(out: Path, manifest: Mapping[str, Any], *, overwrite: bool) -> Iterator[None]:
+    """Begin or resume a dataset.
+
+    A new one is removed if an error of the block ends the drive before any frame is recorded.
+    """
+    prepare(out, manifest["recipe"], overwrite=overwrite)
+    new = not Paths(out).manifest.exists()
+    if new:  # the first file: it marks a folder whose drive can be resumed
+        write_json(Paths(out).manifest, dict(manifest) | {"frames_done": 0})
     try:
         yield
     except (GeosceneError, LidarError):
-        if begun and not any(out.glob("*/*/*")):
-            shutil.rmtree(out)
+        if new and not any(out.glob("*/*/*")):
+            remove_dataset(out)
+            with suppress(OSError):  # files of others are in it
+                out.rmdir()
         raise
 
 

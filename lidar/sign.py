@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically, write_json
+from geoscene.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
@@ -96,10 +97,15 @@ def sign_dataset(
     if out is None:
         if watermark is not None:
             raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
-        if Paths(source).integrity.exists() and not overwrite:
+        chain = Paths(source).chain
+        if chain.exists() and not overwrite:
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
-        summary = _chained(given, signer, summary=SignSummary(source), progress=progress)
-        add_to_checksums(source, below=given.integrity.name)
+        with exclusive(source.resolve()):
+            delete_leftovers(source)
+            summary, data = _chained(given, signer, summary=SignSummary(source), progress=progress)
+            known = {chain.relative_to(source).as_posix(): hashlib.sha256(data).digest()}
+            add_to_checksums(source, below=given.integrity.name, known=known)
+            write_atomically(chain, data)  # last: it marks signed data
         return summary
     out = Path(out)
     check_target(out, source=source, overwrite=overwrite)
@@ -111,7 +117,9 @@ def sign_dataset(
             summary = _marked_clouds(source, summary, watermark=watermark, progress=progress)
         else:
             summary = _marked(dataset, summary, watermark=watermark, progress=progress)
-        summary = _chained(signable(part), signer, summary=summary, progress=progress)
+        summary, data = _chained(signable(part), signer, summary=summary, progress=progress)
+        if data:
+            write_atomically(Paths(part).chain, data)
         write_checksums(part)
     return replace(summary, path=out)
 
@@ -250,14 +258,14 @@ def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
 
 def _chained(
     data: Signable, signer: Signer | None, *, summary: SignSummary, progress: Progress
-) -> SignSummary:
-    """Write the signed hash chain over the files of a directory."""
+) -> tuple[SignSummary, bytes]:
+    """Write the hash chain over the files of a directory; the bytes of the signature, empty without a key."""
     if signer is None:
-        return summary
+        return summary, b""
     signer.sign(b"")  # a key that cannot sign is refused before anything is written
     files, folder = data.files(), data.integrity
     folder.mkdir(exist_ok=True)
-    (folder / "chain.json").unlink(missing_ok=True)  # written last
+    Paths(data.path).chain.unlink(missing_ok=True)
     heads: dict[str, tuple[int, bytes]] = {}
     total, done = sum(map(len, files.frames.values())), 0
     for sensor, frames in files.frames.items():
@@ -279,6 +287,5 @@ def _chained(
         "files": {name: sha256.hex() for name, sha256 in tables.items()},
         "signature": signer.sign(signed_message(heads, tables)).hex(),
     }
-    write_json(folder / "chain.json", document)
     progress("sign", total, total=total)
-    return replace(summary, frames=total, files=files.count)
+    return replace(summary, frames=total, files=files.count), json_bytes(document)

@@ -337,7 +337,7 @@ def _check_coarseness(cloud: MarkedCloud, watermark: Watermark) -> None:
 
 
 def _chain_report(data: Signable, signer: Signer, *, progress: Progress) -> ChainReport:
-    path = data.integrity / "chain.json"
+    path = Paths(data.path).chain
     if not path.is_file():
         raise DatasetError(f"{data.path}: is not signed; lidar sign --chain signs it")
     with reading_file(path):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from geoscene.errors import InputError
 from geoscene.export.files import Summary
+from geoscene.files import exclusive
 from geoscene.options import ExportOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -108,5 +110,6 @@ def export_scene(
         scene.require("tables")
     module, function = kind.writer.split(":")
     write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
-    summary: Summary = write(scene, out, **given, progress=progress)
+    with exclusive(out) if kind.suffixes else nullcontext():  # writers of folders see to that
+        summary: Summary = write(scene, out, **given, progress=progress)
     return summary

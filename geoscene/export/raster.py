@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from geoscene.errors import InputError
 from geoscene.export.files import Summary
 from geoscene.export.objects import attribution, expand, parts
 from geoscene.export.zbuffer import draw_triangles
-from geoscene.files import atomic_path, naming, not_written
+from geoscene.files import atomic_path, naming, not_written, temporary_folder
 from geoscene.mesh import Mesh, concatenate
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -91,11 +90,10 @@ def write_geotiff(
     grid = grid_of(scene, resolution)
     library = list(scene.shapes().values())
     faces = 0
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
+    with temporary_folder(path, "cells") as folder:
         with naming(path):
-            height = _cells_on_disk(Path(folder) / "height", grid, value=np.float32(np.nan))
-            labels = _cells_on_disk(Path(folder) / "labels", grid, value=np.uint8(0))
+            height = _cells_on_disk(folder / "height", grid, value=np.float32(np.nan))
+            labels = _cells_on_disk(folder / "labels", grid, value=np.uint8(0))
         for part in parts(scene, layers, stage="GeoTIFF", progress=progress):
             mesh = part.mesh
             if model == "terrain":
@@ -108,7 +106,7 @@ def write_geotiff(
             raise InputError(
                 f"`layers` {', '.join(layers or ())}: no faces of the {model} model in this scene"
             )
-        draft = Path(folder) / "draft.tif"
+        draft = folder / "draft.tif"
         try:
             _write_draft(draft, scene, grid=grid, cells=labels if model == "classes" else height, model=model)
             _write_cog(draft, path, model=model)

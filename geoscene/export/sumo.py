@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 import subprocess
-import tempfile
 from pathlib import Path
 
 from geoscene.errors import GeosceneError, need
 from geoscene.export.files import Summary
 from geoscene.export.opendrive import write_opendrive
-from geoscene.files import atomic_file
+from geoscene.files import atomic_file, temporary_folder
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 
@@ -29,9 +28,8 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
     with the last line of netconvert's output if that fails.
     """
     home = Path(need("sumo", "sumo").SUMO_HOME)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".geoscene-") as folder:
-        roads, net = Path(folder) / "roads.xodr", Path(folder) / "roads.net.xml"
+    with temporary_folder(path, "roads") as folder:
+        roads, net = folder / "roads.xodr", folder / "roads.net.xml"
         roads_summary = write_opendrive(scene, roads, progress=progress)
         files = ("--opendrive-files", roads, "--output-file", net)
         command = (home / "bin" / "netconvert", *files, "--aggregate-warnings", "-1")  # `_warnings` does so

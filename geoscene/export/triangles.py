@@ -56,7 +56,7 @@ def write_obj(
     objects = solids = faces = first = 0
     looks: dict[tuple[int, ...], str] = {}
     library = path.with_suffix(".mtl")
-    with atomic_file(library) as colors, atomic_file(path) as out:
+    with atomic_file(path) as out, atomic_file(library) as colors:  # the file that names the other comes last
         out.write("".join(f"# {line}\n" for line in _head(scene)).encode())
         out.write(f"mtllib {library.name}\n".encode())
         for index, mesh in meshes_of(scene, layers, stage="OBJ", progress=progress):

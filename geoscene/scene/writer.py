@@ -69,7 +69,7 @@ class SceneWriter:
         self.folder = self.path.with_name(f"{self.path.name}.part")
         self.files = SceneFiles(self.folder)
         self.former: Path | None = None
-        self._replaced = self.path.with_name(f"{self.path.name}.old")
+        self._replaced = self.path.with_name(f"{self.path.name}.old.part")
         self._overwrite = overwrite
         self._lock = ExitStack()
 

@@ -13,7 +13,7 @@ from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import attribution, read_features
-from geoscene.files import atomic_file, spool
+from geoscene.files import atomic_file, exclusive, spool
 from geoscene.options import Degrees, ViewOptions
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -61,7 +61,7 @@ def view_scene(
     tiles: list[dict[str, Any]] = []
     ends: list[int] = []
     faces = 0
-    with atomic_file(out) as file, spool(out) as blobs:
+    with exclusive(out), atomic_file(out) as file, spool(out) as blobs:
         write_blob(blobs, "shapes", data=shape_bytes)
         for done, (i, j, _) in enumerate(chosen.tolist()):
             progress("page", done, total=len(chosen))

@@ -89,10 +89,12 @@ def write_checksums(
     return _digest_of(data)
 
 
-def add_to_checksums(folder: Path, *, below: str) -> None:
+def add_to_checksums(folder: Path, *, below: str, known: Mapping[str, bytes]) -> None:
     """State the files anew that are below a path of the folder; others keep their checksums, right or wrong.
 
     A folder without checksums stays without.
+
+    known : SHA-256 of files that are not written yet
     """
     path = folder / CHECKSUMS
     if not path.is_file():
@@ -100,7 +102,7 @@ def add_to_checksums(folder: Path, *, below: str) -> None:
     start = f"{below}/"
     found = {name: sha for name, sha in read_checksums(path).sha256.items() if not name.startswith(start)}
     fresh = {start + name: file_digest(folder / below / name) for name in files_in(folder / below)}
-    write_atomically(path, _to_bytes(found | fresh))
+    write_atomically(path, _to_bytes({**found, **fresh, **known}))
 
 
 def read_checksums(path: Path) -> Checksums:

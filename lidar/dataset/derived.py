@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
-from lidar.dataset.layout import Paths, remove_dataset
+from geoscene.files import replaced_folder
+from lidar.dataset.layout import Paths, own_files
 from lidar.errors import DatasetError, InputError
 
 
@@ -25,31 +24,12 @@ def check_target(out: Path, *, source: Path, overwrite: bool) -> None:
         raise DatasetError(f"{out}: is not empty; set `overwrite`, or give another directory")
 
 
-@contextmanager
-def complete_folder(out: Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files become those of ``out`` unless the block raises.
+def complete_folder(out: Path) -> AbstractContextManager[Path]:
+    """Yield a temporary folder that replaces ``out`` unless the block raises.
 
-    They replace a former dataset there; other files stay.
+    Files there that are not of a dataset stay, with a warning for each.
     """
-    place = out.resolve()
-    part = place.with_name(f"{place.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir(parents=True)
-    try:
-        yield part
-        if Paths(out).manifest.exists():
-            remove_dataset(out)
-        if not place.exists() or not any(place.iterdir()):
-            part.replace(place)
-            return
-        manifest = Paths(part).manifest
-        files = [path for path in part.rglob("*") if path.is_file() and path != manifest]
-        for path in (*files, *([manifest] if manifest.exists() else [])):
-            target = place / path.relative_to(part)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            path.replace(target)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+    return replaced_folder(out, own=own_files)
 
 
 def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:

@@ -158,7 +158,7 @@ def _integrity(folder: Path) -> dict[str, Any]:
         found["checksums"] = {"files": len(stated.sha256), "digest": stated.digest}
     else:
         found["checksums"] = None
-    return found | {"signed": (paths.integrity / "chain.json").is_file()}
+    return found | {"signed": paths.chain.is_file()}
 
 
 def _extent(dataset: Dataset) -> dict[str, Any] | None:

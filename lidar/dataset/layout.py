@@ -33,7 +33,7 @@ import numpy as np
 from pyproj import CRS
 
 from geoscene.errors import reading
-from geoscene.files import digest
+from geoscene.files import delete_leftovers, digest, write_json
 from geoscene.frames import Frame
 from geoscene.storage import Stored, cache_folder, url_of
 from geoscene.typing import Ints
@@ -125,6 +125,11 @@ class Paths:
     def integrity(self) -> Path:
         """Folder of digests and the signature of a signed dataset."""
         return self.root / "integrity"
+
+    @property
+    def chain(self) -> Path:
+        """The signature; written last."""
+        return self.integrity / "chain.json"
 
     def truth(self, name: str, frame: int) -> Path:
         """What stages did to a frame of a sensor."""
@@ -319,6 +324,8 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     manifest_path = Paths(path).manifest
     if path.exists() and not path.is_dir():
         raise DatasetError(f"{path}: is a file; give a directory")
+    if path.exists():  # a drive may have been killed when it wrote its first file
+        delete_leftovers(path, stem=manifest_path.stem, below=False)
     if not path.exists() or not any(path.iterdir()):
         path.mkdir(parents=True, exist_ok=True)
         return 0
@@ -336,15 +343,20 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
             f"{path}: holds a drive made with other options: {changes};"
             " set `overwrite` to replace it, or give another directory"
         )
-    for left in path.rglob("*.part"):  # of a drive that was killed
-        left.unlink()
+    delete_leftovers(path)
     return int(manifest["frames_done"])
 
 
 def remove_dataset(path: Path) -> None:
-    """Delete the files of a dataset, its manifest last; files of others are kept, with a warning for each."""
+    """Delete the files of a dataset, its manifest last; files of others are kept, with a warning for each.
+
+    If it is killed meanwhile, the manifest states a drive that was not finished.
+    """
     paths = Paths(path)
-    if (paths.integrity / "chain.json").is_file():
+    if paths.manifest.exists():
+        with suppress(DatasetError):
+            write_json(paths.manifest, open_dataset(path).manifest | {"frames_done": 0})
+    if paths.chain.is_file():
         shutil.rmtree(paths.integrity)
     sensors, top = _own_names(paths)
     folders: list[Path] = []
@@ -361,15 +373,18 @@ def remove_dataset(path: Path) -> None:
     for folder in reversed(folders):
         if not any(folder.iterdir()):
             folder.rmdir()
-    paths.manifest.unlink()
+    paths.manifest.unlink(missing_ok=True)
 
 
 def own_files(path: Path) -> Callable[[str], bool]:
     """Whether a path relative to a dataset is that of a file which drives write; others may stand beside."""
     sensors, top = _own_names(Paths(path))
+    signed = Paths(path).chain.is_file()
 
     def own(name: str) -> bool:
         place = Path(name).parts
+        if signed and place[0] == Paths(path).integrity.name:
+            return True
         return path / name in top or (len(place) > 1 and place[0] in sensors and _of_a_sensor(place[1:]))
 
     return own

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from geoscene.classes import class_codes
+from geoscene.files import exclusive
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
 from lidar.dataset.formats import format_of, map_suffixes
@@ -68,7 +70,8 @@ def aggregate(
 
     overwrite : replace an existing file
 
-    Rasters and comparisons are beside it, have its name and replace files of earlier maps.
+    Rasters and comparisons are beside it, have its name and replace files of earlier maps. The map itself
+    appears last.
 
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
@@ -92,9 +95,13 @@ def aggregate(
     if options.raster:
         stream = rasters.measured(stream)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
-    written = _write(out, (_colored(t, options.color, limits=limits) for t in stream), source=source)
-    write_map_provenance(dataset, out)
-    beside = rasters.write(out, crs=dataset.crs)
+    with exclusive(out), _opened(out, source) as append:
+        written = 0
+        for table in stream:
+            append(_colored(table, options.color, limits=limits))
+            written += rows(table)
+        write_map_provenance(dataset, out)
+        beside = rasters.write(out, crs=dataset.crs) + (comparison.write(out) if comparison else [])
     return MapSummary(
         read.points,
         written,
@@ -102,7 +109,7 @@ def aggregate(
         len(read.frames),
         source.missing(),
         out,
-        beside=beside + (comparison.write(out) if comparison else []),
+        beside=beside,
         distances=comparison.rows() if comparison else [],
     )
 
@@ -148,13 +155,10 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
     return table | {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2]}
 
 
-def _write(out: Path, tables: Iterator[Table], *, source: Source) -> int:
-    """Write tables as a map; return the number of points."""
+def _opened(out: Path, source: Source) -> AbstractContextManager[Callable[[Table], None]]:
+    """A function that appends tables to a map."""
     info = LasInfo(source.dataset.crs, source.geo.offset, source.dataset.start)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
-    with format_of(out).open_map(out, info=info, columns=(*COLUMNS, "red", "green", "blue")) as append:
-        for table in tables:
-            append(table)
-            count += rows(table)
-    return count
+    opened: AbstractContextManager[Callable[[Table], None]] = format_of(out).open_map(
+        out, info=info, columns=(*COLUMNS, "red", "green", "blue")
+    )
+    return opened

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.files import temporary_folder
 from lidar.dataset.formats.table import Table, records
 
 Square = tuple[int, int]
@@ -80,9 +79,5 @@ def squares_beside(
     out: Path, side: float, *, offset: tuple[float, float, float], what: str
 ) -> Iterator[Squares]:
     """Yield empty `Squares` in a temporary folder beside a map; ``what`` is part of its name."""
-    folder = out.with_name(f"{out.name}.{os.getpid()}.{what}")
-    folder.mkdir(parents=True)
-    try:
+    with temporary_folder(out, what) as folder:
         yield Squares(folder, side, offset=offset)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)

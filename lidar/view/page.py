@@ -9,7 +9,7 @@ from tempfile import SpooledTemporaryFile
 from typing import IO, Any
 
 from geoscene.export.files import compact_json
-from geoscene.files import atomic_file, spool
+from geoscene.files import atomic_file, exclusive, spool
 from geoscene.progress import Progress, silent
 from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
 from lidar.dataset.layout import Dataset
@@ -68,7 +68,7 @@ def view_drive(
     head = drive.head()
     returns = 0
     written: set[str] = set()
-    with atomic_file(out) as file, spool(out) as blobs:
+    with exclusive(out), atomic_file(out) as file, spool(out) as blobs:
         write_blob(blobs, "slots", data=pack_slots(drive.slots))
         for k in range(len(drive)):
             progress("page", k, total=len(drive))

@@ -355,7 +355,7 @@ def test_files_of_others_are_kept_and_named(osm, whole, tmp_path, caplog):
 @pytest.mark.parametrize("renamed", [False, True])
 def test_replacement_that_was_killed_is_completed(renamed, osm, whole, tmp_path):
     """Killed after the old scene was set aside, before or after the new one got its name."""
-    old = tmp_path / "scene.old"
+    old = tmp_path / "scene.old.part"
     shutil.copytree(whole.path, old)
     (old / "notes.txt").write_text("mine")
     if renamed:
@@ -392,3 +392,11 @@ def test_current_directory_is_refused_before_the_work(out, tmp_path):
 def test_target_is_checked_before_the_map_is_read(whole):
     done = run_program("geoscene", "build", "--osm", "nowhere.osm", "-o", whole.path)
     assert "--overwrite" in done.stderr
+
+
+def test_a_backup_beside_a_scene_is_not_touched(osm, whole, tmp_path):
+    backup = tmp_path / "scene.old"
+    shutil.copytree(whole.path, backup)
+    build(osm, tmp_path / "scene", options=OPTIONS)
+    build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True)
+    same_files(whole.path, backup)

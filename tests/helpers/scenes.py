@@ -7,3 +7,8 @@ def same_files(a, b):
     assert names == sorted(p.relative_to(b) for p in b.rglob("*") if p.is_file())
     for name in names:
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+def names_in(folder):
+    """Names of what is in a directory, sorted."""
+    return sorted(path.name for path in folder.iterdir())

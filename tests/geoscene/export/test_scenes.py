@@ -473,7 +473,7 @@ def test_a_tileset_that_cannot_be_replaced_stays(scene, tmp_path, monkeypatch):
     before = {path: path.read_bytes() for path in out.rglob("*.*")}
 
     def interrupted(path, target):
-        if Path(target) == out and path.name.endswith(".part"):
+        if Path(target) == out and path.name.endswith(".new.part"):
             raise KeyboardInterrupt
         return rename(path, target)
 
