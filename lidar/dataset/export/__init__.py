@@ -143,9 +143,9 @@ EXPORTERS = {
         Exporter(
             "tum",
             "tum",
-            "trajectories of the vehicle and of every sensor as TUM text files",
+            "trajectories of the vehicle and of every sensor as text files of TUM and of KITTI",
             mark="vehicle.tum",
-            names=r"vehicle\.tum|sensors/[^/]+\.tum",
+            names=r"(vehicle|sensors/[^/]+)\.(tum|kitti)",
             hint="compare with evo_ape tum {path}/vehicle.tum ESTIMATE",
         ),
     )

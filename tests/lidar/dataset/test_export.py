@@ -105,6 +105,12 @@ def test_tum_trajectories_are_the_true_poses_of_vehicle_and_sensors(dataset, tmp
         place, turn = expected_pose(name, times[name])
         np.testing.assert_allclose(position, place, rtol=0, atol=1e-9, err_msg=name)
         assert (turn.inv() * rotation).magnitude().max() < 1e-9, name
+        kitti = np.loadtxt(path.with_suffix(".kitti")).reshape(-1, 3, 4)
+        np.testing.assert_allclose(kitti[0], np.eye(3, 4), atol=1e-9)
+        np.testing.assert_allclose(
+            kitti[:, :, 3], turn[0].inv().apply(place - place[0]), rtol=0, atol=1e-8, err_msg=name
+        )
+        assert ((turn[0].inv() * turn).inv() * Rotation.from_matrix(kitti[:, :, :3])).magnitude().max() < 1e-9
 
 
 def test_oxts_values_are_the_true_motion_of_the_inertial_unit(dataset):
@@ -232,7 +238,7 @@ def test_an_export_is_replaced_only_on_request_and_nothing_else_is(dataset, tmp_
 def test_a_replaced_export_keeps_and_names_the_files_of_others(dataset, tmp_path, caplog):
     row, out = EXPORTERS["tum"], tmp_path / "tum"
     row.export(dataset, out)
-    fresh = {path: path.read_bytes() for path in out.rglob("*.tum")}
+    fresh = {path: path.read_bytes() for end in ("tum", "kitti") for path in out.rglob(f"*.{end}")}
     ours = [out / "provenance.json", out / CHECKSUMS]
     mine = [out / "thesis.txt", out / "sensors" / "top.tum.bak", out / "notes" / "a.md"]
     for path in mine:
