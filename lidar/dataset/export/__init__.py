@@ -99,6 +99,17 @@ EXPORTERS = {
             hint="open it with pykitti.odometry('{path}', '00')",
         ),
         Exporter(
+            "kitti-360",
+            "kitti_360",
+            "a sequence of KITTI-360 with poses, calibration, 3D boxes and labels of pixels",
+            mark="calibration/perspective.txt",
+            names=r"calibration/\w+\.txt|data_poses/\w+/(poses|cam0_to_world)\.txt|data_3d_bboxes/train/\w+\.xml"
+            r"|data_3d_raw/\w+/velodyne_points/(timestamps\.txt|data/\d{10}\.bin)"
+            r"|data_2d_raw/\w+/image_0[01]/(timestamps\.txt|data_rect/\d{10}\.png)"
+            r"|data_2d_semantics/train/\w+/(instanceDict\.json|image_0[01]/(semantic|instance)/\d{10}\.png)",
+            hint="open it with kitti360scripts: KITTI360_DATASET={path}",
+        ),
+        Exporter(
             "kitti-raw",
             "kitti_raw",
             "a drive of KITTI's raw recordings, with OXTS files of the true motion",

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import FORMATS, LABELS, kitti
@@ -36,6 +37,7 @@ from lidar.dataset.recorded import (
 from lidar.errors import DatasetError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
+from lidar.time_scales import iso_times
 
 log = logging.getLogger(__name__)
 
@@ -143,8 +145,16 @@ class KittiDrive:
         shutil.copyfile(self.cameras[number].files[self.images[number][row]], path)
 
 
-def read_drive(dataset: Dataset) -> KittiDrive:
+def write_stamps(path: Path, dataset: Dataset, *, times: Ints) -> None:
+    """Write UTC time stamps with nanoseconds, a line each."""
+    lines = [f"{stamp[:-1].replace('T', ' ')}\n" for stamp in iso_times(dataset.start, times)]
+    write_atomically(path, "".join(lines).encode("ascii"))
+
+
+def read_drive(dataset: Dataset, *, numbers: Sequence[int] = _NUMBERS) -> KittiDrive:
     """The drive of a dataset, of its first scanner with clouds.
+
+    numbers : of cameras; those not called ``image_<number>`` get the first free ones
 
     Raises DatasetError for a dataset without clouds in the sensor frame.
     """
@@ -159,24 +169,25 @@ def read_drive(dataset: Dataset) -> KittiDrive:
             f"{dataset.path}: holds no clouds in the sensor frame; drive with `formats` {formats}"
         )
     streams = [color_images(dataset, name) for name in dataset.sensors("camera")]
-    return KittiDrive(dataset, clouds, _numbered([s for s in streams if s is not None and _rectified(s)]))
+    cameras = [s for s in streams if s is not None and _rectified(s)]
+    return KittiDrive(dataset, clouds, _numbered(cameras, numbers))
 
 
 def _rectified(camera: Stream) -> bool:
     """Whether a camera's images have no distortion, for which KITTI's projections have no place."""
     if camera.sensor["model"] == "pinhole" and not any(camera.sensor["distortion"]):
         return True
-    log.warning("%s: left out: KITTI has no fisheye cameras and no distortion", camera.name)
+    log.warning("%s: left out: KITTI has no fisheye cameras of this model and no distortion", camera.name)
     return False
 
 
-def _numbered(cameras: Sequence[Stream]) -> dict[int, Stream]:
-    """Cameras by KITTI's numbers: that of their name, or else free ones in order; a fifth is left out."""
-    own = {int(s.name[-1]): s for s in cameras if s.name in {f"image_{k}" for k in range(CAMERAS)}}
+def _numbered(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[int, Stream]:
+    """Cameras by numbers: that of their name, or else free ones in order; those beyond are left out."""
+    own = {int(s.name[-1]): s for s in cameras if s.name in {f"image_{k}" for k in numbers}}
     others = [s for s in cameras if s.name not in {camera.name for camera in own.values()}]
-    free = [number for number in _NUMBERS if number not in own]
+    free = [number for number in numbers if number not in own]
     for camera in others[len(free) :]:
-        log.warning("%s: left out: KITTI has %d cameras", camera.name, CAMERAS)
+        log.warning("%s: left out: there are %d cameras in this layout", camera.name, len(numbers))
     return dict(sorted({**own, **dict(zip(free, others, strict=False))}.items()))
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.files import write_atomically
 from geoscene.progress import Progress
 from geoscene.typing import Float
-from lidar.dataset.export.kitti_drive import CAMERAS, KittiDrive, read_drive
+from lidar.dataset.export.kitti_drive import CAMERAS, KittiDrive, read_drive, write_stamps
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset, read_rows, reading_file
 from lidar.dataset.recorded import nearest
@@ -23,7 +23,6 @@ from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.navigation.gnss import antenna_motion
 from lidar.navigation.imu import true_inertial
 from lidar.rig.specs import GnssSpec, ImuSpec
-from lidar.time_scales import iso_times
 
 _NAVSTAT = 4
 """OXTS's navigation status ``real time``."""
@@ -77,11 +76,11 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     time_ns = drive.clouds.time_ns
     period_ns = round(1e9 / float(drive.clouds.sensor["rate_hz"]))
     for name, times in {"": time_ns, "_start": time_ns, "_end": time_ns + period_ns}.items():
-        _write_times(out / "velodyne_points" / f"timestamps{name}.txt", dataset, times=times)
+        write_stamps(out / "velodyne_points" / f"timestamps{name}.txt", dataset, times=times)
     for number, stream in drive.cameras.items():
         times = stream.time_ns[drive.images[number]]
-        _write_times(out / f"image_{number:02d}" / "timestamps.txt", dataset, times=times)
-    _write_times(out / "oxts" / "timestamps.txt", dataset, times=time_ns)
+        write_stamps(out / f"image_{number:02d}" / "timestamps.txt", dataset, times=times)
+    write_stamps(out / "oxts" / "timestamps.txt", dataset, times=time_ns)
     oxts = oxts_columns(drive)
     rows = zip(*(oxts[name].tolist() for name in _OXTS), strict=True)
     for row, values in enumerate(rows):
@@ -145,12 +144,6 @@ def _satellites(drive: KittiDrive) -> NDArray[np.int64]:
         if len(used):
             return used[nearest(times, drive.clouds.time_ns)]
     return np.zeros(len(drive), np.int64)
-
-
-def _write_times(path: Path, dataset: Dataset, *, times: NDArray[np.int64]) -> None:
-    """Write UTC time stamps with nanoseconds, a line each."""
-    lines = [f"{stamp[:-1].replace('T', ' ')}\n" for stamp in iso_times(dataset.start, times)]
-    write_atomically(path, "".join(lines).encode("ascii"))
 
 
 def _write_calibrations(drive: KittiDrive, folder: Path) -> None:

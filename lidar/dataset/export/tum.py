@@ -22,7 +22,7 @@ from lidar.geometry.poses import Poses
 
 
 def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
-    """Write ``vehicle`` and ``sensors/<name>`` as ``.tum`` and ``.kitti``; return the numbers of trajectories and poses.
+    """Write ``vehicle`` and ``sensors/<name>`` as ``.tum`` and ``.kitti``; return their numbers and of poses.
 
     The vehicle's poses are those of ``trajectory.csv``. A sensor's are at the start of each of its frames, or
     at each of its measurements; a camera's axes are x right, y down, z forward.

@@ -1,6 +1,7 @@
 """A drive in layouts of image and driving datasets, read as their own tools read them."""
 
 import json
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,8 @@ from geoscene.classes import Class
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.coco import THINGS, encoded_mask
+from lidar.dataset.export.kitti_360 import SEQUENCE
+from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
@@ -181,3 +184,119 @@ def test_a_drive_without_cameras_has_no_coco_images(scene, tmp_path):
     with pytest.raises(DatasetError, match="holds no colour images; drive with a rig that has cameras"):
         EXPORTERS["coco"].export(open_dataset(driven), tmp_path / "out")
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
+
+
+def rigid(values):
+    return np.vstack([np.reshape(values, (3, 4)), [0, 0, 0, 1]])
+
+
+def matrices(path):
+    """Named matrices of a calibration file."""
+    rows = (line.split(": ") for line in path.read_text().splitlines())
+    return {name: np.array(values.split(), float) for name, values in rows}
+
+
+def opencv_matrix(node):
+    shape = int(node.find("rows").text), int(node.find("cols").text)
+    return np.array(node.find("data").text.split(), float).reshape(shape)
+
+
+def xml_objects(folder):
+    path = folder / "data_3d_bboxes" / "train" / f"{SEQUENCE}.xml"
+    return ET.parse(path).getroot()  # noqa: S314  (our own file)
+
+
+@pytest.fixture(scope="module")
+def kitti_360(dataset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("kitti_360") / "out"
+    return folder, EXPORTERS["kitti-360"].export(dataset, folder).counts
+
+
+def test_kitti_360_boxes_hold_the_points_of_their_road_users(dataset, kitti_360):
+    """World from velodyne as kitti360scripts chains it: pose, camera to pose, camera to velodyne."""
+    folder, counts = kitti_360
+    assert counts["clouds"] == 5
+    poses = np.loadtxt(folder / "data_poses" / SEQUENCE / "poses.txt")
+    cam0 = np.loadtxt(folder / "data_poses" / SEQUENCE / "cam0_to_world.txt")
+    mounts = matrices(folder / "calibration" / "calib_cam_to_pose.txt")
+    unit_from_cam0 = rigid(mounts["image_00"])
+    velo_from_cam0 = rigid(np.loadtxt(folder / "calibration" / "calib_cam_to_velo.txt"))
+    assert poses[:, 0].tolist() == cam0[:, 0].tolist() == list(range(5))
+    assert rigid(poses[0, 1:])[2, 2] < -0.99  # the unit's z axis points down
+    objects = xml_objects(folder)
+    boxes = {}
+    for node in objects:
+        numbers = {name: int(node.find(name).text) for name in ("semanticId", "instanceId", "timestamp")}
+        boxes[tuple(numbers.values())] = opencv_matrix(node.find("transform"))
+        assert np.abs(opencv_matrix(node.find("vertices"))).tolist() == [[0.5] * 3] * 8
+        assert numbers["timestamp"] == -1 or node.find("dynamic").text == "1"
+    assert len(boxes) == counts["boxes"] == len(objects)
+    owner, inside = {}, {True: [], False: []}
+    for frame in range(5):
+        world_from_unit = rigid(poses[frame, 1:])
+        np.testing.assert_allclose(cam0[frame, 1:].reshape(4, 4), world_from_unit @ unit_from_cam0, atol=1e-9)
+        path = folder / "data_3d_raw" / SEQUENCE / "velodyne_points" / "data" / f"{frame:010d}.bin"
+        points = np.fromfile(path, "<f4").reshape(-1, 4)
+        world = points[:, :3] @ (world_from_unit @ unit_from_cam0 @ np.linalg.inv(velo_from_cam0))[:3, :3].T
+        world += (world_from_unit @ unit_from_cam0 @ np.linalg.inv(velo_from_cam0))[:3, 3]
+        recorded_cloud = read_table(dataset.path / "top" / "pcd" / f"{frame:06d}.pcd")
+        for key, transform in boxes.items():
+            if key[2] not in (-1, frame):
+                continue
+            local = (world - transform[:3, 3]) @ np.linalg.inv(transform[:3, :3]).T
+            within = (np.abs(local) < 0.5 + 0.05).all(axis=1) & (recorded_cloud["label"] >= Class.CAR)
+            if not within.any():
+                continue
+            instances, hits = np.unique(recorded_cloud["instance"][within], return_counts=True)
+            owner.setdefault(key[:2], int(instances[hits.argmax()]))
+            mine = recorded_cloud["instance"] == owner[key[:2]]
+            inside[key[2] == -1].append((within & mine).sum() / mine.sum())
+    assert len(owner) == len(set(owner.values())) > 10
+    assert min(len(shares) for shares in inside.values()) > 2
+    assert min(inside[True]) == 1
+    assert np.median(inside[False]) > 0.9  # they move within a frame
+
+
+def test_kitti_360_pixels_name_the_boxes_of_their_road_users(dataset, kitti_360):
+    folder, _ = kitti_360
+    labels = folder / "data_2d_semantics" / "train" / SEQUENCE
+    assert {path.name for path in labels.glob("image_*")} == {"image_00"}  # front_right has no such images
+    known = {"car": 26, "person": 24, "rider": 25, "road": 7, "building": 11, "sky": 23}
+    objects = xml_objects(folder)
+    boxed = {(node.find("label").text, int(node.find("instanceId").text)) for node in objects}
+    feature_of = {}
+    for frame in range(5):
+        image = np.asarray(Image.open(labels / "image_00" / "instance" / f"{frame:010d}.png")).astype(int)
+        semantic = np.asarray(Image.open(labels / "image_00" / "semantic" / f"{frame:010d}.png"))
+        assert (image // 1000 == semantic).all()
+        klass = recorded(dataset, "front", "semantic", frame)
+        feature = recorded(dataset, "front", "instance", frame) @ [1, 256, 65536]
+        for name, classes in (("road", [Class.ROAD]), ("building", [Class.BUILDING]), ("sky", [Class.SKY])):
+            assert set(image[np.isin(klass, classes)]) == {known[name] * 1000}
+        users = (klass >= Class.CAR) & (klass <= Class.MOTORCYCLIST)
+        assert (image[users] % 1000 > 0).all()
+        assert (image[~users] % 1000 == 0).all()
+        for value in np.unique(image[users]).tolist():
+            (one,) = np.unique(feature[image == value])
+            assert feature_of.setdefault(value, one) == one
+    assert len(set(feature_of.values())) == len(feature_of) > 5
+    names = {number: name for name, number in known.items()}
+    near = {(names[value // 1000], value % 1000) for value in feature_of if value // 1000 in names}
+    assert len(near & boxed) > 0.9 * len(near)
+    found = json.loads((labels / "instanceDict.json").read_text())
+    assert feature_of.keys() == {int(value) for value in found if int(value) % 1000}
+
+
+def test_kitti_360_cameras_project_with_their_own_intrinsics(dataset, kitti_360):
+    calibration = matrices(kitti_360[0] / "calibration" / "perspective.txt")
+    mounts = matrices(kitti_360[0] / "calibration" / "calib_cam_to_pose.txt")
+    sensors = dataset.sensors()
+    for number, name in enumerate(("front", "front_right")):
+        P = calibration[f"P_rect_{number:02d}"].reshape(3, 4)
+        np.testing.assert_allclose(P[:, :3], sensors[name]["K"])
+        assert calibration[f"S_rect_{number:02d}"].tolist() == [320, 180]
+        assert (calibration[f"R_rect_{number:02d}"].reshape(3, 3) == np.eye(3)).all()
+    baseline = np.linalg.inv(rigid(mounts["image_01"])) @ rigid(mounts["image_00"])
+    np.testing.assert_allclose(baseline[:3, 3], [-0.6, 0, 0], atol=1e-9)
+    P = calibration["P_rect_01"].reshape(3, 4)
+    np.testing.assert_allclose(P[:, 3], P[:, :3] @ baseline[:3, 3], atol=1e-6)
