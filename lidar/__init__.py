@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from lidar.simulation import Simulation as Simulation
     from lidar.simulation import simulate as simulate
     from lidar.traffic.populate import TrafficOptions as TrafficOptions
+    from lidar.training import TrainingData as TrainingData
+    from lidar.training import training_data as training_data
     from lidar.weather.setting import read_weather as read_weather
 
 _HOMES = {
@@ -32,6 +34,7 @@ _HOMES = {
     "MapOptions": "options",
     "Simulation": "simulation",
     "TrafficOptions": "traffic.populate",
+    "TrainingData": "training",
     "aggregate": "maps.aggregate",
     "drive": "pipeline",
     "load_rig": "rig.specs",
@@ -42,6 +45,7 @@ _HOMES = {
     "read_stages": "signal.registry",
     "read_weather": "weather.setting",
     "simulate": "simulation",
+    "training_data": "training",
 }
 __all__ = list(_HOMES)
 
