@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from geoscene.previews import card
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float
@@ -79,6 +80,20 @@ class DriveFrame:
     def images(self) -> dict[str, Image]:
         """The first images of each camera, by name."""
         return {name: one.image for name, one in self.sensors.items() if isinstance(one, MeasuredImages)}
+
+    def _repr_html_(self) -> str:
+        """The first cloud or image with figures of the frame, for notebooks."""
+        rows = [
+            ("time", f"{self.utc:%Y-%m-%d %H:%M:%S.%f} UTC, {self.time_ns / 1e9:g} s after the start"),
+            ("place", "{:.6f}, {:.6f} degrees, {:.2f} m".format(*self.lonlath)),
+            *((name, f"{len(cloud):,} returns") for name, cloud in self.clouds.items()),
+            *((name, "{1} x {0} pixels".format(*image.depth.shape)) for name, image in self.images.items()),
+            *((f"boxes of {name}", len(next(iter(box.values())))) for name, box in self.boxes.items()),
+            *((f"fixes of {name}", len(fixes)) for name, fixes in self.fixes.items()),
+            *((f"samples of {name}", len(samples)) for name, samples in self.samples.items()),
+        ]
+        shown = next((cloud._repr_png_() for cloud in self.clouds.values()), None)
+        return card(f"Frame {self.number}", rows, picture=shown)
 
     @property
     def boxes(self) -> dict[str, Columns]:

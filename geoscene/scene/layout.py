@@ -265,6 +265,18 @@ class Scene:
         for i, j in self.tile_indices:
             yield self.tile(i, j, forests=forests)
 
+    def _repr_png_(self) -> bytes:
+        """A picture from above, for notebooks."""
+        from geoscene.scene.preview import scene_png  # noqa: PLC0415  (Pillow)
+
+        return scene_png(self)
+
+    def _repr_html_(self) -> str:
+        """The picture and a table of figures, for notebooks."""
+        from geoscene.scene.preview import scene_html  # noqa: PLC0415
+
+        return scene_html(self)
+
     def shapes(self) -> dict[str, Mesh]:
         """The meshes that the tiles' instances copy, by name."""
         return read_shapes(self.files.shapes)

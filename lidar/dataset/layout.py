@@ -202,6 +202,18 @@ class Dataset:
                 raise DatasetError(f"{path}: damaged (times do not increase); drive again with `overwrite`")
         return times
 
+    def _repr_png_(self) -> bytes:
+        """A picture from above, for notebooks."""
+        from lidar.dataset.preview import dataset_png  # noqa: PLC0415
+
+        return dataset_png(self)
+
+    def _repr_html_(self) -> str:
+        """The picture and a table of figures, for notebooks."""
+        from lidar.dataset.preview import dataset_html  # noqa: PLC0415
+
+        return dataset_html(self)
+
     def trajectory(self) -> Trajectory:
         """The ego vehicle's poses."""
         return read_trajectory(self.paths.trajectory)

@@ -12,9 +12,10 @@ import numpy as np
 
 from geoscene.classes import class_codes
 from geoscene.files import exclusive
+from geoscene.previews import DARK, Plan, around, card
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
-from lidar.dataset.formats import format_of, map_suffixes
+from lidar.dataset.formats import format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
@@ -27,6 +28,9 @@ from lidar.maps.selection import Selection
 from lidar.maps.source import COLUMNS, Source
 from lidar.maps.voxels import thinned
 from lidar.options import MapOptions
+
+_MOST_DRAWN = 5_000_000
+"""Points of a map up to which notebooks show a picture of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,26 @@ class MapSummary:
     path: Path
     beside: list[Path]
     distances: list[Distances]
+
+    def _repr_png_(self) -> bytes | None:
+        """A picture from above in the map's colours, for notebooks; None for an empty or very large map."""
+        if not 0 < self.points <= _MOST_DRAWN:
+            return None
+        table = read_table(self.path)
+        xyz = np.column_stack([table[axis] for axis in "xyz"])
+        plan = Plan(around(xyz[:, :2]), DARK)
+        plan.points(xyz, np.column_stack([table[name] for name in ("red", "green", "blue")]).astype(np.uint8))
+        return plan.png()
+
+    def _repr_html_(self) -> str:
+        """The picture and a table of figures, for notebooks."""
+        rows = [
+            ("points", f"{self.points:,} of {self.points_in:,}"),
+            ("frames", f"{self.frames:,}"),
+            *((f"without {reason}", f"{count:,}") for reason, count in self.left_out.items()),
+            ("files", ", ".join(path.name for path in (self.path, *self.beside))),
+        ]
+        return card(f"Map {self.path.name}", rows, picture=self._repr_png_())
 
 
 def aggregate(

@@ -45,6 +45,18 @@ class Cloud(Columns):
     echo: NDArray[np.uint8]
     echoes: NDArray[np.uint8]
 
+    def _repr_png_(self) -> bytes:
+        """A picture from above in the sensor frame, x to the right, coloured by class, for notebooks."""
+        from lidar.sensors.preview import cloud_png  # noqa: PLC0415
+
+        return cloud_png(self)
+
+    def _repr_html_(self) -> str:
+        """The picture and the number of returns by class, for notebooks."""
+        from lidar.sensors.preview import cloud_html  # noqa: PLC0415
+
+        return cloud_html(self)
+
     def __post_init__(self) -> None:
         """Check that all columns have the same length."""
         for name, column in self.columns().items():
