@@ -40,6 +40,12 @@ _WIDTH = 872
 _ROWS = 64
 """Rows of a range image of a scanner without rings of constant elevation."""
 
+_LEVEL = 0.05
+"""Largest spread of a ring's elevations for rows that are rings, as a share of the field of view.
+
+Lasers beside each other see elevations that vary with the range, those of an HDL-64E by up to 0.4 degrees.
+"""
+
 _UPRIGHT = 0.7
 """Cosine of the tilt of a scanner up to which its azimuths are about those of the vehicle."""
 
@@ -56,7 +62,8 @@ _RANGES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 def range_image(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:
     """Range, intensity and class of one sweep from the scanner: forward in the middle, left on the left.
 
-    Of the returns in a cell the nearest is shown. Rows are rings if each has one elevation, else elevations.
+    Of the returns in a cell the nearest is shown. Rows are rings if each has about one elevation, else
+    elevations.
 
     Raises DatasetError for a sweep without returns.
     """
@@ -127,7 +134,7 @@ def _image_rows(ring: Ints, elevation: Float) -> tuple[Ints, tuple[float, float]
     returns = np.maximum(np.bincount(ring, minlength=rings), 1)
     mean = np.bincount(ring, elevation, rings) / returns
     spread = np.sqrt(np.maximum(np.bincount(ring, elevation**2, rings) / returns - mean**2, 0))
-    if rings >= 4 and spread.max() < 0.5 * max(mean.max() - mean.min(), 1e-9) / (rings - 1):
+    if rings >= 4 and spread.max() < _LEVEL * np.ptp(elevation):
         return ring, (-0.5, rings - 0.5), "ring"
     low, high = float(elevation.min()), max(float(elevation.max()), float(elevation.min()) + 1e-3)
     row = np.clip(((elevation - low) / (high - low) * _ROWS).astype(np.int64), 0, _ROWS - 1)

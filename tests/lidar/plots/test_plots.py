@@ -16,11 +16,13 @@ from helpers.programs import run_program
 from PIL import Image
 from pyproj import Geod
 
+import lidar
 import lidar.cli
 from geoscene.classes import Class, class_codes
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
+from lidar.options import DriveOptions
 from lidar.plots import FIGURES, plot
 from lidar.plots.drawn import thinned
 
@@ -128,6 +130,18 @@ def test_the_range_image_has_each_return_at_its_azimuth_and_ring(drive, tmp_path
     assert alone.sum() > 100
     shown = by_class[row[alone], column[alone]]
     assert (shown == class_codes().color[table["label"][alone]]).all()
+
+
+def test_the_range_image_of_lasers_beside_each_other_has_no_empty_rows(scene, tmp_path):
+    rig = tmp_path / "rig.toml"
+    rig.write_text(
+        'name = "r"\n[[lidar]]\nname = "top"\npreset = "hdl64e_s3"\ntranslation = [0.0, 0.0, 1.73]\n', "utf-8"
+    )
+    lidar.drive(scene, tmp_path / "drive", options=DriveOptions(rig=str(rig), duration=0.1))
+    svg, told = drawn(tmp_path / "drive", tmp_path, "range-image")
+    assert told["rows"] == 64
+    ranges, *_ = images(svg)
+    assert (ranges != (246, 246, 248)).any(axis=(1, 2)).all()
 
 
 def test_coverage_counts_every_true_return(drive, tmp_path):
