@@ -38,6 +38,7 @@ from lidar.options import (
     DefendOptions,
     DenoiseOptions,
     DriveOptions,
+    FilmOptions,
     MapOptions,
     PlaceOptions,
     PlaybackOptions,
@@ -734,6 +735,52 @@ def plot(
         print_json({"path": str(out), **found.numbers})
     else:
         print(f"{out}: {found.note}")
+    return 0
+
+
+@app.command
+def animate(
+    dataset: Path,
+    /,
+    *,
+    options: FilmOptions = FilmOptions(),
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Make a film of a recorded drive: sweeps, camera images and the growing map, in the drive's own time.
+
+    For example:
+
+    lidar animate drive -o drive.gif --size 640x360 --frames 0:20
+
+    lidar animate drive -o drive.mp4 --show sweep --view top --color intensity
+
+    lidar animate drive -o map.mp4 --show map --speed 4
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset.
+    out
+        MP4 (extra video) or GIF to write.
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.films.film import film  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        made = film(
+            open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
+        print_json({**asdict(made), "path": str(out)})
+        return 0
+    print(
+        f"{out}: {made.images} images of {made.size[0]} x {made.size[1]} pixels, {made.seconds:.2f} s,"
+        f" {', '.join(made.shown)}"
+    )
+    for note in made.notes:
+        print(f"  {with_flags(app, note)}")
     return 0
 
 

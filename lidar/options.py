@@ -51,6 +51,15 @@ RASTERS = ("dsm", "dtm", "density", "intensity")
 ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
 """Origins of returns, `lidar.physics.echoes.Origin` in lower case."""
 
+SHOWN = ("all", "sweep", "cameras", "map")
+"""What a film can show."""
+
+FILM_VIEWS = ("chase", "top")
+"""Where a film looks at sweeps from."""
+
+FILM_COLORS = ("class", "height", "intensity", "time", "origin")
+"""What colours of returns in a film can show."""
+
 ECHOES = ("all", "first", "last", "single")
 """Echoes of a pulse that a map can be made of."""
 
@@ -69,6 +78,13 @@ _LAYOUTS = (
     f"Layout: {'; '.join(f'{row.name} ({row.meaning})' for row in EXPORTERS.values())}."
     f" Or a format of clouds: {', '.join(CONVERTED_FORMATS)}."
 )
+
+
+def _pixels(_: object, tokens: Sequence[Token]) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", tokens[0].value.strip().lower())
+    if not found:
+        raise ValueError(f"{tokens[0].value}: give WIDTHxHEIGHT in pixels, such as 1280x720")
+    return int(found[1]), int(found[2])
 
 
 def _route(_: object, tokens: Sequence[Token]) -> str | Path | list[tuple[float, float]]:
@@ -772,6 +788,58 @@ class PlotOptions:
         _ = self.limits
         if self.resolution is not None and not 0 < self.resolution < math.inf:
             raise InputError(f"`resolution` {self.resolution:g}: give a positive number of metres")
+
+    @property
+    def limits(self) -> tuple[int, float]:
+        """The first frame, and the one after the last; infinity for all further ones."""
+        return frame_limits(self.frames)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class FilmOptions:
+    """Options of a film of a dataset."""
+
+    show: Annotated[str, Parameter(converter=_lower)] = "all"
+    """What the film shows: sweep, cameras, map (which grows), or all of these that the dataset has."""
+
+    view: Annotated[str, Parameter(converter=_lower)] = "chase"
+    """Sweeps from behind the vehicle (chase) or from above (top)."""
+
+    color: Annotated[str, Parameter(converter=_lower)] = "class"
+    """What colours of returns show: class, height, intensity, time (in the sweep) or origin (where stages
+    acted)."""
+
+    sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
+    """Names of scanners and cameras to show; by default the first scanner and all cameras with images."""
+
+    frames: str = ""
+    """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
+    default. They are of the first scanner, or of the first camera in films of cameras only."""
+
+    every: int = 1
+    """Show each n-th of these frames only."""
+
+    speed: float = 1.0
+    """Seconds of the drive per second of the film."""
+
+    size: Annotated[tuple[int, int], Parameter(converter=_pixels, n_tokens=1, metavar="WxH")] = (1280, 720)
+    """Width and height of the film in pixels, both even."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        for name, known in (("show", SHOWN), ("view", FILM_VIEWS), ("color", FILM_COLORS)):
+            if getattr(self, name) not in known:
+                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
+        _ = self.limits
+        if self.every < 1:
+            raise InputError(f"`every` {self.every}: give 1 or more")
+        if not 0 < self.speed < math.inf:
+            raise InputError(f"`speed` {self.speed:g}: give a positive number")
+        if any(side % 2 or not 160 <= side <= 8192 for side in self.size):
+            raise InputError(
+                f"`size` {self.size[0]}x{self.size[1]}: give even numbers of pixels from 160 to 8192"
+            )
 
     @property
     def limits(self) -> tuple[int, float]:

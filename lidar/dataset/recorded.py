@@ -131,6 +131,27 @@ def color_images(dataset: Dataset, name: str) -> Stream | None:
     return _stream(dataset, name, found=found) if found else None
 
 
+@dataclass(frozen=True)
+class Images:
+    """Images of a camera to look at; ``kind`` is ``rgb`` or ``depth``."""
+
+    stream: Stream
+    kind: str
+
+
+def images_of(dataset: Dataset, name: str) -> Images | None:
+    """A camera's colour images, or its depth images if it has none; None without either.
+
+    Raises DatasetError for frames without a time.
+    """
+    for kind in ("rgb", "depth"):
+        first = dataset.frame_file(dataset.paths.image(name, 0, kind=kind))
+        numbers = frame_numbers(first.parent, ".png").tolist()
+        if found := [(frame, dataset.paths.image(name, frame, kind=kind)) for frame in numbers]:
+            return Images(_stream(dataset, name, found=found), kind)
+    return None
+
+
 def labelled_formats() -> list[Format]:
     """Formats that keep points in the sensor frame with times and labels."""
     needed = {"time_ns", "label", "ring"}

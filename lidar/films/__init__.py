@@ -1,0 +1,1 @@
+"""Films of recorded drives: sweeps, cameras and the growing map, in the drive's own time."""
