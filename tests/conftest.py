@@ -34,7 +34,7 @@ SLOW = frozenset(
     (
         "test_actors", "test_benchmarks",
         "test_build", "test_cli", "test_cluster", "test_documented_commands", "test_drive",
-        "test_ego_drive", "test_elevation", "test_fcd", "test_files",
+        "test_ego_drive", "test_elevation", "test_examples", "test_fcd", "test_files",
         "test_flight_planning", "test_footprints", "test_interruptions", "test_network",
         "test_outputs", "test_overture", "test_places", "test_raycast", "test_rays",
         "test_real", "test_render", "test_roofs", "test_ros",
