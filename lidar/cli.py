@@ -456,6 +456,8 @@ def map_(
 
     lidar map drive -o map.laz --raster dsm,dtm --resolution 0.5 --compare scene
 
+    lidar map drive -o map.laz --poses gnss+imu --refine
+
     Parameters
     ----------
     dataset
@@ -463,6 +465,7 @@ def map_(
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.maps.aggregate import aggregate  # noqa: PLC0415
+    from lidar.maps.compare import LIMIT  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -473,6 +476,7 @@ def map_(
         counts: dict[str, Any] = {"points_in": summary.points_in, "points": summary.points}
         counts |= {"left_out": summary.left_out}
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
+        counts |= {"poses": asdict(summary.poses) if summary.poses else None}
         counts |= {"beside": [str(path) for path in summary.beside]}
         counts |= {"distances": [asdict(row) for row in summary.distances]}
         print_json({"path": str(out), **counts})
@@ -482,10 +486,16 @@ def map_(
             f"{out}: {summary.points:,} of {summary.points_in:,} points from {summary.frames} frames"
             + (f"; left out: {', '.join(left)}" if left else "")
         )
+        if summary.poses:
+            print(
+                f"poses: root mean square errors {summary.poses.horizontal_m:.3f} m horizontally,"
+                f" {summary.poses.vertical_m:.3f} m vertically, {summary.poses.yaw_deg:.3f} degrees of yaw"
+            )
         for row in summary.distances:
             print(
                 f"  {row.name:20} {row.points:>12,} points  mean {1000 * row.mean_m:8.1f} mm"
                 f"  median {1000 * row.median_m:8.1f}  95 % {1000 * row.p95_m:8.1f}"
+                + (f"  farther than {LIMIT:g} m: {row.beyond / row.points:.1%}" if row.beyond else "")
             )
         if summary.beside:
             print(f"also written: {', '.join(map(str, summary.beside))}")
@@ -501,6 +511,7 @@ def map_(
 _LEFT_OUT = {
     "noise": "noise (--noise keeps them)",
     "moving": "moving road users (--moving keeps them)",
+    "poses": "times without poses",
     "time": "other times",
     "region": "other places",
     "only": "classes not in --only",

@@ -701,6 +701,13 @@ class MapOptions:
     """Origins of returns to use, separated by commas, by the ground truth of stages: surface, weather,
     interference, injected, replayed, moved, receiver; all by default, but for noise."""
 
+    poses: str = "truth"
+    """Poses that place the points: truth; by the fixes of a GNSS receiver of the dataset, RECEIVER; with the
+    turns of an inertial unit too, RECEIVER+UNIT; or of a trajectory file, FILE.tum."""
+
+    refine: bool = False
+    """Refine measured poses by aligning the sweeps to each other (extra registration)."""
+
     raster: Annotated[tuple[str, ...], WORDS] = ()
     """Rasters to write beside the map as GeoTIFF, separated by commas: dsm (highest return), dtm (mean height
     of the ground's returns), density (returns per square metre), intensity (mean)."""
@@ -726,6 +733,8 @@ class MapOptions:
         for name, words in (("origin", ORIGINS), ("raster", RASTERS)):
             if unknown := [word for word in getattr(self, name) if word not in words]:
                 raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(words)}")
+        if self.refine and self.poses == "truth":
+            raise InputError("`refine` is for measured poses; name a receiver or a file with `poses`")
         if self.time is not None and not self.time[0] < self.time[1]:
             raise InputError(f"`time` {self.time[0]:g},{self.time[1]:g}: ends before it begins")
         if self.bounds_deg is not None:

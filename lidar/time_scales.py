@@ -44,6 +44,11 @@ def drive_ns(start: datetime, gps: Float) -> NDArray[np.int64]:
     return np.rint((gps - base) * 1e9).astype(np.int64)
 
 
+def posix_ns(start: datetime) -> int:
+    """Nanoseconds since 1970 of a UTC time, without leap seconds."""
+    return (start - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+
+
 def check_start(start: datetime, duration_ns: int) -> None:
     """Raise InputError for a drive without a time zone, outside GPS time or across a leap second.
 

@@ -23,6 +23,7 @@ from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.maps.colors import distinct, ramp
 from lidar.maps.compare import Comparison, Distances
+from lidar.maps.poses import PoseErrors, measured_trajectory, pose_errors, write_poses
 from lidar.maps.rasters import Rasters
 from lidar.maps.selection import Selection
 from lidar.maps.source import COLUMNS, Source
@@ -45,6 +46,7 @@ class MapSummary:
     path      : the file
     beside    : further files: rasters, and those of comparisons
     distances : to the surfaces of the scene that the map was compared with
+    poses     : errors of measured poses; None for true ones
     """
 
     points_in: int
@@ -55,6 +57,7 @@ class MapSummary:
     path: Path
     beside: list[Path]
     distances: list[Distances]
+    poses: PoseErrors | None
 
     def _repr_png_(self) -> bytes | None:
         """A picture from above in the map's colours, for notebooks; None for an empty or very large map."""
@@ -105,8 +108,10 @@ def aggregate(
     format_of(out).require()
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
-    selection = Selection(dataset, options)
-    source = Source(dataset, _scanners(dataset, options), selection=selection)
+    names = _scanners(dataset, options)
+    trajectory = measured_trajectory(dataset, options.poses, refine=options.refine, progress=progress)
+    selection = Selection(dataset, options, trajectory=trajectory)
+    source = Source(dataset, names, selection=selection, trajectory=trajectory)
     read = _Read()
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
@@ -125,7 +130,12 @@ def aggregate(
             append(_colored(table, options.color, limits=limits))
             written += rows(table)
         write_map_provenance(dataset, out)
-        beside = rasters.write(out, crs=dataset.crs) + (comparison.write(out) if comparison else [])
+        beside = rasters.write(out, crs=dataset.crs)
+        if comparison:
+            beside += comparison.write(out)
+        if trajectory is not None:
+            beside.append(out.with_suffix(".tum"))
+            write_poses(beside[-1], trajectory, dataset=dataset)
     return MapSummary(
         read.points,
         written,
@@ -135,6 +145,7 @@ def aggregate(
         out,
         beside=beside,
         distances=comparison.rows() if comparison else [],
+        poses=pose_errors(trajectory, dataset.trajectory()) if trajectory is not None else None,
     )
 
 

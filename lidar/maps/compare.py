@@ -25,7 +25,7 @@ from lidar.maps.colors import ramp
 from lidar.maps.picture import cloud_picture, with_key
 from lidar.maps.surfaces import TrueSurfaces
 
-LIMIT = 10.0
+LIMIT = 5.0
 """Metres: distances beyond it count as it."""
 
 _STEP = 1e-4  # metres: width of the bins from which median and percentile are taken

@@ -16,18 +16,26 @@ from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset, read_rows, reading_file
 from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
+from lidar.geometry.poses import Trajectory
 from lidar.options import MapOptions, classes_of
 from lidar.physics.echoes import Origin
 from lidar.time_scales import gps_seconds
 
 _STEP_DEG = 1e-3
 """Degrees between points of a region's edges, about 100 m: edges are straight in longitude and latitude."""
+_ROUNDING = 1e-6
+"""Seconds, of GPS times as floating-point numbers."""
 
 
 class Selection:
-    """The returns of a dataset that options ask for."""
+    """The returns of a dataset that options ask for.
 
-    def __init__(self, dataset: Dataset, options: MapOptions) -> None:
+    trajectory : that places the returns; those of times outside it have no place
+    """
+
+    def __init__(
+        self, dataset: Dataset, options: MapOptions, *, trajectory: Trajectory | None = None
+    ) -> None:
         self._dataset = dataset
         self._options = options
         self._without = classes_of(options.without)
@@ -35,6 +43,7 @@ class Selection:
         self._region = _region(dataset, options)
         self._origins = [int(Origin[name.upper()]) for name in options.origin]
         self._begin = float(gps_seconds(dataset.start, np.zeros(1, np.int64))[0])
+        self._placed = None if trajectory is None else trajectory.time_ns[[0, -1]] * 1e-9
 
     def may_hold(self, start_ns: int, period_ns: int) -> bool:
         """Whether a frame that lasts from ``start_ns`` can have returns of the time asked for."""
@@ -52,6 +61,9 @@ class Selection:
         row         : of the cloud with which the table begins
         """
         options, label = self._options, table["label"]
+        if self._placed is not None:
+            seconds, (first, last) = table["gps_time"] - self._begin, self._placed
+            yield "poses", ~((seconds >= first - _ROUNDING) & (seconds <= last + _ROUNDING))
         if options.time is not None:
             seconds = table["gps_time"] - self._begin
             yield "time", ~((seconds >= options.time[0]) & (seconds < options.time[1]))

@@ -12,7 +12,6 @@ import logging
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.rig.specs import Rig, rig_of
+from lidar.time_scales import posix_ns
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class RosDrive:
     @functools.cached_property
     def base_ns(self) -> int:
         """The drive's start, nanoseconds since 1970."""
-        return (self.dataset.start - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
+        return posix_ns(self.dataset.start)
 
     @functools.cached_property
     def trajectory(self) -> Trajectory:
