@@ -95,6 +95,7 @@ def drive(
     place: PlaceOptions = PlaceOptions(),
     wanted: AccuracyOptions = AccuracyOptions(),
     out: Out,
+    live: Annotated[tuple[str, ...] | None, SEVERAL, Parameter(group=OUTPUT, metavar="[FILE.rrd]")] = None,
     report: Reporting = Report(),
 ) -> int:
     """Drive a route through a scene or a map and record what the rig senses.
@@ -128,15 +129,20 @@ def drive(
         .osm.gz, .osm.bz2, .osm.pbf or Overpass JSON.
     out
         Directory or URL to write the dataset to.
+    live
+        Show clouds, images, boxes and the path in a viewer of Rerun while frames are recorded (extra live),
+        or write them to FILE.rrd for it.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
     from geoscene.storage import published, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
+    from lidar.view.live import live_target, opened_live  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
+    target = live_target(live, overwrite=report.overwrite)
     if not url_of(out):
         note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
@@ -153,7 +159,7 @@ def drive(
             pick = picked(opened, options, wanted=wanted, out=begun, progress=progress)
         if pick and not report.json:
             print(pick.to_text(options.workers), flush=True)
-        with bar() as progress:
+        with bar() as progress, opened_live(target) as shown_live:
             done = driven(
                 opened,
                 folder,
@@ -162,6 +168,7 @@ def drive(
                 pick=pick,
                 overwrite=report.overwrite,
                 progress=progress,
+                live=shown_live,
             )
         limits = open_dataset(folder).manifest["limits"]
     summary = done.summary

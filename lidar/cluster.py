@@ -127,7 +127,7 @@ def _recorded(task: _Task) -> _Done:
     frames = []
     for row, frame in task.frames:
         sensor = _station.sensors[row]
-        points = record_frame(recording, sensor, frame=frame, worlds=worlds)
+        points = record_frame(recording, sensor, frame=frame, worlds=worlds).points
         with recording.watch.stage("digest"):
             frames.append((sensor.name, frame, points, recording.digests(sensor, frame)))
     return _Done(tuple(frames), dict(recording.watch.seconds), dict(recording.effects.counts))

@@ -26,10 +26,11 @@ from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
+from lidar.dataset.measured import MeasuredCloud, MeasuredImages
 from lidar.dataset.metadata import write_metadata
 from lidar.dataset.record import record_frame
 from lidar.dataset.recording import Recording
-from lidar.errors import LidarError
+from lidar.errors import InputError, LidarError
 from lidar.frame_loop import check_attackers, recording_chunks, run_jobs
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
@@ -37,6 +38,12 @@ from lidar.plan import DrivePlan, Job, Jobs, plan_drive
 from lidar.rig.devices import Scanner
 from lidar.signal.effects import Counts
 from lidar.world.thread_worlds import Worlds
+
+Show = Callable[[MeasuredCloud | MeasuredImages], None]
+"""Shows a frame that is recorded."""
+
+Live = Callable[[DrivePlan], Show]
+"""Begins to show a drive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,15 +88,20 @@ def drive(
     notes: Mapping[str, Any] | None = None,
     check: Callable[[DrivePlan], Mapping[str, Any]] | None = None,
     plan: DrivePlan | None = None,
+    live: Live | None = None,
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
 
     notes : further entries of ``dataset.json``
     check : called when all frames are recorded; returns entries that replace or join the notes
     plan  : of the same scene and options; made here by default
+    live  : called with the plan before the first frame; returns a function that is called with each frame
+            once it is recorded, in any order
 
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
+    if live is not None and options.scheduler:
+        raise InputError("`live` shows frames that this machine records; leave out `scheduler`")
     began = time.perf_counter()
     with (
         install_listener("numba:compile", _CompilationProgress(progress)),
@@ -105,6 +117,7 @@ def drive(
             notes=notes or {},
             check=check,
             plan=plan,
+            live=live,
             began=began,
         )
 
@@ -135,6 +148,7 @@ def _driven(
     notes: Mapping[str, Any],
     check: Callable[[DrivePlan], Mapping[str, Any]] | None,
     plan: DrivePlan | None,
+    live: Live | None,
     began: float,
 ) -> DriveSummary:
     """Plan and record; ``began`` is the time of the start, seconds."""
@@ -153,7 +167,13 @@ def _driven(
         recording_from = time.perf_counter()
         if cluster is None:
             record_all(
-                recording, pending, scene=scene, journal=journal, workers=options.workers, progress=progress
+                recording,
+                pending,
+                scene=scene,
+                journal=journal,
+                workers=options.workers,
+                progress=progress,
+                shown=None if live is None else live(plan),
             )
         else:
             record_on_cluster(
@@ -293,18 +313,24 @@ def record_all(
     journal: Journal,
     workers: int = 1,
     progress: Progress = silent,
+    shown: Show | None = None,
 ) -> None:
-    """Record frames and add them to the journal."""
+    """Record frames and add them to the journal; ``shown`` is called with each of them."""
     progress("driving", 0, total=len(jobs))
-    task = partial(_record, recording=recording, journal=journal)
+    task = partial(_record, recording=recording, journal=journal, keep=shown is not None)
     recorded = run_jobs(task, jobs, recording=recording, scene=scene, workers=workers)
-    for done, _ in enumerate(recorded, 1):
+    for done, measured in enumerate(recorded, 1):
+        if shown is not None and measured is not None:
+            shown(measured)
         progress("driving", done, total=len(jobs))
 
 
-def _record(job: Job, worlds: Worlds, *, recording: Recording, journal: Journal) -> None:
-    """Record one frame and add it to the journal."""
-    points = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
+def _record(
+    job: Job, worlds: Worlds, *, recording: Recording, journal: Journal, keep: bool
+) -> MeasuredCloud | MeasuredImages | None:
+    """Record one frame and add it to the journal; return it if it is to be kept."""
+    measured = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
     with recording.watch.stage("digest"):
         digests = recording.digests(job.sensor, job.frame)
-    journal.add(job.sensor.name, job.frame, points=points, digests=digests)
+    journal.add(job.sensor.name, job.frame, points=measured.points, digests=digests)
+    return measured if keep else None

@@ -48,6 +48,11 @@ class Measured:
         """The one pose of the sensor in the scene at the frame's start."""
         return self.trajectory.at([self.time_ns]).mounted(self.mount.translation, self.mount.rotation)
 
+    @property
+    def points(self) -> int:
+        """Number of returns; 0 for images."""
+        return 0
+
 
 @dataclass(frozen=True)
 class MeasuredCloud(Measured):
@@ -61,6 +66,11 @@ class MeasuredCloud(Measured):
     cloud: Cloud
     period_ns: int
     velocity: NDArray[np.float32] | None = None
+
+    @property
+    def points(self) -> int:
+        """Number of returns."""
+        return len(self.cloud)
 
     @functools.cached_property
     def placed(self) -> Float:

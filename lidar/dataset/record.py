@@ -10,14 +10,12 @@ from lidar.rig.devices import Camera, Scanner
 from lidar.world.thread_worlds import Worlds
 
 
-def record_frame(recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds) -> int:
-    """Simulate one frame and write its files; return the number of points, 0 for images.
-
-    Several threads may do so at once.
-    """
+def record_frame(
+    recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds
+) -> MeasuredCloud | MeasuredImages:
+    """Simulate one frame and write its files. Several threads may do so at once."""
     if isinstance(sensor, Camera):
-        record_images(recording, sensor, frame=frame, worlds=worlds)
-        return 0
+        return record_images(recording, sensor, frame=frame, worlds=worlds)
     return record_cloud(recording, sensor, frame=frame, worlds=worlds)
 
 

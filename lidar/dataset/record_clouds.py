@@ -29,8 +29,8 @@ from lidar.world.thread_worlds import Worlds
 from lidar.world.world import World
 
 
-def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> int:
-    """Scan one frame and write its clouds, labels and boxes; return the number of points."""
+def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:
+    """Scan one frame and write its clouds, labels and boxes."""
     paths = recording.paths(scanner, frame)
     measured = measure_cloud(recording, scanner, frame=frame, worlds=worlds)
     cloud = measured.cloud
@@ -42,7 +42,7 @@ def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: 
     if "boxes" in paths:
         with recording.watch.stage("boxes"):
             write_columns(paths["boxes"], measured.boxes)
-    return len(cloud)
+    return measured
 
 
 def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:

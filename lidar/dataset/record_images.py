@@ -26,7 +26,7 @@ from lidar.world.thread_worlds import Worlds
 from lidar.world.world import World
 
 
-def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> None:
+def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
     """Render one frame and write its images and boxes."""
     paths, watch = recording.paths(camera, frame), recording.watch
     measured = measure_images(recording, camera, frame=frame, worlds=worlds)
@@ -38,6 +38,7 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
     for kind in camera.spec.images:
         with watch.stage(f"write {kind}"):
             _write_image(paths[kind], measured, kind=kind)
+    return measured
 
 
 def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:

@@ -283,6 +283,7 @@ def driven(
     pick: Pick | None,
     overwrite: bool = False,
     progress: Progress = silent,
+    live: pipeline.Live | None = None,
 ) -> CheckedDrive:
     """Drive as `lidar.pipeline.drive` does, with what was picked, and check a sample of the frames.
 
@@ -313,6 +314,7 @@ def driven(
         notes={"accuracy": notes} if notes else {},
         check=check if wanted.checks else None,
         plan=plan,
+        live=live,
     )
     return CheckedDrive(summary, wanted, pick, found[0] if found else None)
 
