@@ -159,6 +159,14 @@ EXPORTERS = {
             names=r"(vehicle|sensors/[^/]+)\.(tum|kitti)",
             hint="compare with evo_ape tum {path}/vehicle.tum ESTIMATE",
         ),
+        Exporter(
+            "waymo",
+            "waymo",
+            "Parquet files of the Waymo Open Dataset 2, a component each",
+            mark="segments.txt",
+            names=r"segments\.txt|(vehicle_pose|lidar(_\w+)?|camera(_\w+)?)/[^/]+\.parquet",
+            hint="open it with pyarrow, pandas or dask, or with waymo_open_dataset.v2",
+        ),
     )
 }
 """Exporters by name."""

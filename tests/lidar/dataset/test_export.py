@@ -173,7 +173,7 @@ def _write_cloud(dataset, frame, **columns):
     FORMATS["pcd"].write(path, table | {name: np.array(v, table[name].dtype) for name, v in columns.items()})
 
 
-@pytest.mark.parametrize("name", ["kitti", "nuscenes"])
+@pytest.mark.parametrize("name", ["kitti", "kitti-360", "nuscenes"])
 def test_damaged_clouds_and_boxes_are_refused_by_name(dataset, tmp_path, name):
     row, out, boxes = EXPORTERS[name], tmp_path / "out", dataset.paths.sensor_boxes("top")
     for columns in (
@@ -217,7 +217,7 @@ def test_a_camera_without_intrinsics_is_refused(dataset, tmp_path):
     document = json.loads(dataset.paths.calibration.read_text())
     document["sensors"]["front"]["K"] = [[1, 2]]
     write_json(dataset.paths.calibration, document)
-    for name in ("kitti", "kitti-raw", "nuscenes"):
+    for name in ("coco", "kitti", "kitti-360", "kitti-raw", "nuscenes"):
         with pytest.raises(DatasetError, match=r"calibration\.json: damaged"):
             EXPORTERS[name].export(dataset, tmp_path / name)
 

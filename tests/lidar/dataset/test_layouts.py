@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pycocotools.mask as rle
 import pytest
 from hypothesis import given
@@ -12,6 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 from pycocotools.coco import COCO
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
 from lidar.dataset.boxes import read_boxes
@@ -20,6 +23,7 @@ from lidar.dataset.export.coco import THINGS, encoded_mask
 from lidar.dataset.export.kitti_360 import SEQUENCE
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.recorded import labelled_clouds, still_points
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
@@ -300,3 +304,199 @@ def test_kitti_360_cameras_project_with_their_own_intrinsics(dataset, kitti_360)
     np.testing.assert_allclose(baseline[:3, 3], [-0.6, 0, 0], atol=1e-9)
     P = calibration["P_rect_01"].reshape(3, 4)
     np.testing.assert_allclose(P[:, 3], P[:, :3] @ baseline[:3, 3], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def waymo(dataset, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("waymo") / "out"
+    return folder, EXPORTERS["waymo"].export(dataset, folder).counts
+
+
+def rows_of(folder, tag):
+    """Rows of a component, by the names of its columns without the component's."""
+    table = pq.read_table(folder / tag / "drive.parquet")
+    names = [name.removeprefix("key.").split("].")[-1] for name in table.column_names]
+    return table.rename_columns(names).to_pylist()
+
+
+def range_image(row, number=1):
+    shape = row[f"range_image_return{number}.shape"]
+    return np.reshape(row[f"range_image_return{number}.values"], shape)
+
+
+def waymo_points(lidar, pose, calibration, vehicle):
+    """Points in the vehicle's frame as Waymo's range_image_utils computes them, and their pixels' values."""
+    image, turned = range_image(lidar), range_image(pose)
+    mount = np.reshape(calibration["extrinsic.transform"], (4, 4))
+    width = image.shape[1]
+    inclination = np.array(calibration["beam_inclination.values"])[::-1]
+    correction = np.arctan2(mount[1, 0], mount[0, 0])
+    azimuth = ((width - np.arange(width) - 0.5) / width * 2 - 1) * np.pi - correction
+    hit = image[..., 0] > 0
+    row, column = np.nonzero(hit)
+    level, distance = np.cos(inclination[row]), image[hit][:, 0]
+    ray = [level * np.cos(azimuth[column]), level * np.sin(azimuth[column]), np.sin(inclination[row])]
+    local = np.column_stack(ray) * distance[:, None] @ mount[:3, :3].T + mount[:3, 3]
+    roll, pitch, yaw, *place = turned[hit].T
+    turn = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+    world_from_vehicle = np.reshape(vehicle["world_from_vehicle.transform"], (4, 4))
+    world = turn.apply(local) + np.column_stack(place)
+    return (world - world_from_vehicle[:3, 3]) @ world_from_vehicle[:3, :3], image[hit]
+
+
+def test_waymo_range_images_hold_the_recorded_points(dataset, waymo):
+    folder, counts = waymo
+    lidar, poses = rows_of(folder, "lidar"), rows_of(folder, "lidar_pose")
+    calibrations = {row["laser_name"]: row for row in rows_of(folder, "lidar_calibration")}
+    vehicles = rows_of(folder, "vehicle_pose")
+    segments = rows_of(folder, "lidar_segmentation")
+    assert counts["frames"] == len(vehicles) == len(segments) == 5
+    assert [row["laser_name"] for row in lidar] == [1, 2] * 5
+    assert range_image(lidar[0]).shape[0] == 16
+    assert range_image(lidar[1]).shape[0] == 1  # the second scanner is a plane
+    trajectory, start = dataset.trajectory(), round(dataset.start.timestamp() * 1e6)
+    clouds = labelled_clouds(dataset, "top")
+    total = kept = 0
+    for frame, vehicle in enumerate(vehicles):
+        time_ns = (vehicle["frame_timestamp_micros"] - start) * 1000
+        assert time_ns == clouds.time_ns[frame]
+        truth = trajectory.at([time_ns])
+        found = np.reshape(vehicle["world_from_vehicle.transform"], (4, 4))
+        np.testing.assert_allclose(found[:3, :3], truth.rotation[0], atol=1e-12)
+        np.testing.assert_allclose(found[:3, 3], truth.position[0] / truth.scale[0], atol=1e-9)
+        points, values = waymo_points(lidar[2 * frame], poses[2 * frame], calibrations[1], vehicle)
+        table = still_points(clouds, trajectory, row=frame)
+        local = np.column_stack([table[axis] for axis in "xyz"]).astype(float)
+        local = local @ clouds.mount.rotation.T + clouds.mount.translation
+        away, nearest = cKDTree(local).query(points)
+        assert away.max() < 3e-4  # float32 at 100 m and in the pose
+        assert len(np.unique(nearest)) == len(points)
+        np.testing.assert_allclose(values[:, 1], table["intensity"][nearest] / 255, atol=1e-6)
+        pixels = range_image(segments[frame])[range_image(lidar[2 * frame])[..., 0] > 0]
+        vehicles_hit = np.isin(table["label"][nearest], [Class.CAR, Class.VAN])
+        assert ((pixels[:, 1] == 1) == vehicles_hit).all()
+        assert (pixels[vehicles_hit, 0] > 0).all()
+        total, kept = total + len(local), kept + len(points)
+    assert kept > 0.999 * total
+    flat = sum(np.count_nonzero(range_image(row)[..., 0] > 0) for row in lidar[1::2])
+    assert (
+        counts["points without pixel"]
+        == total - kept + sum(len(labelled_points) for labelled_points in flat_points(dataset)) - flat
+    )
+
+
+def flat_points(dataset):
+    """Points of the second scanner nearest to each frame of the first."""
+    top, flat = (labelled_clouds(dataset, name) for name in ("top", "flat"))
+    for time_ns in top.time_ns:
+        yield read_table(flat.files[int(np.abs(flat.time_ns - time_ns).argmin())])["x"]
+
+
+def test_waymo_boxes_are_the_recorded_ones_and_hold_their_points(dataset, waymo):
+    folder, counts = waymo
+    boxes = rows_of(folder, "lidar_box")
+    assert counts["3D boxes"] == len(boxes) > 50
+    recorded_boxes = read_boxes(dataset.paths.sensor_boxes("top"), ("points", "visibility"))
+    start = round(dataset.start.timestamp() * 1e6)
+    known = {(start + box["time_ns"] // 1000, str(box["id"])): box for box in recorded_boxes}
+    kinds = {"car": 1, "van": 1, "truck": 1, "bus": 1, "pedestrian": 2, "cyclist": 4}
+    lidar = [row for row in rows_of(folder, "lidar") if row["laser_name"] == 1]
+    poses = [row for row in rows_of(folder, "lidar_pose") if row["laser_name"] == 1]
+    calibration, vehicles = rows_of(folder, "lidar_calibration")[0], rows_of(folder, "vehicle_pose")
+    parts = zip(lidar, poses, vehicles, strict=True)
+    clouds = {v["frame_timestamp_micros"]: waymo_points(i, p, calibration, v)[0] for i, p, v in parts}
+    parked = 0
+    for box in boxes:
+        source = known[box["frame_timestamp_micros"], box["laser_object_id"]]
+        assert kinds.get(source["class"], box["type"]) == box["type"]
+        assert [box[f"speed.{axis}"] for axis in "xyz"] == [source[f"ego_v{axis}"] for axis in "xyz"]
+        assert box["num_top_lidar_points_in_box"] == source["points"] <= box["num_lidar_points_in_box"]
+        centre = np.array([box[f"box.center.{axis}"] for axis in "xyz"])
+        size = np.array([box[f"box.size.{axis}"] for axis in "xyz"])
+        local = (clouds[box["frame_timestamp_micros"]] - centre) @ Rotation.from_euler(
+            "z", box["box.heading"]
+        ).as_matrix()
+        inside = (np.abs(local) < size / 2 + 0.05).all(axis=1).sum()
+        if not source["moving"] and source["points"]:
+            parked += 1
+            assert inside >= source["points"]
+    assert parked > 2
+    assert {box["type"] for box in boxes} >= {1, 2}
+
+
+def test_waymo_cameras_have_their_images_axes_and_boxes(dataset, waymo):
+    folder, counts = waymo
+    images = rows_of(folder, "camera_image")
+    calibrations = {row["camera_name"]: row for row in rows_of(folder, "camera_calibration")}
+    assert counts["images"] == len(images) == 10
+    names = dict(zip(calibrations, ("front", "front_right"), strict=True))
+    trajectory = dataset.trajectory()
+    for number, calibration in calibrations.items():
+        mount = np.reshape(calibration["extrinsic.transform"], (4, 4))
+        np.testing.assert_allclose(mount[:3, :3], np.eye(3), atol=1e-9)  # they look ahead: x forward, z up
+        K = np.array(dataset.sensors()[names[number]]["K"])
+        found = [calibration[f"intrinsic.{name}"] for name in ("f_u", "f_v", "c_u", "c_v")]
+        np.testing.assert_allclose(found, [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5])
+    start = dataset.start.timestamp()
+    for k, row in enumerate(images):
+        path = dataset.paths.image(names[row["camera_name"]], k // 2, kind="rgb")
+        assert row["image"] == path.read_bytes()
+        at = np.round((row["pose_timestamp"] - start) * 1e9)
+        ends = trajectory.at([at - 5_000_000, at + 5_000_000])
+        truth = np.diff(ends.position / ends.scale, axis=0)[0] / 0.01
+        velocity = [row[f"velocity.linear_velocity.{axis}"] for axis in "xyz"]
+        if k > 1:  # a drive begins at its first pose
+            np.testing.assert_allclose(velocity, truth, atol=0.05)
+    flat = [row for row in rows_of(folder, "camera_box") if names[row["camera_name"]] == "front"]
+    seen = [b for b in read_boxes(dataset.paths.sensor_boxes("front"), ("pixels",)) if b["pixels"]]
+    assert len(flat) == len(seen) > 10
+    for row, box in zip(flat, seen, strict=True):
+        sides = [row["box.center.x"] - row["box.size.x"] / 2, row["box.center.y"] + row["box.size.y"] / 2]
+        assert sides == pytest.approx([box["seen_left"] + 0.5, box["seen_bottom"] + 0.5])
+        assert row["camera_object_id"] == str(box["id"])
+
+
+def test_waymo_columns_have_the_names_and_types_of_the_second_version(waymo):
+    """As `Component.schema` of waymo_open_dataset.v2 gives them."""
+    schemas = {path.parent.name: pq.read_schema(path) for path in waymo[0].glob("*/drive.parquet")}
+    wanted = {
+        "lidar": {
+            "key.segment_context_name": "string",
+            "key.frame_timestamp_micros": "int64",
+            "key.laser_name": "int8",
+            "[LiDARComponent].range_image_return1.values": "list<float>",
+            "[LiDARComponent].range_image_return1.shape": "fixed_size_list<int32>[3]",
+            "[LiDARComponent].range_image_return2.values": "list<float>",
+            "[LiDARComponent].range_image_return2.shape": "fixed_size_list<int32>[3]",
+        },
+        "vehicle_pose": {
+            "key.segment_context_name": "string",
+            "key.frame_timestamp_micros": "int64",
+            "[VehiclePoseComponent].world_from_vehicle.transform": "fixed_size_list<double>[16]",
+        },
+        "camera_box": {
+            "key.segment_context_name": "string",
+            "key.frame_timestamp_micros": "int64",
+            "key.camera_name": "int8",
+            "key.camera_object_id": "string",
+            "[CameraBoxComponent].box.center.x": "double",
+            "[CameraBoxComponent].box.center.y": "double",
+            "[CameraBoxComponent].box.size.x": "double",
+            "[CameraBoxComponent].box.size.y": "double",
+            "[CameraBoxComponent].type": "int8",
+            "[CameraBoxComponent].difficulty_level.detection": "int8",
+            "[CameraBoxComponent].difficulty_level.tracking": "int8",
+        },
+    }
+    assert len(schemas) == 10
+    for tag, columns in wanted.items():
+        kinds = {field.name: str(field.type).replace("element: ", "") for field in schemas[tag]}
+        assert kinds == columns
+
+
+def test_layouts_have_the_same_bytes_each_time(dataset, coco, kitti_360, waymo, tmp_path):
+    for name, (folder, _) in (("coco", coco), ("kitti-360", kitti_360), ("waymo", waymo)):
+        EXPORTERS[name].export(dataset, tmp_path / name)
+        assert (tmp_path / name / "checksums.sha256").read_bytes() == (
+            folder / "checksums.sha256"
+        ).read_bytes()
