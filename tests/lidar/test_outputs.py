@@ -578,7 +578,7 @@ def test_nuscenes_tables_link_samples_to_points_boxes_and_pixels(dataset, tmp_pa
     samples = sorted(tables["sample"].values(), key=lambda s: s["timestamp"])
     assert len(samples) == counts["samples"] == 8  # two a second for four seconds
     assert np.diff([s["timestamp"] for s in samples]).tolist() == [500_000] * 7
-    assert {_resolve(tables, s, "scene_token")["name"] for s in samples} == {"scene-0001"}
+    assert {_resolve(tables, s, "scene_token")["name"] for s in samples} == {"scene-0103"}  # of mini_val
     (drawn,) = tables["map"].values()
     with Image.open(root / drawn["filename"]) as image:
         mask = np.asarray(image)

@@ -137,6 +137,9 @@ def test_commands_fetch_the_frames_that_they_read(stored, tmp_path):
     same_files(tmp_path / "stored", tmp_path / "local")
     new = {"top/velodyne", "top/labels", "front/rgb"}
     assert set(fetched_folders()) == {"rear/laz", "rear/boxes"} | new
+    lidar("convert", url, "--to", "las", "-o", tmp_path / "stored_las")
+    lidar("convert", local, "--to", "las", "-o", tmp_path / "local_las")
+    same_files(tmp_path / "stored_las", tmp_path / "local_las")
 
 
 def test_frames_that_changed_in_storage_are_fetched_again(s3, stored, tmp_path):
