@@ -749,8 +749,8 @@ class PlaybackOptions:
     """Options of the page that plays a drive."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
-    """Names of a scanner and of cameras to show; by default the first scanner and the first camera with
-    images."""
+    """Names of scanners and of cameras to show; by default the first scanner and the first camera with
+    images. Frames are those of the first scanner named."""
 
     frames: str = ""
     """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by

@@ -69,6 +69,21 @@ _BOX = (
 
 
 @dataclass(frozen=True)
+class ScannerSweeps:
+    """Sweeps of a scanner, one row for each that is shown.
+
+    clouds : of the scanner
+    rows   : (m,) of ``clouds``
+    index  : (n,) row of ``rows`` in each frame of the page: its own sweep of the first scanner, of others the
+             one that starts nearest in time
+    """
+
+    clouds: Stream
+    rows: Ints
+    index: Ints
+
+
+@dataclass(frozen=True)
 class CameraImages:
     """Images of a camera, one row for each that is shown.
 
@@ -85,7 +100,7 @@ class CameraImages:
 
 
 class Drive:
-    """The part of a dataset that a page shows.
+    """The part of a dataset that a page shows; its frames are the sweeps of the first scanner.
 
     Raises InputError for a sensor that is not in the dataset and frames that it does not have, and
     DatasetError for a dataset without clouds in the sensor frame.
@@ -93,9 +108,14 @@ class Drive:
 
     def __init__(self, dataset: Dataset, options: PlaybackOptions) -> None:
         self.dataset = dataset
-        self.clouds, cameras = _chosen(dataset, options.sensors)
+        scanners, cameras = _chosen(dataset, options.sensors)
+        self.clouds, *others = scanners
         shown = frames_within(self.clouds, options.limits, every=options.every)
         self.rows: Ints = np.searchsorted(self.clouds.frames, shown.frames)
+        self.scanners = [ScannerSweeps(self.clouds, self.rows, np.arange(len(self.rows)))]
+        for clouds in others:
+            rows, index = np.unique(nearest(clouds.time_ns, shown.time_ns), return_inverse=True)
+            self.scanners.append(ScannerSweeps(clouds, rows, index.ravel()))
         self.cameras = [found for name in cameras if (found := self._images(name)) is not None]
         self.notes: list[str] = []
 
@@ -108,20 +128,28 @@ class Drive:
         return self.dataset.trajectory()
 
     @cached_property
-    def slots(self) -> Slots:
-        """Directions of the scanner's pulses, from some sweeps over the drive."""
-        step = max(1, len(self) // _SAMPLE)
-        return slots_of([cloud_points(self._file(row)) for row in self.rows[::step].tolist()])
+    def slots(self) -> list[Slots]:
+        """Directions of each scanner's pulses, from some sweeps over the drive."""
+        return [
+            slots_of(
+                [
+                    cloud_points(self._file(shown.clouds, row))
+                    for row in shown.rows[:: max(1, len(shown.rows) // _SAMPLE)].tolist()
+                ]
+            )
+            for shown in self.scanners
+        ]
 
-    def sweep(self, k: int) -> tuple[int, bytes]:
-        """Number of returns of the k-th sweep that is shown, and its bytes with poses and boxes.
+    def sweep(self, k: int, *, scanner: int = 0) -> tuple[int, bytes]:
+        """Number of returns of the k-th sweep of a scanner that is shown, and its bytes with poses and boxes.
 
         Raises DatasetError for a damaged file.
         """
-        row = int(self.rows[k])
-        table = cloud_points(self._file(row))
-        head = {"poses": self._poses(row, table), "boxes": self._boxes(row)}
-        return len(table["x"]), pack_sweep(table, self.slots, origin=self._origin(row, table), head=head)
+        clouds, row = self.scanners[scanner].clouds, int(self.scanners[scanner].rows[k])
+        table = cloud_points(self._file(clouds, row))
+        head = {"poses": self._poses(clouds, row, table=table), "boxes": self._boxes(clouds, row)}
+        origin = self._origin(clouds, row, count=len(table["x"]))
+        return len(table["x"]), pack_sweep(table, self.slots[scanner], origin=origin, head=head)
 
     def image(self, camera: int, k: int, *, kind: str) -> bytes:
         """The k-th image of a camera that is shown, as JPEG; depth in colours.
@@ -149,12 +177,17 @@ class Drive:
         forward = at.rotation[:, :, 0]
         classes = class_codes().color.tolist()
         path, roads = self._path(), self._roads()
-        sensor = self.clouds.sensor
         return {
             "name": self.dataset.path.resolve().name,
-            "scanner": self.clouds.name,
-            "model": sensor.get("model", ""),
-            "far": float(sensor.get("max_range", 100.0)),
+            "scanners": [
+                {
+                    "name": shown.clouds.name,
+                    "model": shown.clouds.sensor.get("model", ""),
+                    "far": float(shown.clouds.sensor.get("max_range", 100.0)),
+                    "index": shown.index.tolist(),
+                }
+                for shown in self.scanners
+            ],
             "start": self.dataset.start.isoformat(),
             "frame": self.dataset.frame.name,
             "numbers": self.clouds.frames[self.rows].tolist(),
@@ -165,7 +198,7 @@ class Drive:
             "path": path.round(2).tolist(),
             "roads": roads,
             "cameras": [{"name": c.name, "kinds": c.kinds, "index": c.index.tolist()} for c in self.cameras],
-            "truth": bool(self._truth_path(int(self.rows[0])).exists()),
+            "truth": bool(self._truth_path(self.clouds, int(self.rows[0])).exists()),
             "classes": {int(code): [code.name.lower(), classes[code]] for code in Class},
             "origins": [origin.name.lower() for origin in Origin],
             "ramp": ramp(np.arange(256), 0, high=255).tolist(),
@@ -173,8 +206,8 @@ class Drive:
             "steps": {"range": RANGE_STEP, "angle": ANGLE_STEP, "table": TABLE_STEP, "time_ns": TIME_STEP_NS},
         }
 
-    def _file(self, row: int) -> Any:
-        return self.dataset.frame_file(self.clouds.files[row])
+    def _file(self, clouds: Stream, row: int) -> Any:
+        return self.dataset.frame_file(clouds.files[row])
 
     def _images(self, name: str) -> CameraImages | None:
         """Which images of a camera are shown with the sweeps; None without images."""
@@ -199,21 +232,19 @@ class Drive:
             self.dataset.frame_file(self.dataset.paths.image(name, 0, kind=kind)).parent, ".png"
         )
 
-    def _truth_path(self, row: int) -> Any:
-        return self.dataset.frame_file(
-            self.dataset.paths.truth(self.clouds.name, int(self.clouds.frames[row]))
-        )
+    def _truth_path(self, clouds: Stream, row: int) -> Any:
+        return self.dataset.frame_file(self.dataset.paths.truth(clouds.name, int(clouds.frames[row])))
 
-    def _origin(self, row: int, table: Table) -> Any:
+    def _origin(self, clouds: Stream, row: int, *, count: int) -> Any:
         """Cause of each return; None where no stage acted."""
-        truth = read_truth(self._truth_path(row), count=len(table["x"]))
+        truth = read_truth(self._truth_path(clouds, row), count=count)
         return None if truth is None else truth["origin"]
 
-    def _poses(self, row: int, table: Table) -> dict[str, Any]:
+    def _poses(self, clouds: Stream, row: int, *, table: Table) -> dict[str, Any]:
         """Poses of the scanner at even times from a sweep's start to its last return."""
-        start, last = int(self.clouds.time_ns[row]), int(table["time_ns"].max(initial=1))
+        start, last = int(clouds.time_ns[row]), int(table["time_ns"].max(initial=1))
         times = start + np.rint(np.linspace(0, max(last, 1), POSES)).astype(np.int64)
-        mount = mount_of(self.clouds.sensor)
+        mount = mount_of(clouds.sensor)
         poses = self.trajectory.at(times).mounted(mount.translation, mount.rotation)
         quat = quat_from_matrix(poses.rotation)
         quat *= np.where((quat * quat[:1]).sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
@@ -224,11 +255,9 @@ class Drive:
             "quat": quat.round(7).tolist(),
         }
 
-    def _boxes(self, row: int) -> list[dict[str, Any]]:
+    def _boxes(self, clouds: Stream, row: int) -> list[dict[str, Any]]:
         """3D boxes of road users at a sweep's start."""
-        path = self.dataset.frame_file(
-            self.dataset.paths.frame_boxes(self.clouds.name, int(self.clouds.frames[row]))
-        )
+        path = self.dataset.frame_file(self.dataset.paths.frame_boxes(clouds.name, int(clouds.frames[row])))
         if not path.exists():
             return []
         return [
@@ -268,8 +297,8 @@ def _speeds(trajectory: Trajectory, time_ns: Ints) -> Float:
     return found
 
 
-def _chosen(dataset: Dataset, names: Sequence[str]) -> tuple[Stream, list[str]]:
-    """The clouds of the scanner, and the names of the cameras, that are to be shown."""
+def _chosen(dataset: Dataset, names: Sequence[str]) -> tuple[list[Stream], list[str]]:
+    """The clouds of the scanners, and the names of the cameras, that are to be shown."""
     kinds = {name: sensor["kind"] for name, sensor in dataset.sensors("lidar", "camera").items()}
     if unknown := sorted(set(names) - set(kinds)):
         raise InputError(
@@ -277,9 +306,7 @@ def _chosen(dataset: Dataset, names: Sequence[str]) -> tuple[Stream, list[str]]:
             f" {', '.join(kinds)}"
         )
     scanners = [name for name in names if kinds[name] == "lidar"]
-    if len(scanners) > 1:
-        raise InputError(f"`sensors`: the page shows one scanner; choose from {', '.join(scanners)}")
-    clouds = scanner_clouds(dataset, *scanners)
+    clouds = [scanner_clouds(dataset, name) for name in dict.fromkeys(scanners or [""])]
     cameras = [name for name in names if kinds[name] == "camera"]
     if not cameras:
         with_images = (

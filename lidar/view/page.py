@@ -68,13 +68,18 @@ def view_drive(
     head = drive.head()
     returns = 0
     written: set[str] = set()
+    swept: set[str] = set()
     with exclusive(out), atomic_file(out) as file, spool(out) as blobs:
-        write_blob(blobs, "slots", data=pack_slots(drive.slots))
+        _write_slots(blobs, drive)
         for k in range(len(drive)):
             progress("page", k, total=len(drive))
-            count, data = drive.sweep(k)
-            returns += count
-            write_blob(blobs, f"sweep-{k}", data=data)
+            for number, scanner in enumerate(drive.scanners):
+                row = int(scanner.index[k])
+                if (name := f"sweep-{number}-{row}") not in swept:
+                    count, data = drive.sweep(row, scanner=number)
+                    returns += count
+                    write_blob(blobs, name, data=data)
+                    swept.add(name)
             for number, camera in enumerate(drive.cameras):
                 for kind in camera.kinds:
                     image = int(camera.index[k])
@@ -97,7 +102,7 @@ def write_player(
     served : frames come from the server of the page instead; nothing else can be loaded
     """
     words = {
-        "title": html.escape(f"{head['name']}, {head['scanner']}"),
+        "title": html.escape(f"{head['name']}, {', '.join(one['name'] for one in head['scanners'])}"),
         "credit": linked(str(drive.dataset.manifest.get("attribution", ""))),
         "connect": "'self'" if served else "'none'",
         "style": part("page.css", package="lidar.view"),
@@ -109,10 +114,16 @@ def write_player(
     write_page(file, part("page.html", package="lidar.view"), words=words, blobs=blobs)
 
 
+def _write_slots(blobs: IO[bytes], drive: Drive) -> None:
+    """Write the table of directions of each scanner."""
+    for number, slots in enumerate(drive.slots):
+        write_blob(blobs, f"slots-{number}", data=pack_slots(slots))
+
+
 def served_page(drive: Drive) -> bytes:
     """The page of a server, which asks it for frames."""
     with SpooledTemporaryFile() as blobs, SpooledTemporaryFile() as file:
-        write_blob(blobs, "slots", data=pack_slots(drive.slots))
+        _write_slots(blobs, drive)
         write_player(file, drive, head=drive.head(), blobs=blobs, served=True)
         file.seek(0)
         return file.read()
@@ -120,10 +131,10 @@ def served_page(drive: Drive) -> bytes:
 
 def _left_out(drive: Drive) -> list[str]:
     """What of the dataset is not shown."""
-    names = {drive.clouds.name, *(camera.name for camera in drive.cameras)}
+    names = {*(shown.clouds.name for shown in drive.scanners), *(camera.name for camera in drive.cameras)}
     notes = []
     if left := [name for name in drive.dataset.sensors("lidar", "camera") if name not in names]:
-        notes.append(f"sensors left out: {', '.join(left)} (name a scanner and cameras by `sensors`)")
+        notes.append(f"sensors left out: {', '.join(left)} (name scanners and cameras by `sensors`)")
     if len(drive) < len(drive.clouds.files):
         notes.append(f"{len(drive)} of {len(drive.clouds.files)} frames")
     return notes

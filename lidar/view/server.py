@@ -36,7 +36,7 @@ class DriveServer(ThreadingHTTPServer):
     ) -> None:
         self.drive = Drive(dataset, options)
         self.page = served_page(self.drive)
-        self.sweep = lru_cache(_KEPT)(self.drive.sweep)
+        self.sweep = lru_cache(_KEPT)(lambda scanner, k: self.drive.sweep(k, scanner=scanner))
         self.image = lru_cache(_KEPT)(self.drive.image)
         try:
             super().__init__((HOST, port), _Handler)
@@ -73,8 +73,8 @@ class _Handler(BaseHTTPRequestHandler):
         server = self.server
         if path == "/":
             return "text/html; charset=utf-8", server.page
-        if found := re.fullmatch(r"/sweep/(\d{1,9})", path):
-            return "application/octet-stream", server.sweep(int(found[1]))[1]
+        if found := re.fullmatch(r"/sweep/(\d{1,9})/(\d{1,9})", path):
+            return "application/octet-stream", server.sweep(int(found[1]), int(found[2]))[1]
         if found := re.fullmatch(r"/image/(\d{1,9})/(rgb|depth)/(\d{1,9})", path):
             camera, kind, k = int(found[1]), found[2], int(found[3])
             if kind in server.drive.cameras[camera].kinds:

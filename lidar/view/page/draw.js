@@ -134,8 +134,8 @@ class Renderer {
   }
 
   /** The picture: sweeps, of which the last is current, and lines [from, to, colour] in scene metres. */
-  render(camera, sweeps, lines, { ground, rings }) {
-    const { gl, canvas, head } = this;
+  render(camera, sweeps, lines, { ground }) {
+    const { gl, canvas } = this;
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const [width, height] = [Math.round(canvas.clientWidth * ratio), Math.round(canvas.clientHeight * ratio)];
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
@@ -148,8 +148,6 @@ class Renderer {
     gl.uniformMatrix4fv(at.uMatrix, false, matrix);
     gl.uniform1f(at.uSize, this.size * ratio);
     gl.uniform1f(at.uGround, ground - target[2]);
-    gl.uniform1f(at.uFar, head.far);
-    gl.uniform1f(at.uRings, rings);
     gl.uniform1i(at.uMode, this.mode);
     gl.uniform1i(at.uColors, 0);
     sweeps.forEach((sweep, k) => {
@@ -157,6 +155,8 @@ class Renderer {
       gl.uniform3fv(at["uAt[0]"], position.flatMap((p) => p.map((v, axis) => v - target[axis])));
       gl.uniform4fv(at["uTurn[0]"], quat.flat());
       gl.uniform1f(at.uScale, scale);
+      gl.uniform1f(at.uFar, sweep.far);
+      gl.uniform1f(at.uRings, sweep.slots.rings);
       gl.uniform1i(at.uPicked, k === sweeps.length - 1 ? this.picked : -1);
       gl.bindVertexArray(sweep.onCard.array);
       gl.drawArrays(gl.POINTS, 0, sweep.count);

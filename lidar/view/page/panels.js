@@ -34,7 +34,7 @@ function legend(view) {
     echo: () => of("echo", (c) => `echo ${c}`, (c) => head.distinct[c % 7]),
     origin: () => of("origin", (c) => words(head.origins[c]), (c) => (c ? head.distinct[(c - 1) % 7] : [128, 128, 128])),
   }[mode];
-  const ends = mode === "range" ? ["0", `${head.far / 4} m`, `${head.far} m`] : COLORINGS[mode].ends;
+  const ends = mode === "range" ? ["0", `${sweep.far / 4} m`, `${sweep.far} m`] : COLORINGS[mode].ends;
   const items = [];
   if (rows) {
     for (const [color, text, code, column] of rows()) {
@@ -63,8 +63,8 @@ function colorOf(view, k) {
     case "echo": return head.distinct[sweep.echo[k] % 7];
     case "origin": return sweep.origin[k] ? head.distinct[(sweep.origin[k] - 1) % 7] : [128, 128, 128];
     case "instance": return sweep.instance[k] < 0 ? [115, 115, 115] : hueOf(sweep.instance[k]);
-    case "ring": return ramp(sweep.ring[k] / Math.max(1, view.rings - 1));
-    default: return ramp(Math.sqrt(sweep.range[k] / head.far));
+    case "ring": return ramp(sweep.ring[k] / Math.max(1, sweep.slots.rings - 1));
+    default: return ramp(Math.sqrt(sweep.range[k] / sweep.far));
   }
 }
 
@@ -76,13 +76,13 @@ function hueOf(instance) {
 
 /** Rows are channels, the highest on top; columns azimuths, from left to right; the last return drawn is the first. */
 function scanImage(view) {
-  const { sweep, slots, rings } = view;
+  const { sweep } = view, { rings, columns, azimuths } = sweep.slots;
   const canvas = $("scan");
-  const width = Math.min(slots.columns, 720), height = Math.min(rings, 256);
+  const width = Math.min(columns, 720), height = Math.min(rings, 256);
   if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
   const context = canvas.getContext("2d");
   const image = context.createImageData(width, height);
-  const [low, high] = view.azimuths;
+  const [low, high] = azimuths;
   for (let k = sweep.count - 1; k >= 0; k--) {
     const azimuth = Math.atan2(sweep.xyz[3 * k + 1], sweep.xyz[3 * k]);
     const x = Math.min(width - 1, Math.max(0, Math.floor(((high - azimuth) / (high - low)) * width)));
@@ -90,13 +90,6 @@ function scanImage(view) {
     if (y >= 0) image.data.set([...colorOf(view, k), 255], 4 * (y * width + x));
   }
   context.putImageData(image, 0, 0);
-}
-
-/** Lowest and highest azimuth of a scanner's pulses, radians. */
-function azimuthsOf({ azimuth }, step) {
-  let low = Infinity, high = -Infinity;
-  for (const value of azimuth) [low, high] = [Math.min(low, value * step), Math.max(high, value * step)];
-  return [low, high > low ? high : low + 1];
 }
 
 /** Figures for the images of cameras. */

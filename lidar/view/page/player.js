@@ -13,39 +13,41 @@ function sourceOf(head) {
       if (!answer.ok) throw new Error(`The server has no ${path}: ${await answer.text()}`);
       return new Uint8Array(await answer.arrayBuffer());
     };
-    return { sweep: (k) => ask(`sweep/${k}`), image: (camera, kind, k) => ask(`image/${camera}/${kind}/${k}`) };
+    return { sweep: (scanner, k) => ask(`sweep/${scanner}/${k}`), image: (camera, kind, k) => ask(`image/${camera}/${kind}/${k}`) };
   }
   const element = async (id) => bytesOf($(id).textContent);
-  return { sweep: (k) => element(`sweep-${k}`), image: (camera, kind, k) => element(`image-${camera}-${kind}-${k}`) };
+  return { sweep: (scanner, k) => element(`sweep-${scanner}-${k}`), image: (camera, kind, k) => element(`image-${camera}-${kind}-${k}`) };
 }
 
 /** Decoded sweeps, the last used ones. */
 class Sweeps {
   constructor(view) {
     this.view = view;
-    this.kept = new Map(); // frame -> promise of its sweep; the longest unused first
+    this.kept = new Map(); // scanner and row -> promise of the sweep; the longest unused first
   }
 
-  get(frame) {
+  /** The sweep of a scanner in a frame. */
+  get(scanner, frame) {
     const { source, slots, head, renderer } = this.view;
-    const found = this.kept.get(frame) || source.sweep(frame).then(inflated).then((buffer) => {
-      const sweep = readSweep(buffer, slots, head.steps);
+    const row = head.scanners[scanner].index[frame], key = `${scanner}-${row}`;
+    const found = this.kept.get(key) || source.sweep(scanner, row).then(inflated).then((buffer) => {
+      const sweep = { ...readSweep(buffer, slots[scanner], head.steps), slots: slots[scanner], far: head.scanners[scanner].far };
       renderer.load(sweep);
       return sweep;
     });
-    this.kept.delete(frame);
-    this.kept.set(frame, found);
+    this.kept.delete(key);
+    this.kept.set(key, found);
     return found;
   }
 
-  /** Forget sweeps beyond the limit; those from `first` to `last` stay. */
-  async trim(first, last) {
+  /** Forget sweeps beyond the limit; those that are drawn stay. */
+  async trim(drawn) {
     let sum = 0;
-    for (const [frame, promise] of [...this.kept].reverse()) {
+    for (const [key, promise] of [...this.kept].reverse()) {
       const sweep = await promise;
-      if (frame >= first && frame <= last) continue;
+      if (drawn.includes(sweep)) continue;
       sum += sweep.count;
-      if (sum > KEPT_RETURNS && this.kept.delete(frame)) this.view.renderer.drop(sweep);
+      if (sum > KEPT_RETURNS && this.kept.delete(key)) this.view.renderer.drop(sweep);
     }
   }
 }
@@ -55,20 +57,20 @@ async function start() {
   const head = JSON.parse($("head").textContent);
   const renderer = new Renderer($("canvas"), head);
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  const far = Math.max(...head.scanners.map((scanner) => scanner.far));
   for (const point of head.position)
     for (const axis of [0, 1, 2]) {
-      low[axis] = Math.min(low[axis], point[axis] - 2 * head.far);
-      high[axis] = Math.max(high[axis], point[axis] + 2 * head.far);
+      low[axis] = Math.min(low[axis], point[axis] - 2 * far);
+      high[axis] = Math.max(high[axis], point[axis] + 2 * far);
     }
   const camera = new Camera(low, high);
   const view = { head, renderer, camera, source: sourceOf(head), dirty: true, frame: -1, playing: false, rate: 1, shown: [] };
   view.extent = Math.max(...[0, 1].map((axis) => Math.max(...head.path.map((p) => p[axis])) - Math.min(...head.path.map((p) => p[axis]))));
-  view.slots = readSlots(await blobOf("slots"));
+  view.slots = (await Promise.all(head.scanners.map((_, k) => blobOf(`slots-${k}`)))).map((buffer) => readSlots(buffer, head.steps.table));
   view.sweeps = new Sweeps(view);
-  view.rings = view.slots.rings;
-  view.azimuths = azimuthsOf(view.slots, head.steps.table);
   figures(view);
   fill(view);
+  choose(view);
   listen(view);
   behind(view, 0);
   await show(view, 0);
@@ -80,7 +82,7 @@ async function start() {
   window.lidar = {
     view, camera, head,
     show: (frame) => show(view, frame), play: (on) => play(view, on),
-    color: (mode) => color(view, mode), pick: (x, y) => under(view, x, y),
+    color: (mode) => color(view, mode), scan: (name) => scan(view, name), pick: (x, y) => under(view, x, y),
     points: () => ({ ...Object.fromEntries(COLUMNS.map((name) => [name, [...view.sweep[name]]])), xyz: [...view.sweep.xyz] }),
     placed: (rows) => rows.map((k) => placed(view.sweep, k)),
   };
@@ -90,8 +92,26 @@ async function start() {
 /** Options of the lists, and ends of the timeline. */
 function fill({ head }) {
   $("color").append(...Object.entries(COLORINGS).map(([value, { title }]) => make("option", title, { value })));
+  $("scanner").append(...head.scanners.map(({ name }, k) => make("option", name, { value: k })), make("option", "all", { value: "all" }));
+  $("scanner").parentElement.hidden = head.scanners.length === 1;
   $("rate").append(...RATES.map((rate) => make("option", `${rate}×`, { value: rate, selected: rate === 1 })));
   $("time").max = head.numbers.length - 1;
+}
+
+/** Which scanners are drawn; the range image, the legend and clicks are of the last one, which is the first of all. */
+function choose(view) {
+  const { value } = $("scanner");
+  view.drawn = value === "all" ? view.head.scanners.map((_, k) => k).reverse() : [Number(value)];
+}
+
+/** Draw the scanner of a name, or all. */
+function scan(view, name) {
+  const chosen = [...$("scanner").options].find((option) => option.textContent === name);
+  if (!chosen) return Promise.resolve();
+  $("scanner").value = chosen.value;
+  choose(view);
+  tell(view, null);
+  return show(view, view.wanted);
 }
 
 /** Show a frame, and with it those before it that are drawn together. */
@@ -100,8 +120,12 @@ async function show(view, wanted) {
   const frame = Math.min(head.numbers.length - 1, Math.max(0, Math.round(wanted)));
   const first = Math.max(0, frame - Number($("sweeps").value) + 1);
   view.wanted = frame;
-  const shown = await Promise.all(Array.from({ length: frame - first + 1 }, (_, k) => view.sweeps.get(first + k)));
-  if (view.wanted !== frame) return; // another frame was asked for meanwhile
+  const { drawn } = view;
+  const frames = Array.from({ length: frame - first + 1 }, (_, k) => first + k);
+  const found = await Promise.all(frames.flatMap((k) => drawn.map((scanner) => view.sweeps.get(scanner, k))));
+  if (view.wanted !== frame || view.drawn !== drawn) return; // something else was asked for meanwhile
+  const shown = [...new Set(found)];
+  const now = [...new Set(found.slice(-drawn.length))].reduce((sum, { count }) => sum + count, 0);
   if (view.frame >= 0 && $("follow").checked) {
     const [from, to] = [view.frame, frame];
     camera.target = camera.target.map((v, k) => v + head.position[to][k] - head.position[from][k]);
@@ -116,13 +140,13 @@ async function show(view, wanted) {
   Object.assign(view, { frame, shown, sweep: shown[shown.length - 1], ground: head.position[frame][2], dirty: true });
   $("time").value = frame;
   const at = (head.time_ns[frame] - head.time_ns[0]) / 1e9;
-  $("clock").textContent = `frame ${head.numbers[frame]}   ${at.toFixed(2)} s   ${(3.6 * head.speed[frame]).toFixed(1)} km/h   ${view.sweep.count} returns`;
+  $("clock").textContent = `frame ${head.numbers[frame]}   ${at.toFixed(2)} s   ${(3.6 * head.speed[frame]).toFixed(1)} km/h   ${now} returns`;
   if (changed) tell(view, null);
   legend(view);
   scanImage(view);
   plan(view);
   graph(view);
-  await Promise.all([pictures(view, frame), view.sweeps.trim(first, frame)]);
+  await Promise.all([pictures(view, frame), view.sweeps.trim(shown)]);
 }
 
 /** The camera behind the vehicle. */
@@ -159,7 +183,7 @@ function advance(view, now) {
   show(view, next).then(() => {
     // Time that decoding took beyond a quarter of a second is not made up by leaving frames out.
     if (view.clock) view.clock = { frame: next, since: Math.max(due, performance.now() - 250) };
-    if (next + 1 < head.numbers.length) view.sweeps.get(next + 1).catch(fail);
+    if (next + 1 < head.numbers.length) for (const scanner of view.drawn) view.sweeps.get(scanner, next + 1).catch(fail);
   }).catch(fail).finally(() => { view.busy = false; });
 }
 
@@ -211,10 +235,11 @@ function under(view, x, y) {
   return best;
 }
 
-/** #frame=12&color=height&view=x,y,z,distance,azimuth,tilt, any of them. */
+/** #frame=12&color=height&scanner=all&view=x,y,z,distance,azimuth,tilt, any of them. */
 function fromAddress(view) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("color")) color(view, given.get("color"));
+  if (given.has("scanner")) scan(view, given.get("scanner")).catch(fail);
   const row = view.head.numbers.indexOf(Number(given.get("frame")));
   if (given.has("frame") && row >= 0) show(view, row).catch(fail);
   if (given.has("view")) view.camera.fromText(given.get("view"));
@@ -277,6 +302,7 @@ function listen(view) {
     const share = (event.offsetX - 8) / Math.max(1, $("graph").clientWidth - 16);
     go(share * (head.numbers.length - 1));
   };
+  $("scanner").onchange = () => scan(view, $("scanner").selectedOptions[0].textContent).catch(fail);
   $("color").onchange = () => color(view, $("color").value);
   $("sweeps").onchange = () => together(0);
   $("size").oninput = () => {

@@ -23,11 +23,18 @@ function readPlanes(bytes, count, planes, sums) {
   });
 }
 
-/** The table of directions and times of slots. */
-function readSlots(buffer) {
+/** Lowest and highest azimuth of a scanner's pulses, radians. */
+function azimuthsOf(azimuth, step) {
+  let low = Infinity, high = -Infinity;
+  for (const value of azimuth) [low, high] = [Math.min(low, value * step), Math.max(high, value * step)];
+  return [low, high > low ? high : low + 1];
+}
+
+/** The table of directions and times of slots; `step` is the unit of its azimuths. */
+function readSlots(buffer, step) {
   const [head, bytes] = split(buffer);
   const [azimuth, elevation, time] = readPlanes(bytes, head.count, head.planes, () => true);
-  return { rings: head.rings, columns: head.columns, last: head.count - 1, azimuth, elevation, time };
+  return { rings: head.rings, columns: head.columns, last: head.count - 1, azimuths: azimuthsOf(azimuth, step), azimuth, elevation, time };
 }
 
 /** A sweep: columns of its returns, among them `xyz` in the sensor's frame, its poses and its boxes. */

@@ -70,14 +70,14 @@ def test_whole_numbers_survive_as_planes_of_bytes(numbers):
 def test_the_page_has_every_frame_image_and_road_user(drive, page):
     dataset = open_dataset(drive)
     blobs, head = elements(page.path)
-    assert head["scanner"] == "lidar_top"
+    assert [one["name"] for one in head["scanners"]] == ["lidar_top"]
     assert head["numbers"] == list(range(6))
     assert page.frames == 6
     assert page.images == 12  # colour and depth
     assert page.returns == dataset.manifest["points"]["lidar_top"]
     assert page.bytes == page.path.stat().st_size
     for frame in head["numbers"]:
-        told = head_of(blobs[f"sweep-{frame}"])
+        told = head_of(blobs[f"sweep-0-{frame}"])
         rows = dataset.paths.frame_boxes("lidar_top", frame).read_text("utf-8").splitlines()[1:]
         assert told["count"] == len(read_table(drive / "lidar_top" / "pcd" / f"{frame:06d}.pcd")["x"])
         assert len(told["boxes"]) == len(rows) > 3
@@ -126,10 +126,30 @@ def test_a_selection_of_frames_and_sensors_is_shown(drive, tmp_path):
     options = PlaybackOptions(sensors=("lidar_front",), frames="1:20", every=4)
     summary = view_drive(open_dataset(drive), tmp_path / "page.html", options=options)
     _, head = elements(summary.path)
-    assert head["scanner"] == "lidar_front"
+    assert [one["name"] for one in head["scanners"]] == ["lidar_front"]
     assert head["numbers"] == list(range(1, 20, 4))
     assert [camera["name"] for camera in head["cameras"]] == ["camera_front"]
     assert any("5 of " in note for note in summary.notes)
+
+
+def test_of_several_scanners_the_nearest_sweeps_are_shown_together(drive, tmp_path):
+    dataset = open_dataset(drive)
+    options = PlaybackOptions(sensors=("lidar_top", "lidar_front"), frames=":4")
+    summary = view_drive(dataset, tmp_path / "page.html", options=options)
+    blobs, head = elements(summary.path)
+    top, front = head["scanners"]
+    assert (top["name"], front["name"]) == ("lidar_top", "lidar_front")
+    assert top["index"] == [0, 1, 2, 3]
+    starts = dataset.sample_times("lidar_front")
+    wanted = [int(np.argmin(np.abs(starts - time))) for time in head["time_ns"]]
+    assert head["numbers"] == [0, 1, 2, 3]
+    for place, frame in zip(front["index"], wanted, strict=True):
+        returns = len(read_table(drive / "lidar_front" / "pcd" / f"{frame:06d}.pcd")["x"])
+        assert head_of(blobs[f"sweep-1-{place}"])["count"] == returns
+    assert summary.returns == sum(
+        head_of(data)["count"] for name, data in blobs.items() if name.startswith("sweep-")
+    )
+    assert not any("lidar_front" in note for note in summary.notes)
 
 
 def test_a_page_that_would_be_too_large_names_a_selection_that_fits(drive, tmp_path):
@@ -147,7 +167,6 @@ def test_a_page_that_would_be_too_large_names_a_selection_that_fits(drive, tmp_p
     ("options", "message"),
     [
         ({"sensors": ("roof",)}, "no scanner or camera roof"),
-        ({"sensors": ("lidar_top", "lidar_front")}, "shows one scanner"),
         ({"frames": "100:200"}, "has frames 0 to 5"),
     ],
 )
@@ -205,10 +224,17 @@ def fetch(url):
 def test_the_server_has_the_bytes_of_the_page(drive, page):
     blobs, _ = elements(page.path)
     with serving(drive) as server:
-        assert fetch(f"{server.address}sweep/3") == blobs["sweep-3"]
+        assert fetch(f"{server.address}sweep/0/3") == blobs["sweep-0-3"]
         assert fetch(f"{server.address}image/0/depth/2") == blobs["image-0-depth-2"]
         assert b"connect-src 'self'" in fetch(server.address)
-        for path in ("sweep/6", "image/1/rgb/0", "image/0/rgb/99", "../dataset.json", "sweep/-1"):
+        for path in (
+            "sweep/0/6",
+            "sweep/1/0",
+            "image/1/rgb/0",
+            "image/0/rgb/99",
+            "../dataset.json",
+            "sweep/0/-1",
+        ):
             with pytest.raises(urllib.error.HTTPError, match="404"):
                 fetch(server.address + path)
 
@@ -217,7 +243,7 @@ def test_the_server_answers_this_machine_only(drive):
     with serving(drive) as server:
         assert server.server_address[0] == "127.0.0.1"
         link = HTTPConnection("127.0.0.1", server.server_port, timeout=60)
-        link.request("GET", "/sweep/0", headers={"Host": "elsewhere.example"})
+        link.request("GET", "/sweep/0/0", headers={"Host": "elsewhere.example"})
         assert link.getresponse().status == 403
         link.close()
         with pytest.raises(InputError, match="`port`"):

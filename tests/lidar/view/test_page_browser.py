@@ -15,6 +15,7 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.truth_files import read_truth
+from lidar.options import PlaybackOptions
 from lidar.physics.echoes import Origin
 from lidar.view import view_drive
 from lidar.view.server import DriveServer
@@ -282,3 +283,29 @@ def test_a_served_drive_plays_as_the_page_does(dataset, window):
         finally:
             server.shutdown()
             thread.join()
+
+
+def test_scanners_are_drawn_one_at_a_time_or_together(dataset, window, tmp_path):
+    options = PlaybackOptions(sensors=("lidar_top", "lidar_front"))
+    path = view_drive(dataset, tmp_path / "two.html", options=options).path
+    window.complaints()
+    window.open(path)
+    counts = {
+        name: len(read_table(dataset.path / name / "pcd" / "000000.pcd")["x"])
+        for name in ("lidar_top", "lidar_front")
+    }
+    assert window.js("return [...document.getElementById('scanner').options].map((o) => o.textContent)") == [
+        *counts,
+        "all",
+    ]
+    assert window.js("return lidar.view.shown.map((s) => s.count)") == [counts["lidar_top"]]
+    window.js("return lidar.scan('lidar_front')")
+    window.wait("return lidar.view.shown.length === 1 && lidar.view.sweep.slots === lidar.view.slots[1]")
+    assert window.js("return lidar.view.sweep.count") == counts["lidar_front"]
+    window.js("return lidar.scan('all')")
+    window.wait("return lidar.view.shown.length === 2")
+    assert window.js("return lidar.view.sweep.count") == counts["lidar_top"], "clicks are on the first one"
+    assert f"{sum(counts.values())} returns" in window.text("clock")
+    show(window, 3)
+    assert window.js("return lidar.view.shown.length") == 2
+    assert [text for text in window.complaints() if not any(part in text for part in SLOW)] == []
