@@ -410,14 +410,18 @@ def view(
 
     geoscene view scene -o page.html
 
-    The page needs no network and no server; open the file in any browser with WebGL 2.
+    geoscene view scene -o page
+
+    The page needs no network and no server; open the file, or the index.html of the folder, in any browser
+    with WebGL 2.
 
     Parameters
     ----------
     scene
         Directory or URL of the scene.
     out
-        File to write.
+        File to write (.html), or a folder (no suffix) whose page loads parts of the scene as they are seen:
+        for scenes of any size.
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from geoscene.view import view_scene  # noqa: PLC0415

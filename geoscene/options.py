@@ -127,7 +127,7 @@ class ViewOptions:
     """Layers to show, separated by commas, such as ground,buildings,trees; all by default."""
 
     max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
-    """Maximum size of the page in megabytes; for a larger one, the error names a --bbox that fits."""
+    """Maximum size in megabytes of a page in a file; for a larger one, the error gives a --bbox that fits."""
 
     def __post_init__(self) -> None:
         """Validate the options."""

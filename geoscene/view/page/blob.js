@@ -13,10 +13,15 @@ function inflated(bytes) {
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
 }
 
-/** The inflated bytes of an element of the page, which is removed. */
-function blobOf(id) {
+/** The bytes of an element of the page, which is removed. */
+function takenOf(id) {
   const element = document.getElementById(id);
   const bytes = bytesOf(element.textContent);
   element.remove();
-  return inflated(bytes);
+  return bytes;
+}
+
+/** The inflated bytes of an element of the page, which is removed. */
+function blobOf(id) {
+  return inflated(takenOf(id));
 }

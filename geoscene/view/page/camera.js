@@ -4,24 +4,6 @@
 const FIELD = Math.PI / 4; // vertical angle of view
 const LOWEST = 0.02, HIGHEST = Math.PI / 2; // tilt
 
-/** The box of the tiles where things stand: the middle nine tenths of what is not bare ground, along either axis. */
-function busyBox({ low, high, tiles }) {
-  const weights = tiles.map(({ ends, runs }) => ends[ends.length - 1] - ends[0] + runs.reduce((sum, run) => sum + (run[0] ? run[2] : 0), 0));
-  const half = weights.reduce((sum, weight) => sum + weight, 0) * 0.05;
-  if (!half) return { low, high };
-  const reached = (order) => {
-    let sum = 0;
-    return order.find((k) => (sum += weights[k]) >= half);
-  };
-  const box = { low: [...low], high: [...high] };
-  for (const axis of [0, 1]) {
-    const order = [...tiles.keys()].sort((a, b) => tiles[a].index[axis] - tiles[b].index[axis]);
-    box.low[axis] = tiles[reached(order)].low[axis];
-    box.high[axis] = tiles[reached(order.reverse())].high[axis];
-  }
-  return box;
-}
-
 /** Product of 4 x 4 matrices, columns first, as WebGL has them. */
 function product(a, b) {
   const out = new Float32Array(16);

@@ -150,40 +150,17 @@ function shapePositions(shape) {
   return out;
 }
 
-/** Boxes of all features in scene metres: low and high as 3 floats each, empty where low > high. */
+/** Boxes of the features in metres: low and high as 3 floats each, empty where low > high; see `Contents.boxes`. */
 class Boxes {
-  constructor(count) {
+  constructor(count, buffer) {
     this.low = new Float32Array(3 * count).fill(Infinity);
     this.high = new Float32Array(3 * count).fill(-Infinity);
-  }
-
-  add(feature, x, y, z) {
-    if (feature < 0) return;
-    const at = 3 * feature;
-    this.low[at] = Math.min(this.low[at], x); this.high[at] = Math.max(this.high[at], x);
-    this.low[at + 1] = Math.min(this.low[at + 1], y); this.high[at + 1] = Math.max(this.high[at + 1], y);
-    this.low[at + 2] = Math.min(this.low[at + 2], z); this.high[at + 2] = Math.max(this.high[at + 2], z);
-  }
-
-  addTile(told, tile, shapes) {
-    const base = told.base.map((b) => b * told.step);
-    for (let k = 0; k < tile.corners.length; k++) {
-      const v = 3 * tile.corners[k];
-      this.add(tile.feature[(k / 3) | 0], base[0] + tile.vertices[v] * told.step,
-        base[1] + tile.vertices[v + 1] * told.step, base[2] + tile.vertices[v + 2] * told.step);
-    }
-    let copy = 0;
-    for (const [, shape, count] of told.runs) {
-      const { low, high } = shapes[shape];
-      for (let n = 0; n < count; n++, copy++) {
-        const t = tile.transform.subarray(12 * copy, 12 * copy + 12);
-        for (let k = 0; k < 8; k++) {
-          const p = [0, 1, 2].map((axis) => ((k >> axis) & 1 ? high : low)[axis]);
-          const [x, y, z] = [0, 4, 8].map((r) => t[r] * p[0] + t[r + 1] * p[1] + t[r + 2] * p[2] + t[r + 3]);
-          this.add(tile.copied[copy], base[0] + x, base[1] + y, base[2] + z);
-        }
+    const values = new Int32Array(buffer), n = values.length / 7;
+    for (let row = 0; row < n; row++)
+      for (let axis = 0; axis < 3; axis++) {
+        this.low[3 * values[row] + axis] = values[(1 + axis) * n + row] / 100;
+        this.high[3 * values[row] + axis] = values[(4 + axis) * n + row] / 100;
       }
-    }
   }
 
   has(feature) {

@@ -9,7 +9,7 @@ class Renderer {
   constructor(canvas, head, shapes) {
     const gl = canvas.getContext("webgl2", { antialias: true });
     if (!gl) throw new Error("This browser does not support WebGL 2, which the page needs.");
-    Object.assign(this, { canvas, gl, head, tiles: [], mode: 0, selected: -1, glow: 0, shadows: false, guesses: true, sunAzimuth: 2.6 });
+    Object.assign(this, { canvas, gl, head, tiles: [], made: [], bytes: 0, mode: 0, selected: -1, glow: 0, shadows: false, guesses: true, sunAzimuth: 2.6 });
     this.hidden = new Set();
     this.programs = {};
     for (const pass of ["VIEW", "PICK", "DEPTH"])
@@ -35,6 +35,8 @@ class Renderer {
   buffer(data) {
     const { gl } = this;
     const buffer = gl.createBuffer();
+    this.made.push(() => gl.deleteBuffer(buffer));
+    this.bytes += data.byteLength;
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
     gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
     return buffer;
@@ -62,11 +64,20 @@ class Renderer {
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   }
 
-  /** Add a tile's faces and copies. */
+  /** A new array of attributes, bound. */
+  array() {
+    const { gl } = this;
+    const array = gl.createVertexArray();
+    this.made.push(() => gl.deleteVertexArray(array));
+    gl.bindVertexArray(array);
+    return array;
+  }
+
+  /** Put a tile's faces and copies on the card; it is drawn while it is among `tiles`. */
   add(told, tile) {
     const { gl } = this;
-    const faces = gl.createVertexArray();
-    gl.bindVertexArray(faces);
+    Object.assign(this, { made: [], bytes: 0 });
+    const faces = this.array();
     this.buffer(vertexBytes(tile, told.step));
     this.perVertex(true);
     const walled = this.walled(told, tile);
@@ -83,8 +94,12 @@ class Renderer {
       first += count;
     }
     gl.bindVertexArray(null);
-    this.tiles.push({ told, faces, walled, runs, origin: told.base.map((b) => b * told.step) });
-    this.stale = true;
+    return { told, faces, walled, runs, origin: told.base.map((b) => b * told.step), made: this.made, bytes: this.bytes };
+  }
+
+  /** Take what `add` returned from the card. */
+  remove({ made }) {
+    made.forEach((undo) => undo());
   }
 
   /** The faces of buildings, with the columns of walls; null if there are none. */
@@ -92,8 +107,7 @@ class Renderer {
     const { gl, head } = this;
     const group = head.groups.indexOf("buildings"), first = group > 0 ? told.ends[group - 1] : 0;
     if (group < 0 || told.ends[group] === first) return null;
-    const bytes = gl.getParameter(gl.ARRAY_BUFFER_BINDING), array = gl.createVertexArray();
-    gl.bindVertexArray(array);
+    const bytes = gl.getParameter(gl.ARRAY_BUFFER_BINDING), array = this.array();
     gl.bindBuffer(gl.ARRAY_BUFFER, bytes);
     this.perVertex(true, 3 * first * VERTEX_BYTES);
     this.buffer(wallBytes(tile, told, first, told.ends[group]));
@@ -106,8 +120,7 @@ class Renderer {
   /** Attributes of copies, from the first on. */
   copies(shape, transforms, features, first) {
     const { gl } = this;
-    const array = gl.createVertexArray();
-    gl.bindVertexArray(array);
+    const array = this.array();
     gl.bindBuffer(gl.ARRAY_BUFFER, shape.bytes);
     this.perVertex(false);
     gl.bindBuffer(gl.ARRAY_BUFFER, shape.positions);
@@ -172,13 +185,13 @@ class Renderer {
       gl.uniform1i(at.uShadows, this.shadows ? 1 : 0);
       gl.uniform1f(at.uSunPixel, this.sunPixel || 0);
       if (at.uSunMatrix) gl.uniformMatrix4fv(at.uSunMatrix, false, this.sunMatrix || new Float32Array(16));
-      for (const { told, faces, walled, runs, offset } of seen) {
+      for (const { told, coarse, faces, walled, runs, offset } of seen) {
         gl.uniform3fv(at.uOffset, offset);
         if (copies) {
           const metres = pixel * Math.hypot(...eye.map((v, k) => v - Math.min(told.high[k], Math.max(told.low[k], v))));
           for (const { group, sides, near, far, count } of runs) {
             if (this.hidden.has(head.groups[group]) || sides[1] < LEAST_PIXELS * metres) continue;
-            const drawn = sides[0] < FAR_PIXELS * metres && far.vertices < near.vertices ? far : near;
+            const drawn = (coarse || sides[0] < FAR_PIXELS * metres) && far.vertices < near.vertices ? far : near;
             gl.bindVertexArray(drawn.array);
             gl.drawArraysInstanced(gl.TRIANGLES, 0, drawn.vertices, count);
           }

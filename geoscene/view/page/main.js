@@ -9,33 +9,11 @@ async function start() {
   const shapes = readShapes(head.shapes, await blobOf("shapes"));
   const renderer = new Renderer($("canvas"), head, shapes);
   const camera = new Camera(head.low, head.high);
-  camera.whole(busyBox(head), window.innerWidth / window.innerHeight);
-  const boxes = new Boxes(head.features);
+  camera.whole(head.busy, window.innerWidth / window.innerHeight);
   const used = { material: new Set(), class: new Set() };
-  const view = { head, renderer, camera, boxes, used, dirty: true, cursor: null };
-  view.attributes = new Attributes(JSON.parse(new TextDecoder().decode(await blobOf("attributes"))));
-
+  const view = { head, shapes, renderer, camera, used, dirty: true, cursor: null, wanted: () => {} };
   loop(view);
-  let shown = performance.now(), pause = 250;
-  for (const [k, told] of head.tiles.entries()) {
-    const tile = readTile(told, await blobOf(`tile-${k}`));
-    renderer.add(told, tile);
-    boxes.addTile(told, tile, shapes);
-    for (const part of [tile, ...new Set(told.runs.map((run) => shapes[run[1]]))]) {
-      part.material.forEach((code) => used.material.add(code));
-      part.klass.forEach((code) => used.class.add(code));
-    }
-    if (performance.now() - shown < pause) continue;
-    $("message").textContent = `Reading the scene … ${k + 1} of ${head.tiles.length} tiles`;
-    view.dirty = true;
-    const waited = performance.now();
-    await new Promise((done) => {
-      requestAnimationFrame(() => requestAnimationFrame(done));
-      setTimeout(done, 3000); // hidden pages get no animation frames
-    });
-    shown = performance.now();
-    pause = Math.max(250, 8 * (shown - waited)); // on a slow card, loading takes precedence over drawing
-  }
+  await load(view);
   $("message").hidden = true;
   if (window.innerWidth <= 640) $("controls").open = false;
 
@@ -51,7 +29,9 @@ async function start() {
     click: (x, y) => click(view, x, y),
     select: (text) => find(view, text),
     color: (mode) => color(view, mode),
-    camera, attributes: view.attributes, boxes, head,
+    camera, attributes: view.attributes, boxes: view.boxes, head, settled: () => view.settled(),
+    first: view.first, bytes: () => view.bytes,
+    tiles: () => renderer.tiles.map(({ number, told }) => [number, told.ends[told.ends.length - 1]]),
     redraw: () => { view.dirty = true; },
     lonLat: (x, y) => toLonLat(head.lonlat, x, y),
     benchmark: (frames) => {
@@ -67,12 +47,34 @@ async function start() {
   document.documentElement.dataset.ready = "yes";
 }
 
-/** Draw whenever something has changed. */
+/** Put a tile or a node, as its file has it, on the graphics card. */
+function admit({ shapes, renderer, used }, told, buffer) {
+  const tile = readTile(told, buffer);
+  for (const part of [tile, ...new Set(told.runs.map((run) => shapes[run[1]]))]) {
+    part.material.forEach((code) => used.material.add(code));
+    part.klass.forEach((code) => used.class.add(code));
+  }
+  return renderer.add(told, tile);
+}
+
+/** What is known of the features, from its compressed bytes. */
+async function learn(view, attributes, boxes) {
+  view.attributes = new Attributes(JSON.parse(new TextDecoder().decode(await inflated(attributes))));
+  view.boxes = new Boxes(view.head.features, await inflated(boxes));
+}
+
+/** Draw whenever something has changed; what is `fresh` from loading, a few times a second. */
 function loop(view) {
-  const step = () => {
-    if (view.dirty) {
-      view.dirty = false;
+  let drawn = 0, pause = 250, timed = true;
+  const step = (now) => {
+    if (!timed) pause = Math.max(250, 4 * (now - drawn)); // on a slow card, loading takes precedence over drawing
+    timed = true;
+    if (view.dirty || (view.fresh && now - drawn > pause)) {
+      view.dirty = view.fresh = timed = false;
+      drawn = now;
+      view.wanted();
       view.renderer.render(view.camera);
+      if (view.renderer.tiles.length) view.first ??= performance.now();
       footer(view);
     }
     if (view.cursor) {
@@ -107,7 +109,7 @@ function cursorText({ head, renderer, camera }, [x, y]) {
   $("cursor").textContent = `${lat.toFixed(7)}, ${wrapped(lon).toFixed(7)} (lat, lon)   x ${px}  y ${py}  z ${pz} m`;
   const within = Math.max(head.lonlat.error, 1e-4);
   $("cursor").title = `Latitude and longitude within ${within.toPrecision(2)} m of the projection's (${head.frame}); `
-    + `positions to ${(Math.max(...head.tiles.map((t) => t.step)) * 500).toFixed(1)} mm an axis; z is ${head.vertical}`;
+    + `positions to ${(head.step * 500).toFixed(1)} mm an axis; z is ${head.vertical}`;
 }
 
 /** Select what lies under a point of the canvas; nothing over the sky. */

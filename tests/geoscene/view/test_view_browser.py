@@ -391,3 +391,110 @@ def test_a_browser_without_decompression_gets_a_message(window, page, tmp_path):
     (tmp_path / "old.html").write_text(text, "utf-8")
     with pytest.raises(AssertionError, match="too old"):
         window.open(tmp_path / "old.html")
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """A scene of small tiles as one file, and as a folder."""
+    folder = tmp_path_factory.mktemp("pages")
+    osm = read_osm(demo_path(), bounds=BOX)
+    scene = build(osm, folder / "scene", options=BuildOptions(name="small tiles", tile_size=50.0))
+    view_scene(scene, folder / "page.html")
+    view_scene(scene, folder / "a page")
+    return folder / "page.html", folder / "a page"
+
+
+def at_rest(window):
+    """The picture when everything that the view wants is loaded and drawn."""
+    window.wait("return geoscene.settled()")
+    return picture(window)
+
+
+def nodes_asked(window):
+    """Numbers of the nodes that the page has asked for."""
+    return {int(url.split("/")[-1][:-3]) for url in window.requests() if "/nodes/" in url}
+
+
+NEAR = "#view=0,0,5,80,0,60&shadows=0"
+
+
+def test_a_folder_shows_the_same_near_view_as_a_file_from_parts_of_the_scene(window, pages):
+    file, folder = pages
+    window.open(file, NEAR)
+    whole = at_rest(window)
+    window.complaints(), window.requests()
+    window.open(folder / "index.html", NEAR)
+    assert np.array_equal(at_rest(window), whole)
+    assert [text for text in window.complaints() if SLOW not in text] == []
+    entries = window.js("return geoscene.tiles().map(([number]) => geoscene.head.nodes[number][6])")
+    assert 0.0 in entries
+    assert max(entries) > 0.0  # far away it is coarse
+    asked = nodes_asked(window)
+    assert len(asked) < len(window.js("return geoscene.head.nodes"))
+
+
+def test_a_folder_looks_from_afar_as_the_file_with_fewer_triangles(window, pages):
+    file, folder = pages
+    far = "#view=0,0,5,900,-28,43&shadows=0"
+    window.open(file, far)
+    whole, faces = at_rest(window), sum(n for _, n in window.js("return geoscene.tiles()"))
+    window.open(folder / "index.html", far)
+    coarse = at_rest(window)
+    assert sum(n for _, n in window.js("return geoscene.tiles()")) < 0.8 * faces
+    assert window.js("return geoscene.tiles().length === geoscene.head.roots.length")
+    assert np.abs(coarse - whole).mean() < 3
+    assert (np.abs(coarse - whole).max(axis=2) > 60).mean() < 0.02
+
+
+def test_search_in_a_folder_finds_what_is_not_loaded_and_goes_there(window, pages):
+    _, folder = pages
+    window.open(folder / "index.html", "#view=0,0,5,900,-28,43")
+    at_rest(window)
+    window.requests()
+    way = window.js(
+        "const table = geoscene.attributes.tables.find((t) => t.layer === 'buildings');"
+        "return geoscene.attributes.ids(table.feature[0])[0]"
+    )
+    assert window.js("return geoscene.select(arguments[0])", way)
+    feature = int(window.js("return document.getElementById('panel').dataset.feature"))
+    target = window.js("return geoscene.camera.target")
+    assert np.allclose(target, window.js("return geoscene.boxes.middle(arguments[0])", feature), atol=1e-6)
+    window.js("const c = geoscene.camera; c.distance = 60; c.tilt = 1.5; geoscene.redraw();")
+    at_rest(window)
+    assert nodes_asked(window)
+    hit = window.js(
+        "return geoscene.click(innerWidth / 2, document.getElementById('canvas').clientHeight / 2)"
+    )
+    assert hit["feature"] == feature
+    assert way in window.text("panel")
+
+
+def test_a_folder_gives_up_what_is_not_needed_and_loads_it_again(window, pages, tmp_path):
+    _, folder = pages
+    window.open(folder / "index.html", NEAR)
+    first = at_rest(window)
+    small = tmp_path / "small"
+    small.mkdir()
+    for name in ("nodes", "attributes.js"):
+        (small / name).symlink_to(folder / name)
+    text = (folder / "index.html").read_text("utf-8")
+    assert text.count("MOST_BYTES = 768e6") == 1
+    (small / "index.html").write_text(text.replace("MOST_BYTES = 768e6", "MOST_BYTES = 1e6"), "utf-8")
+    window.open(small / "index.html", NEAR)
+    at_rest(window)
+    near = window.js("return geoscene.bytes()")
+    window.requests()
+    window.js("location.hash = '#view=0,0,5,5000,-28,43&shadows=0'")
+    at_rest(window)
+    assert window.js("return geoscene.bytes()") < near
+    window.js("location.hash = arguments[0]", NEAR)
+    assert np.array_equal(at_rest(window), first)
+    assert nodes_asked(window)
+
+
+def test_a_folder_that_lacks_a_file_says_so(window, pages, tmp_path):
+    _, folder = pages
+    (tmp_path / "nodes").mkdir()
+    (tmp_path / "index.html").write_bytes((folder / "index.html").read_bytes())
+    with pytest.raises(AssertionError, match="cannot be loaded; keep the folder of the page whole"):
+        window.open(tmp_path / "index.html")

@@ -1,0 +1,94 @@
+"""Coarser copies of parts of a scene, for views from far away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from geoscene.mesh import FLOOR, Instances, Mesh
+from geoscene.splitmix import uniform_at
+from geoscene.typing import Bools, Float
+
+_ON_EDGE = 1e-6
+"""Metres within which a vertex lies on a side of a box."""
+
+_THINNEST = 0.5
+"""Instances whose second-largest side is a smaller share of a cell are left out."""
+
+
+def coarser_mesh(mesh: Mesh, *, cell: float, box: Sequence[float]) -> Mesh:
+    """The mesh with one vertex per cube of side ``cell``, without the faces that lose their area by it.
+
+    Vertices move by at most the diagonal of a cell, to the vertex nearest to the middle of their cell (vertex
+    clustering; Rossignac and Borrel 1993). Those of solids and of surfaces are apart, and so are those on the
+    sides of ``box`` (xmin, ymin, xmax, ymax): surfaces of neighbouring boxes keep their common edges without
+    gaps. Undersides of solids are left out.
+    """
+    faces = mesh.faces[~(mesh.closed & (mesh.surface & 3 == FLOOR))]
+    rows = np.flatnonzero(~(mesh.closed & (mesh.surface & 3 == FLOOR)))
+    ground = np.zeros(len(mesh.vertices), np.bool_)
+    ground[faces[~mesh.closed[rows]]] = True
+    keep = _nearest(mesh.vertices, cell=cell, apart=_apart(mesh.vertices, ground, box=box))
+    faces = keep[faces]
+    a, b, c = faces.T
+    whole = (a != b) & (b != c) & (c != a)
+    faces, rows = faces[whole], rows[whole]
+    turned = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    _, first = np.unique(turned, axis=0, return_index=True)
+    first.sort()
+    kept = mesh.take(rows[first])
+    used, number = np.unique(turned[first], return_inverse=True)
+    return Mesh(
+        mesh.vertices[used],
+        number.reshape(-1, 3).astype(np.int32),
+        kept.feature,
+        kept.klass,
+        kept.material,
+        kept.surface,
+        kept.color,
+        kept.closed,
+    )
+
+
+def _apart(points: Float, ground: Bools, *, box: Sequence[float]) -> Float:
+    """Number (n,) of a vertex's kind: of a solid, or of the ground, inside or on which sides of the box."""
+    xmin, ymin, xmax, ymax = box
+    on_x, on_y = (
+        np.minimum(np.abs(points[:, axis] - low), np.abs(points[:, axis] - high)) < _ON_EDGE
+        for axis, low, high in ((0, xmin, xmax), (1, ymin, ymax))
+    )
+    return np.where(ground, 1 + on_x + 2 * on_y, 0).astype(float)
+
+
+def _nearest(points: Float, *, cell: float, apart: Float) -> np.ndarray:
+    """Of each point (n,) the row of the one that stands for its cell and kind."""
+    place = np.floor(points / cell)
+    away = np.square(points - (place + 0.5) * cell).sum(axis=1)
+    columns = (*points.T, away, *place.T, apart)
+    order = np.lexsort(columns)
+    keys = np.column_stack([*place.T, apart])[order]
+    new = (
+        np.concatenate([[True], (keys[1:] != keys[:-1]).any(axis=1)]) if len(keys) else np.empty(0, np.bool_)
+    )
+    out = np.empty(len(points), np.int64)
+    out[order] = order[np.flatnonzero(new)][np.cumsum(new) - 1]
+    return out
+
+
+def fewer_instances(copies: Instances, sizes: Float, *, cell: float, share: float, seed: int) -> Instances:
+    """A share of the instances that are at least half a cell thick, widened so that they cover as much.
+
+    Which are kept depends on their places and the seed alone.
+
+    sizes : (s, 3) metres, sides of the shapes
+    """
+    scale = np.sqrt(np.square(copies.transform[:, :, :3]).sum(axis=1))  # (k, 3) of the shape's axes
+    wide = 1.0 / np.sqrt(share)
+    sides = scale * sizes[copies.shape] * np.array([wide, wide, 1.0])
+    place = np.rint(copies.transform[:, :2, 3] * 100).astype(np.int64)
+    drawn = uniform_at(place[:, 0], place[:, 1], count=1, seed=seed)[0]
+    kept = copies.take((np.sort(sides, axis=1)[:, 1] >= _THINNEST * cell) & (drawn < share))
+    matrix = kept.transform.copy()
+    matrix[:, :, :2] *= wide
+    return Instances(kept.shape, matrix, kept.feature)

@@ -1,0 +1,127 @@
+"""A folder with a page that loads parts of a scene as they come into view, coarse from afar."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.export.files import compact_json
+from geoscene.files import write_atomically
+from geoscene.mesh import Instances, concatenate
+from geoscene.progress import Progress
+from geoscene.scene.tile_files import Tile
+from geoscene.typing import Float, Ints
+from geoscene.view.coarse import coarser_mesh, fewer_instances
+from geoscene.view.contents import Contents
+
+NAMES = r"index\.html|attributes\.js|nodes/\d+\.js"
+"""Paths of the files of a page's folder, a regular expression."""
+
+MARK = "attributes.js"
+"""A file that marks the folder of a page."""
+
+_FACTOR = 4
+"""Tiles, and then nodes, along a side of a node of the next coarser level."""
+
+_CELL = 1 / 125
+"""Side of the cells of the first coarser level as a share of the side of a tile: 2 m of 250 m."""
+
+_SHARES = (1 / 3, 1 / 4)
+"""Share of the instances that the first coarser level keeps, and each further one of those before."""
+
+_ROOTS = 4
+"""Nodes of the coarsest level, at most; they are loaded first."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A part of the scene in one file.
+
+    low, high : (3,) whole metres
+    error     : metres by which it may differ from the scene; 0 for a tile
+    children  : numbers of the nodes that replace it from near
+    """
+
+    low: Float
+    high: Float
+    error: float
+    children: tuple[int, ...]
+
+
+class NodeWriter:
+    """Writes the nodes of a tree over tiles, children before their parents.
+
+    A node of level k covers `_FACTOR` ** k tiles along a side and holds all tiles therein, as coarse as its
+    cells. Nodes of level 0 are tiles, whole; so is any node that a single larger tile fills.
+    """
+
+    def __init__(self, folder: Path, contents: Contents, *, tiles: Ints, progress: Progress) -> None:
+        self.nodes: list[Node] = []
+        self.step = 0.0
+        self._folder, self._contents, self._progress = folder / "nodes", contents, progress
+        self._tiles, self._corner = tiles, tiles[:, :2].min(axis=0)
+        self._sizes = np.array([np.ptp(mesh.vertices, axis=0) for mesh in contents.shapes]).reshape(-1, 3)
+        self._folder.mkdir()
+
+    def roots(self) -> list[int]:
+        """Write all nodes; returns the numbers of the coarsest ones."""
+        level = 1
+        while len(self._cells(self._tiles, level)) > _ROOTS:
+            level += 1
+        return [self._node(own, level, cell=cell)[0] for cell, own in self._cells(self._tiles, level).items()]
+
+    def _cells(self, tiles: Ints, level: int) -> dict[tuple[int, int], Ints]:
+        """The tiles of each cell of a level, in order of cells."""
+        places = (tiles[:, :2] - self._corner) // _FACTOR**level
+        cells, of = np.unique(places, axis=0, return_inverse=True)
+        return {(i, j): tiles[of.ravel() == k] for k, (i, j) in enumerate(cells.tolist())}
+
+    def _node(self, tiles: Ints, level: int, *, cell: tuple[int, int]) -> tuple[int, Tile]:
+        """Write the node of all tiles in a cell; returns its number and contents."""
+        if len(tiles) == 1 and tiles[0, 2] >= _FACTOR**level:
+            self._progress("page", len(self._contents.tiles), total=len(self._tiles))
+            tile = self._contents.tile(*tiles[0, :2].tolist())
+            return self._write(tile), tile
+        below = [self._node(own, level - 1, cell=c) for c, own in self._cells(tiles, level - 1).items()]
+        children = tuple(number for number, _ in below)
+        side = _FACTOR**level * self._contents.scene.tile_size
+        low = self._corner * self._contents.scene.tile_size + np.array(cell) * side
+        size = _CELL * self._contents.scene.tile_size * _FACTOR ** (level - 1)
+        mesh = concatenate([tile.mesh.shifted(tile.origin) for _, tile in below])
+        copies = Instances.concatenate([tile.instances.shifted(tile.origin) for _, tile in below])
+        tile = Tile(
+            np.zeros(3),
+            coarser_mesh(mesh, cell=size, box=(*low, *(low + side))),
+            fewer_instances(copies, self._sizes, cell=size, share=_SHARES[min(level, 2) - 1], seed=level),
+        )
+        return self._write(tile, error=size, children=children), tile
+
+    def _write(self, tile: Tile, *, error: float = 0.0, children: tuple[int, ...] = ()) -> int:
+        number = len(self.nodes)
+        told, data = self._contents.pack(tile)
+        text = f'geosceneNode({number},{compact_json(told).decode()},"{b64encode(data).decode()}");\n'
+        write_atomically(self._folder / f"{number}.js", text.encode())
+        below = [self.nodes[k] for k in children]
+        low, high = (np.array([told[name], *(getattr(n, name) for n in below)]) for name in ("low", "high"))
+        self.nodes.append(Node(low.min(axis=0), high.max(axis=0), error, children))
+        self.step = max(self.step, told["step"])
+        return number
+
+
+def write_streamed(contents: Contents, tiles: Ints, *, folder: Path, progress: Progress) -> dict[str, Any]:
+    """Write the nodes and attributes of a page into an empty folder; returns the header's part about them."""
+    writer = NodeWriter(folder, contents, tiles=tiles, progress=progress)
+    roots = writer.roots()
+    texts = ",".join(f'"{b64encode(data).decode()}"' for data in (contents.attributes(), contents.boxes()))
+    write_atomically(folder / MARK, f"geosceneAttributes({texts});\n".encode())
+    return {
+        "step": writer.step,
+        "roots": roots,
+        "nodes": [
+            [*(int(v) for v in (*node.low, *node.high)), node.error, *node.children] for node in writer.nodes
+        ],
+    }
