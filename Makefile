@@ -1,7 +1,7 @@
 # make demo        build the bundled real scene, drive it, write pictures and point clouds
 # make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
 # make test-fast   the tests outside the modules that build scenes, record drives or compile kernels
-# make fuzz        property tests with fresh random seeds and ten times the examples
+# make fuzz        property tests with fresh random seeds and ten times the examples; 20,000 damaged files
 # make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
 # make bench-quick the same on a part of the demo, about a minute
 # make lint        style, types, layer contract
@@ -33,6 +33,7 @@ test-fast: $(STAMP)
 
 fuzz: $(STAMP)
 	$(PYTEST) --hypothesis-profile=fuzz -m hypothesis
+	PYTHONPATH=benchmarks $(BIN)/python benchmarks/robustness.py --count 20000 --reading 0.97 --seed "$$(date +%s)"
 
 bench: $(STAMP)
 	PYTHONPATH=benchmarks $(BIN)/python -m bench $(ARGS)

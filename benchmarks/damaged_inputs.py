@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import random
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import forked
 from mutations import WORDS
 
 from lidar.dataset.export import EXPORTERS
+from lidar.dataset.formats import FORMATS
 
 Words = list[str]
 Line = list[tuple[float, float]]
@@ -84,6 +85,51 @@ seed = 5
 """
 
 
+_SWEEP = """[drive]
+duration = 0.1
+rig = "{0}/rig0.toml"
+route = "random"
+[grid]
+scene = ["{0}/scene"]
+seed = [1, 2]
+format = ["pcd", "laz"]
+"""
+_REDTEAM = """[drive]
+duration = 0.1
+rig = "{0}/rig0.toml"
+route = "random"
+[grid]
+scene = ["{0}/scene"]
+seed = [1]
+[[attack]]
+name = "wall"
+attack = "inject:shape=wall"
+goal = "forge"
+[defences]
+use = ["shadow", "temporal"]
+[measure]
+score = 0.3
+false_alarms = 0.05
+block = 0.5
+detector = ["rules"]
+"""
+_WEATHER = """[[weather]]
+kind = "rain"
+amount = "10mm/h"
+start = 1.0
+end = 8.0
+centre = [24.944, 60.167]
+radius = 200.0
+[[weather]]
+kind = "fog"
+amount = "200m"
+amount_to = "50m"
+start = 0.0
+end = 5.0
+polygon = [[24.9, 60.1], [25.0, 60.1], [25.0, 60.2]]
+"""
+
+
 @dataclass(frozen=True)
 class Inputs:
     """Valid inputs in a folder, made once; workers damage copies."""
@@ -96,14 +142,14 @@ class Inputs:
         _write_maps(self.folder)
         _run("geoscene", "build", "--osm", self.folder / "a.osm", "-o", self.folder / "scene", "--workers=1")
         _write_configurations(self.folder)
-        for name, labels in _DATASETS.items():
+        for name, more in _DATASETS.items():
             _run(
                 *self.drive(f"data-{name}"),
-                f"--format={name}",
-                *labels,
+                *more,
                 "--traffic=on",
                 f"--rig={self.folder}/rig0.toml",
             )
+        _write_derived(self.folder)
 
     def drive(self, out: str) -> Words:
         """A short drive through the scene."""
@@ -150,30 +196,64 @@ class Inputs:
     def damaged_dataset(self, rng: random.Random) -> Case:
         """A file of a dataset, and a command that reads it."""
         f = self.folder
-        kind = rng.randrange(20)
+        kind = rng.randrange(30)
+        if kind >= 26:
+            return self._damaged_folder(rng)
         name = rng.choice([name for name in _DATASETS if kind >= 16 or name not in ("kitti", "nuscenes")])
         data = f / f"data-{name}"
         files = [path for path in sorted(data.rglob("*")) if path.is_file()]
         path = rng.choice(
-            [file for file in files if file.parent in (data, data / "top" / name) or rng.random() < 0.3]
+            [f for f in files if f.parent == data or f.parent.name in FORMATS or rng.random() < 0.3]
         )
         if kind < 6:
             end = rng.choice((".laz", ".ply", ".pcd"))
-            more = rng.choice(([], ["--voxel=0.2"], ["--color=intensity", "--noise"]))
+            more = rng.choice(
+                (
+                    [],
+                    ["--voxel=0.2"],
+                    ["--color=intensity", "--noise"],
+                    ["--raster=dsm", f"--compare={f}/scene"],
+                )
+            )
             return path, ["lidar", "map", str(data), "-o", f"{f}/m{end}", "--overwrite", *more]
         if kind < 16:
             to = rng.choice(list(EXPORTERS))
             return path, ["lidar", "convert", str(data), "--to", to, "-o", f"{f}/to-{to}", "--overwrite"]
         if kind < 17:
             rig = ["--rig", f"{f}/rig0.toml", "--traffic=on"]
-            return path, [*self.drive(data.name), f"--format={name}", *_DATASETS[name], *rig]
+            return path, [*self.drive(data.name), *_DATASETS[name], *rig]
         if kind < 18:
             path = data / rng.choice(("poses.csv", "trajectory.csv", "dataset.json"))
             route = data / "trajectory.csv" if path.suffix == ".json" else path
             words = [word for word in self.drive("out") if word != "--route=random"]
             return path, [*words, "--overwrite", f"--rig={f}/rig0.toml", "--route", str(route)]
         stage = rng.choice(("dropped_packets", "cover_glass", "lost_rows"))
-        return path, ["lidar", "apply", str(data), "--stage", stage, "-o", f"{f}/applied", "--overwrite"]
+        again = rng.choice(
+            (
+                ["apply", str(data), "--stage", stage, "-o", f"{f}/applied", "--overwrite"],
+                ["info", str(data)],
+                ["info", str(data), "--full"],
+                ["verify", str(data)],
+                ["view", str(data), "-o", f"{f}/play.html", "--overwrite"],
+                ["denoise", str(data), "--method=dror", "-o", f"{f}/clean", "--overwrite"],
+                ["sign", str(data), "--chain", f"{f}/key", "-o", f"{f}/signed", "--overwrite"],
+            )
+        )
+        return path, ["lidar", *again]
+
+    def _damaged_folder(self, rng: random.Random) -> Case:
+        """A file of signed data, or of a folder in the layout of KITTI or nuScenes, and a command on them."""
+        f = self.folder
+        data = f / rng.choice(("signed-data", "to-kitti", "to-nuscenes"))
+        path = rng.choice([path for path in sorted(data.rglob("*")) if path.is_file()])
+        keys = [f"--chain={f}/key", f"--watermark={f}/key"] if data.name == "signed-data" else []
+        commands = (
+            ["verify", str(data), *keys],
+            ["info", str(data), "--full"],
+            ["apply", str(data), "--stage", "dropped_packets", "-o", f"{f}/applied", "--overwrite"],
+            ["denoise", str(data), "--method=dror"],
+        )
+        return path, ["lidar", *rng.choice(commands)]
 
     def damaged_configuration(self, rng: random.Random) -> Case:
         """A rig, sensor, vehicle, stage, route or traffic file, or the words of a command."""
@@ -255,16 +335,14 @@ KINDS: dict[str, Callable[[Inputs, random.Random], Case]] = {
 _MAPS = {"a.osm": 10, "a.osm.gz": 1, "a.osm.pbf": 1, "a.json": 2, "a.tif": 1, "a.parquet": 1}
 """Maps with their shares."""
 
-_DATASETS = {
-    "pcd": ["--labels=semantickitti,nuscenes", "--deskew=middle", "--stage=dropped_packets"],
-    "laz": [],
-    "kitti": ["--labels=semantickitti"],
-    "nuscenes": ["--labels=nuscenes"],
-    "ply": ["--set=rays=7"],
-    "csv": [],
-    "pcd-ascii": ["--fidelity=survey"],
+_DATASETS: dict[str, Words] = {
+    "pcd": ["--format=pcd", "--labels=semantickitti,nuscenes", "--deskew=middle", "--stage=dropped_packets"],
+    "kitti": ["--format=kitti", "--labels=semantickitti"],
+    "nuscenes": ["--format=nuscenes", "--labels=nuscenes"],
+    "ply": ["--format=ply", "--set=rays=7"],
+    "others": [f"--format={','.join(FORMATS.keys() - {'pcd', 'kitti', 'nuscenes', 'ply'})}"],
 }
-"""Formats of the datasets, with more options of their drives."""
+"""Options of the drives of the datasets."""
 
 _SENSORS = 1 + len(list(_RIG_FOLDER.glob("sensors/*.toml")))
 """Number of rigs: one with cameras, and one for each built-in scanner."""
@@ -347,8 +425,9 @@ _EXPORT = {
 
 
 def _run(*words: object) -> None:
-    command = [sys.executable, "-m", f"{words[0]}.cli", *map(str, words[1:])]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    ended = forked.run(words, within=Path())
+    if ended.code:
+        raise SystemExit(f"{words}: {ended.errors}")
 
 
 def _degrees(x: float, y: float) -> tuple[float, float]:
@@ -465,6 +544,36 @@ def _write_overture(path: Path) -> None:
     pq.write_table(
         pa.table(columns).replace_schema_metadata({"geo": json.dumps(geo)}), path, compression="none"
     )
+
+
+def _write_derived(folder: Path) -> None:
+    """Data that are made of others, and files that only some commands read."""
+    data = folder / "data-pcd"
+    (folder / "key").write_text("5f" * 32)
+    keys = f"--chain={folder}/key", f"--watermark={folder}/key"
+    _run("lidar", "sign", folder / "data-ply", *keys, "-o", folder / "signed-data")
+    for name in ("kitti", "nuscenes"):
+        _run("lidar", "convert", data, "--to", name, "-o", folder / f"to-{name}")
+    for end in ("laz", "las", "copc.laz", "ply", "pcd", "e57"):
+        _run("lidar", "map", data, "-o", folder / f"map.{end}")
+    for end in ("obj", "ply", "stl"):
+        shutil.copy(_mesh(folder, end), folder / f"mesh.{end}")
+    shutil.copy(data / "front" / "rgb" / "000000.png", folder / "patch.png")
+    (folder / "sweep.toml").write_text(_SWEEP.format(folder))
+    (folder / "redteam.toml").write_text(_REDTEAM.format(folder))
+    (folder / "weather.toml").write_text(_WEATHER)
+    (folder / "fcd.xml.gz").write_bytes(gzip.compress((folder / "fcd.xml").read_bytes(), 1))
+    inside = Path(__file__).resolve().parents[1] / "lidar"
+    shutil.copy(inside / "defences" / "calibration.toml", folder / "calibration.toml")
+    shutil.copy(next((inside / "detection").glob("*.npz")), folder / "model.npz")
+
+
+def _mesh(folder: Path, end: str) -> Path:
+    import trimesh  # noqa: PLC0415
+
+    path = folder / f"box.{end}"
+    trimesh.creation.box().export(path)
+    return path
 
 
 def _write_configurations(folder: Path) -> None:

@@ -56,6 +56,8 @@ def run(
     die_at: int = 0,
     interruption: tuple[float, signal.Signals] | None = None,
     before: Callable[[], Any] | None = None,
+    after: Callable[[], Any] | None = None,
+    at_change: Callable[[], Any] | None = None,
     limit_s: float = 300.0,
 ) -> Ended:
     """Run a command or a function in a forked process.
@@ -64,19 +66,23 @@ def run(
     die_at       : number, from 1, of the change before which the process kills itself; 0 for none
     interruption : seconds after which it gets a signal, SIGINT with all of its process group
     before       : called in the process before the command
+    after        : called in the process after the command
+    at_change    : called at the change ``die_at`` instead of killing the process
     """
     shared = mmap.mmap(-1, 8)
     with tempfile.TemporaryFile() as errors:
         child = os.fork()
         if child == 0:
-            _become(work, shared, errors=errors.fileno(), within=within, die_at=die_at, before=before)
+            hook = _counter(shared, f"{within}{os.sep}", die_at, then=at_change or _die)
+            _become(work, errors=errors.fileno(), hook=hook, before=before, after=after)
         started = time.monotonic()
         code = None
         if interruption is not None:
             after, number = interruption
             code = _wait(child, after)
             if code is None:
-                (os.killpg if number == signal.SIGINT else os.kill)(child, number)
+                whole_group = number == signal.SIGINT and os.getpgid(child) == child
+                (os.killpg if whole_group else os.kill)(child, number)
                 started = time.monotonic()
         if code is None:
             code = _wait(child, limit_s)
@@ -103,12 +109,11 @@ def _wait(child: int, seconds: float) -> int | None:
 
 def _become(
     work: Work,
-    shared: mmap.mmap,
     *,
     errors: int,
-    within: Path,
-    die_at: int,
+    hook: _Hook,
     before: Callable[[], Any] | None,
+    after: Callable[[], Any] | None,
 ) -> NoReturn:
     """Be the process of the work."""
     code = 70
@@ -124,7 +129,7 @@ def _become(
             main = importlib.import_module(f"{work[0]}.cli").main
         if before is not None:
             before()
-        sys.addaudithook(_counter(shared, f"{within}{os.sep}", die_at))
+        sys.addaudithook(hook)
         main()
         code = 0
     except SystemExit as end:
@@ -132,12 +137,21 @@ def _become(
     except BaseException:  # noqa: BLE001 - what a process would end with
         traceback.print_exc()
     finally:
+        if after is not None:
+            after()
         sys.stderr.flush()
         os._exit(code)
 
 
-def _counter(shared: mmap.mmap, within: str, die_at: int) -> Callable[[str, tuple[Any, ...]], None]:
-    """An audit hook that counts changes of files in a folder, and ends the process before one of them."""
+def _die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+_Hook = Callable[[str, tuple[Any, ...]], None]
+
+
+def _counter(shared: mmap.mmap, within: str, number: int, *, then: Callable[[], Any]) -> _Hook:
+    """An audit hook that counts changes of files in a folder, and does something before one of them."""
     me, count = os.getpid(), 0
 
     def hook(event: str, details: tuple[Any, ...]) -> None:
@@ -150,7 +164,7 @@ def _counter(shared: mmap.mmap, within: str, die_at: int) -> Callable[[str, tupl
         if os.getpid() == me and str(details[0]).startswith(within):
             count += 1
             shared[:8] = struct.pack("q", count)
-            if count == die_at:
-                os.kill(me, signal.SIGKILL)
+            if count == number:
+                then()
 
     return hook

@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 import gzip
 import io
+import itertools
 import json
 import random
 import re
 import sqlite3
+import struct
 import xml.etree.ElementTree as ET
 import zipfile
 from contextlib import closing, suppress
@@ -41,7 +43,19 @@ WORDS = (
     *NUMBERS,
     *("yes", "no", ";", ";;", ":", "null", "None", "[]", "{}", "", " ", "é", "\ufffd", "🏠", "\x01", "1;2"),
     *("1,5", "1'", "10ft", "--", "a=b", "true", "Infinity", "random", "../x", "/", ".", "x" * 300),
-    *("<", "&", '"', "\n", "%s"),
+    *(
+        "<",
+        "&",
+        '"',
+        "\n",
+        "%s",
+        "\x00",
+        "../../../outside",
+        "/outside",
+        "a/../../../outside",
+        "~",
+    ),
+    *("[" * 3000, "{" * 3000, "9" * 5000),
 )
 
 TAGS = {
@@ -100,15 +114,33 @@ TAGS = {
 
 
 def mutate(path: Path, rng: random.Random) -> None:
-    """Damage a file: one to four changes, half of them to its structure where this is known."""
+    """Damage a file: one to four changes, half of them to its structure where this is known.
+
+    One in a hundred is a link or a folder instead, or is missing.
+    """
+    if rng.random() < 0.01:
+        _replace(path, rng)
+        return
     data = path.read_bytes()
     suffix = path.suffix.lower()
     if suffix == ".gz":
         whole = gzip.decompress(data)
         inner = _damaged(whole, Path(path.stem).suffix, rng)
+        if rng.random() < 0.02:
+            inner += bytes(2**28)  # 256 MiB in 1 MiB
         path.write_bytes(gzip.compress(inner, 1) if rng.random() < 0.8 else _of_bytes(data, rng))
     else:
         path.write_bytes(_damaged(data, suffix, rng))
+
+
+def _replace(path: Path, rng: random.Random) -> None:
+    """Put something else at the place of a file, or nothing."""
+    path.unlink()
+    kind = rng.randrange(5)
+    if kind == 0:
+        path.mkdir()
+    elif kind < 4:
+        path.symlink_to((path, path.parent, path.with_name("absent"))[kind - 1])
 
 
 def _damaged(data: bytes, suffix: str, rng: random.Random) -> bytes:
@@ -148,9 +180,13 @@ def _of_bytes(data: bytes, rng: random.Random) -> bytes:
     at, size = rng.randrange(len(data) + 1), rng.randint(1, 64)
     if rng.random() < 0.3:
         at = min(at, rng.randrange(1024))  # headers
-    kind = rng.randrange(8)
+    kind = rng.randrange(11)
     if kind == 7:
         return data.decode("latin-1").encode(rng.choice(("utf-16", "utf-8-sig", "cp037")), "replace")
+    if kind > 7:  # a number of a header
+        number = rng.choice((-1, 0, 1, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, 2**64 - 1)) % 2**64
+        number = struct.pack("<Q", number)[: rng.choice((2, 4, 8))]
+        return data[:at] + number + data[at + len(number) :]
     return (
         data[:at],
         data[:at] + rng.randbytes(size) + data[at:],
@@ -175,6 +211,8 @@ def _value(old: str, rng: random.Random) -> str:
 
 
 def _of_xml(data: bytes, rng: random.Random) -> bytes:
+    if rng.random() < 0.02:
+        return _with_entities(data)
     root = ET.fromstring(data)  # noqa: S314 - of the benchmark's own file
     parents = {child: parent for parent in root.iter() for child in parent}
     for _ in range(rng.randint(1, 4)):
@@ -214,6 +252,17 @@ def _of_xml(data: bytes, rng: random.Random) -> bytes:
     return ET.tostring(root)
 
 
+def _with_entities(data: bytes) -> bytes:
+    """The document with entities that expand to 10^9 letters, the last of them in an attribute and a text."""
+    names = "abcdefghij"
+    rows = [f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in itertools.pairwise(names)]
+    kinds = f'<!DOCTYPE x [<!ENTITY a "x">{"".join(rows)}]>'
+    start, _, rest = data.decode().rpartition("?>")
+    tag, end, more = rest.partition(">")
+    text = f'{start}{"?>" * bool(start)}{kinds}{tag}{end}<tag k="&j;" v="1">&j;</tag>{more}'
+    return text.encode()
+
+
 def _of_json(data: bytes, rng: random.Random) -> bytes:
     document = json.loads(data)
     for _ in range(rng.randint(1, 3)):
@@ -232,6 +281,9 @@ def _other_json(value: Any, rng: random.Random) -> Any:
             return {k: v for k, v in value.items() if k != key}
         if kind < 0.15:
             return value | {rng.choice(list(value)): value[key]}
+        if kind < 0.2:
+            other = rng.choice(("../outside", "../../outside", "/outside", "a/b", "..", "", ".", "x" * 300))
+            return {other if k == key else k: v for k, v in value.items()}
         return value | {key: _other_json(value[key], rng)}
     if isinstance(value, list) and value and rng.random() < 0.9:
         at, kind = rng.randrange(len(value)), rng.random()
@@ -251,6 +303,8 @@ def _of_arrays(data: bytes, rng: random.Random) -> bytes:
     """Another value, type or shape of a member of an .npz file."""
     with np.load(io.BytesIO(data)) as file:
         arrays = dict(file)
+    if rng.random() < 0.1:
+        return _of_many_numbers(arrays, rng)
     for _ in range(rng.randint(1, 2)):
         name = rng.choice(list(arrays))
         array, kind = arrays[name], rng.randrange(7)
@@ -277,6 +331,26 @@ def _of_arrays(data: bytes, rng: random.Random) -> bytes:
             buffer = io.BytesIO()
             np.save(buffer, array, allow_pickle=array.dtype == object)
             file.writestr(f"{name}.npy", buffer.getvalue())
+    return out.getvalue()
+
+
+def _of_many_numbers(arrays: dict[str, Any], rng: random.Random) -> bytes:
+    """An .npz file with a member that holds, or only states that it holds, far more numbers."""
+    out, victim = io.BytesIO(), rng.choice(list(arrays))
+    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, array in arrays.items():
+            buffer = io.BytesIO()
+            np.save(buffer, array, allow_pickle=False)
+            member = buffer.getvalue()
+            if name == victim and rng.random() < 0.5:
+                member = re.sub(
+                    rb"'shape': \((\d*)", rb"'shape': (%d" % rng.choice((10**9, 10**12, 10**18)), member
+                )
+            elif name == victim:
+                buffer = io.BytesIO()
+                np.save(buffer, np.zeros((2**25, *array.shape[1:]), array.dtype)[: 2**28], allow_pickle=False)
+                member = buffer.getvalue()[: 2**28]
+            file.writestr(f"{name}.npy", member)
     return out.getvalue()
 
 

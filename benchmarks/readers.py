@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from damaged_inputs import PLACE
@@ -14,20 +15,50 @@ from geoscene.scene.geopackage import read_layer
 from geoscene.scene.layout import SceneFiles, open_scene
 from geoscene.scene.tile_files import read_shapes, read_tile
 from geoscene.sources import read_osm, read_source
+from lidar.attacks.images import _picture
+from lidar.attacks.placed_object import _read_mesh
+from lidar.camera.png import read_png
 from lidar.dataset.boxes import read_boxes
-from lidar.dataset.formats import FORMATS, read_table
+from lidar.dataset.checksums import differences, read_checksums
+from lidar.dataset.formats import FORMATS, MAPS, format_of, read_table
+from lidar.dataset.formats.table import rows
+from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset, read_rows, read_sensors
 from lidar.dataset.recorded import cloud_points
+from lidar.dataset.truth_files import read_truth
+from lidar.defences.calibration import read_calibration
+from lidar.detection.forest import read_forest
+from lidar.errors import FormatError
+from lidar.integrity.digest_files import read_digests, read_links
+from lidar.integrity.keys import read_signer
+from lidar.maps.selection import _polygons
 from lidar.planning.replay import read_replay
 from lidar.planning.waypoints import read_track
+from lidar.redteam.plan import read_plan
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.scanner import load_sensor
 from lidar.rig.specs import load_rig, rig_digest
 from lidar.rig.vehicle import load_vehicle
 from lidar.signal.registry import read_stages
+from lidar.sweep.grid import read_grid
 from lidar.traffic.fcd import read_fcd
+from lidar.weather.setting import read_weather
 
 _FRAME = Frame.at(*PLACE)
+
+
+def _cloud(path: Path) -> None:
+    """Read a cloud; its header must state as many points as are read."""
+    form, stated = format_of(path), None
+    with suppress(FormatError):
+        stated = form.count(path)
+    found = rows(cloud_points(path) if form.frame == "sensor" else read_table(path))
+    if stated not in (None, found):
+        raise AssertionError(f"{stated} points stated, {found} read")
+
+
+def _checked(path: Path) -> None:
+    list(differences(path.parent, read_checksums(path)))
 
 
 def _whole_rig(path: Path) -> None:
@@ -63,10 +94,14 @@ _DATASETS: dict[str, Callable[[Path], object]] = {
     "poses.csv": lambda path: read_replay(path, _FRAME),
     "timestamps.csv": read_rows,
     "boxes.csv": lambda path: read_boxes(path, ("frame", "id")),
-    **{
-        f"0*{form.suffix}": cloud_points if form.frame == "sensor" else read_table
-        for form in FORMATS.values()
-    },
+    "frames.csv": read_journal,
+    "checksums.sha256": _checked,
+    "*.digests": read_digests,
+    "integrity/*.csv": read_links,
+    "rgb/*.png": read_png,
+    "depth/*.png": read_png,
+    **{f"0*{s}": _cloud for s in sorted((f.suffix for f in FORMATS.values()), key=len, reverse=True)},
+    **{f"map{form.suffix}": read_table for form in MAPS.values()},
 }
 _CONFIGURATIONS: dict[str, Callable[[Path], object]] = {
     "rig*.toml": _whole_rig,
@@ -77,27 +112,44 @@ _CONFIGURATIONS: dict[str, Callable[[Path], object]] = {
     "a.gpx": lambda path: read_track(path, _FRAME),
     "a.geojson": lambda path: read_track(path, _FRAME),
     "fcd.xml": read_fcd,
+    "fcd.xml.gz": read_fcd,
+    "sweep.toml": read_grid,
+    "redteam.toml": read_plan,
+    "weather.toml": lambda path: read_weather(str(path)),
+    "calibration.toml": read_calibration,
+    "model.npz": read_forest,
+    "key": read_signer,
+    "field.geojson": _polygons,
+    "mesh.*": lambda path: _read_mesh.__wrapped__(str(path)),
+    "patch.png": lambda path: _picture.__wrapped__(str(path)),
 }
 READERS = {"maps": _MAPS, "scenes": _SCENES, "datasets": _DATASETS, "configurations": _CONFIGURATIONS}
 
 
-def reader_of(kind: str, path: Path) -> Callable[[Path], object] | None:
-    """The function that reads a file; None if there is none of its own."""
-    found = (read for pattern, read in READERS[kind].items() if path.match(pattern))
-    return next(found, None) if path.parent.name not in ("boxes", "lidarseg", "deskewed", "truth") else None
+def reader_of(kind: str, path: Path) -> tuple[str, Callable[[Path], object]] | None:
+    """The pattern of a file's name and the function that reads it; None if there is none of its own."""
+    if path.parent.name in ("truth", "before"):
+        return "truth/*.npz", read_truth
+    found = ((pattern, read) for pattern, read in READERS[kind].items() if path.match(pattern))
+    return next(found, None) if path.parent.name not in ("boxes", "lidarseg", "deskewed") else None
 
 
 @functools.cache
-def readable(kind: str, folder: Path) -> list[Path]:
-    """The files of a kind that functions read."""
-    return [path for path in _files(kind, folder) if reader_of(kind, path)]
+def readable(kind: str, folder: Path) -> list[list[Path]]:
+    """The files of a kind that functions read, by function."""
+    found: dict[str, list[Path]] = {}
+    for path in _files(kind, folder):
+        if reader := reader_of(kind, path):
+            found.setdefault(reader[0], []).append(path)
+    return list(found.values())
 
 
 def _files(kind: str, folder: Path) -> Iterator[Path]:
     if kind == "scenes":
         yield from sorted((folder / "scene").rglob("*.*"))
     elif kind == "datasets":
-        for data in sorted(folder.glob("data-*")):
+        for data in (*sorted(folder.glob("data-*")), folder / "signed-data"):
             yield from sorted(data.rglob("*.*"))
+        yield from sorted(folder.glob("map.*"))
     else:
-        yield from sorted(folder.glob("*.*"))
+        yield from sorted(path for path in folder.iterdir() if path.is_file())

@@ -6,7 +6,8 @@
 Each trial damages a small valid input at random (`mutations.py`) and runs a command on it, in a process
 that runs many; a share of them only reads the file by the function for it (`readers.py`). Success or one
 line on standard error is right; a traceback, a crash (signal), an exit code other than 0, 1 and 2, more
-than --seconds or --gigabytes is not. Inputs that went wrong are kept in FOLDER.
+than --seconds or --gigabytes, a change of files outside of the output, and clouds that have other numbers of
+points than their headers state are not. Inputs that went wrong are kept in FOLDER.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ import functools
 import importlib
 import io
 import multiprocessing
+import os
 import random
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -31,6 +34,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import forked
 from bench.measure import restart_peak
 from damaged_inputs import KINDS, Inputs, Words
 from mutations import mutate
@@ -43,7 +47,7 @@ from geoscene.files import digest_of
 from geoscene.memory import peak_memory
 from lidar.errors import InputError, LidarError
 
-_SHARES = {"maps": 1, "scenes": 3, "datasets": 2, "configurations": 8}
+_SHARES = {"maps": 2, "scenes": 3, "datasets": 6, "configurations": 5}
 _USAGE = (InputError, SceneInputError)
 
 
@@ -107,10 +111,10 @@ def _program(name: str) -> _Program:
 
 def reading(kind: str, path: Path) -> str:
     """Read a file by its own function; returns what is wrong, or an empty text."""
-    read = reader_of(kind, path)
+    found = reader_of(kind, path)
     try:
-        if read:
-            read(path)
+        if found:
+            found[1](path)
     except (GeosceneError, LidarError, OSError):
         return ""
     except MemoryError:
@@ -145,8 +149,47 @@ def outcome(words: Words) -> str:
     return "memory: out of memory" if "out of memory" in text else ""
 
 
+class _Watch:
+    """What a process changes outside of the places that the running command may write to."""
+
+    def __init__(self) -> None:
+        self.allowed: tuple[str, ...] | None = None
+        self.outside = ""
+        sys.addaudithook(self._hook)
+
+    def _hook(self, event: str, details: tuple[Any, ...]) -> None:
+        if self.allowed is None or event not in _CHANGES:
+            return
+        if event == "open" and not (isinstance(details[2], int) and details[2] & (os.O_WRONLY | os.O_RDWR)):
+            return
+        for place in details[: 2 if event in ("os.rename", "os.link") else 1]:
+            if not isinstance(place, str | bytes | os.PathLike):
+                continue
+            path = os.path.realpath(os.fsdecode(place))
+            known = "__pycache__" in path or (event in ("open", "os.mkdir") and Path(path).is_dir())
+            by_folder = event != "open" and not Path(os.fsdecode(place)).is_absolute()  # as of shutil.rmtree
+            if not (
+                known or by_folder or path.startswith((*self.allowed, "/dev/null", tempfile.gettempdir()))
+            ):
+                self.outside = f"outside: {event} {path}"
+
+
+_CHANGES = frozenset(("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate"))
+
+
+def _places(words: Words, folder: Path) -> tuple[str, ...]:
+    """Beginnings of the paths that a command may change: output, what is named after it, and cache."""
+    cache = str(folder / "home")
+    if "-o" not in words:
+        return (cache,)
+    out = Path(words[words.index("-o") + 1])
+    return cache, os.path.realpath(out.with_name(out.name.partition(".")[0]))
+
+
 def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
     """Run the trials whose numbers arrive; tells of each what it is and then what was wrong."""
+    os.environ["HOME"], os.environ["XDG_CACHE_HOME"] = str(folder / "home"), str(folder / "home" / "cache")
+    watch = _Watch()
     resource.setrlimit(resource.RLIMIT_AS, (int(6 * options.gigabytes * 2**30),) * 2)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2**31,) * 2)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -158,7 +201,7 @@ def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
         kind, number = link.recv()
         rng = random.Random(f"{options.seed} {kind} {number}")
         if only_read := rng.random() < options.reading:
-            path: Path | None = rng.choice(readable(kind, folder))
+            path: Path | None = rng.choice(rng.choice(readable(kind, folder)))
             words = ["read", str(path)]
         else:
             path, words = KINDS[kind](inputs, rng)
@@ -167,12 +210,23 @@ def _serve(link: Connection, folder: Path, options: argparse.Namespace) -> None:
         if path:
             mutate(path, rng)
         restart_peak()
+        watch.allowed, watch.outside = _places(words, folder), ""
         wrong = reading(kind, path) if only_read and path else outcome(words)
+        watch.allowed, wrong = None, wrong or watch.outside
         peak = peak_memory() / 2**30
         link.send(wrong or (f"memory: {peak:.1f} GB" if peak > options.gigabytes else ""))
         if link.recv() and path:
-            path.parent.mkdir(exist_ok=True)
-            path.write_bytes(valid)
+            _restore(path, valid)
+
+
+def _restore(path: Path, valid: bytes) -> None:
+    """Write the valid contents of a file, whatever is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    elif path.is_symlink():
+        path.unlink()
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(valid)
 
 
 class _Server:
@@ -199,11 +253,11 @@ class _Server:
         except EOFError:
             self.process.join()
             wrong = f"crash: exit code {self.process.exitcode}"
-        bad = trial.path.read_bytes() if wrong and trial and trial.path and trial.path.exists() else b""
+        bad = trial.path.read_bytes() if wrong and trial and trial.path and _is_plain(trial.path) else b""
         if wrong.startswith(("hang", "crash", "memory")):
             self.stop()
             if trial and trial.path:
-                trial.path.write_bytes(trial.valid)
+                _restore(trial.path, trial.valid)
         else:
             self._link.send(True)
         return wrong, trial, bad
@@ -216,10 +270,22 @@ class _Server:
             self.process = None
 
 
+def _is_plain(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _name(kind: str, trial: Trial | None) -> str:
+    """What a trial counts as: a reader of files, or a command."""
+    if trial is None:
+        return kind
+    if trial.words[0] == "read" and trial.path and (found := reader_of(kind, trial.path)):
+        return f"read {found[0]}"
+    return " ".join(trial.words[:2])
+
+
 def run_trials(options: argparse.Namespace, folder: Path) -> Counter[str]:
     """Run the trials; returns the number of each kind, and of those with a fault by kind and fault."""
-    for module in ("geoscene.cli", "lidar.cli", "geoscene.pipeline", "lidar.pipeline", "geoscene.view"):
-        importlib.import_module(module)
+    forked.load()
     inputs = Inputs(folder / "inputs")
     server = _Server(inputs.folder, options)
     counts: Counter[str] = Counter()
@@ -228,15 +294,15 @@ def run_trials(options: argparse.Namespace, folder: Path) -> Counter[str]:
     for number in range(options.first, options.first + options.count):
         kind = random.Random(f"{options.seed} {number}").choices(options.kinds, shares)[0]
         wrong, trial, bad = server.run(kind, number)
-        counts[kind] += 1
+        counts[name := _name(kind, trial)] += 1
         if wrong and trial:
-            counts[f"{kind}: {wrong.partition(':')[0]}"] += 1
+            counts[f"{name}: {wrong.partition(':')[0]}"] += 1
             print(f"{number} {wrong}\n    {trial.path} | {' '.join(trial.words)}", flush=True)
             if options.keep and trial.path:
                 options.keep.mkdir(parents=True, exist_ok=True)
                 (options.keep / f"{number}_{trial.path.name}").write_bytes(bad)
         if (number + 1) % 1000 == 0:
-            print(f"{number + 1}: {dict(counts)}", flush=True)
+            print(f"{number + 1}: {sum(n for name, n in counts.items() if ':' in name)} wrong", flush=True)
         if time.monotonic() > stop:
             break
     server.stop()
@@ -261,8 +327,10 @@ def main() -> int:
     memory = Path("/dev/shm")  # noqa: S108  (files in memory, not at a guessable name)
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
         counts = run_trials(options, Path(folder))
-    wrong = sum(n for name, n in counts.items() if name not in KINDS)
-    print(f"{dict(counts)}: {wrong} wrong")
+    wrong = sum(n for name, n in counts.items() if ":" in name)
+    for name, number in sorted(counts.items()):
+        print(f"{number:7,}  {name}")
+    print(f"{sum(counts.values()) - wrong:,} trials, {wrong} wrong")
     return int(wrong > 0)
 
 

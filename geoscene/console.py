@@ -37,7 +37,11 @@ busily for work, of which the small blocks of sparse matrices give them none."""
 
 _NO_SPACE = "; free some space and run the same command again"
 _PERMISSION = "; give a path that you may write to and files that you may read"
+_NO_DIRECTORY = "; a file is where a directory is needed"
 _HINTS = {
+    errno.EEXIST: _NO_DIRECTORY,
+    errno.ENOTDIR: _NO_DIRECTORY,
+    errno.EISDIR: "; a directory is where a file is needed",
     errno.ENOSPC: _NO_SPACE,
     errno.EDQUOT: _NO_SPACE,
     errno.EACCES: _PERMISSION,

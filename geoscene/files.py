@@ -58,7 +58,7 @@ def naming(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno is not None:
             error.filename = str(path)
         raise
 
@@ -101,10 +101,12 @@ def replaced_folder(path: Path, *, own: Callable[[Path], Callable[[str], bool]])
 
     own : from a folder, which paths relative to it, with slashes, are of its kind
 
-    Raises InputError for the current directory, which cannot be replaced, a folder around it or the root of a
-    disk, and if another process writes the folder.
+    Raises InputError for a file, for the current directory, which cannot be replaced, a folder around it or
+    the root of a disk, and if another process writes the folder.
     """
     place, here = path.resolve(), Path.cwd()
+    if place.exists() and not place.is_dir():
+        raise InputError(f"{path}: is a file; give a directory")
     if place.is_mount() or place in (here, *here.parents):
         kind = "the root of a disk" if place.is_mount() else "the current directory or holds it"
         raise InputError(f"{path}: is {kind} and cannot be replaced; give a directory in it")
@@ -117,7 +119,8 @@ def replaced_folder(path: Path, *, own: Callable[[Path], Callable[[str], bool]])
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir()
         try:
-            yield part
+            with naming(path):
+                yield part
             if place.exists():
                 place.rename(old)
             part.rename(place)

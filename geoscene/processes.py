@@ -154,15 +154,16 @@ def _serve(connection: Connection, work: Callable[[Task], Result]) -> None:
     for interruption in _INTERRUPTIONS:
         signal.signal(interruption, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    while True:
-        task = connection.recv()
-        answer: tuple[Exception | None, Result | None]
-        try:
-            answer = None, work(task)
-        except Exception as error:  # noqa: BLE001  (raised again in the parent process)
-            error.add_note(traceback.format_exc())
-            answer = error, None
-        connection.send(answer)
+    with suppress(EOFError, ConnectionError):  # the parent process has been killed
+        while True:
+            task = connection.recv()
+            answer: tuple[Exception | None, Result | None]
+            try:
+                answer = None, work(task)
+            except Exception as error:  # noqa: BLE001  (raised again in the parent process)
+                error.add_note(traceback.format_exc())
+                answer = error, None
+            connection.send(answer)
 
 
 def _exit_with_parent() -> None:

@@ -178,12 +178,12 @@ class VerifyReport:
         lines = []
         if (sums := self.checksums) is not None:
             lines += [finding.to_text() for finding in sums.findings]
-            found = f"{len(sums.findings)} findings" if sums.findings else "all as written"
+            found = _findings(sums.findings) or "all as written"
             lines.append(f"{name}: checksums of {sums.files:,} files: {found}")
         if (chain := self.chain) is not None:
             lines += [finding.to_text() for finding in chain.findings]
             counts = f"{chain.frames} frames, {chain.files} files"
-            state = f"{len(chain.findings)} findings" if chain.findings else "all as signed"
+            state = _findings(chain.findings) or "all as signed"
             lines.append(f"{name}: hash chain ({chain.algorithm}) of {counts}: {state}")
         if (marks := self.watermark) is not None:
             lines += [finding.to_text() for finding in marks.findings]
@@ -195,6 +195,11 @@ class VerifyReport:
                 f" (by chance {marks.chance:.2g})"
             )
         return lines
+
+
+def _findings(found: tuple[Finding, ...]) -> str:
+    """The number of findings in words; empty without any."""
+    return f"{len(found):,} finding{'s' * (len(found) > 1)}" if found else ""
 
 
 def verify_dataset(

@@ -18,6 +18,7 @@ from geoscene.files import digest, write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.objects.forests import Forests, forest_instances
 from geoscene.typing import Float
+from geoscene.untrusted import read_arrays
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,20 +74,9 @@ def read_tile(path: Path) -> Tile:
     Raises SceneFormatError if the file is missing or damaged.
     """
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
-        arrays = _unpacked(path)
+        arrays = read_arrays(path)
         instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(Instances)}
         return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
-
-
-def _unpacked(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of a file of `pack`; zipfile verifies their checksums before their headers are trusted."""
-    with zipfile.ZipFile(path) as archive:
-        return {
-            name.removesuffix(".npy"): np.lib.format.read_array(
-                BytesIO(archive.read(name)), allow_pickle=False
-            )
-            for name in archive.namelist()
-        }
 
 
 def _mesh(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Mesh:
@@ -118,5 +108,5 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
     if not path.exists():
         return {}
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
-        arrays = _unpacked(path)
+        arrays = read_arrays(path)
         return {str(name): _mesh(arrays, f"{name}/") for name in arrays["names"]}

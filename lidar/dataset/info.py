@@ -167,6 +167,10 @@ def _extent(dataset: Dataset) -> dict[str, Any] | None:
     with reading_file(path), opened_rows(path) as rows:
         places = np.array([(float(r["lon"]), float(r["lat"]), float(r["h"])) for r in rows])
     if not len(places):
+        if dataset.frames:
+            raise DatasetError(
+                f"{path}: has no poses of {dataset.frames} frames; drive again with `overwrite`"
+            )
         return None
     lon = places[:, 0]
     if np.ptp(lon) > 180:  # over the antimeridian: west is then the greater number

@@ -22,7 +22,7 @@ from lidar.dataset.checksums import file_digest
 _HEADER = ("sensor", "frame", "points", "digest")
 _DIGEST = 20
 """Characters of a digest."""
-_LARGEST = 1 << 62
+_LARGEST, _DIGITS = 1 << 62, 20
 
 
 def digests_of_files(paths: Iterable[Path]) -> bytes:
@@ -101,7 +101,7 @@ def read_journal(path: Path) -> Entries:
         return found
     with path.open(encoding="utf-8", errors="replace", newline="") as file:
         for row in csv.reader(file):
-            if len(row) != len(_HEADER) or not (row[1].isdecimal() and row[2].isdecimal()):
+            if len(row) != len(_HEADER) or not all(n.isdecimal() and len(n) < _DIGITS for n in row[1:3]):
                 continue
             sensor, frame, points, digest = row[0], int(row[1]), int(row[2]), row[3]
             if max(frame, points) < _LARGEST and digest.isascii() and len(digest) <= _DIGEST:

@@ -21,7 +21,6 @@ import json
 import logging
 import os
 import re
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -42,6 +41,7 @@ from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
+from lidar.rig.specs import names_folder
 
 log = logging.getLogger(__name__)
 
@@ -200,6 +200,8 @@ class Dataset:
             times = np.fromiter((int(row["time_ns"]) for row in rows), np.int64)
             if (np.diff(times) <= 0).any() or (times < 0).any():
                 raise DatasetError(f"{path}: damaged (times do not increase); drive again with `overwrite`")
+            if not len(times) and self.manifest.get("sensor_frames", {}).get(name):
+                raise DatasetError(f"{path}: damaged (no times of its frames); drive again with `overwrite`")
         return times
 
     def _repr_png_(self) -> bytes:
@@ -301,7 +303,10 @@ def opened_rows(path: Path) -> Iterator[Iterator[dict[str, str]]]:
         reading(path, DatasetError, remedy=remedy, known=LidarError),
         path.open(newline="", encoding="utf-8") as file,
     ):
-        yield csv.DictReader(file, strict=True)
+        rows = csv.DictReader(file, strict=True)
+        if not rows.fieldnames:
+            raise ValueError("no line with the names of columns")
+        yield rows
 
 
 def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
@@ -312,7 +317,9 @@ def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
     with reading_file(paths.calibration):
         sensors = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
         found = {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
-        for sensor in found.values():
+        for name, sensor in found.items():
+            if not names_folder(name):
+                raise ValueError(f"the name {name!r} of a sensor is none of a folder")
             mount = np.array(sensor["vehicle_from_sensor"], float)
             turn = mount[:3, :3]
             if mount.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6):
@@ -368,24 +375,23 @@ def remove_dataset(path: Path) -> None:
     if paths.manifest.exists():
         with suppress(DatasetError):
             write_json(paths.manifest, open_dataset(path).manifest | {"frames_done": 0})
-    if paths.chain.is_file():
-        shutil.rmtree(paths.integrity)
-    sensors, top = _own_names(paths)
+    own, (sensors, _) = own_files(path), _own_names(paths)
+    last = paths.chain, paths.calibration, paths.manifest  # they tell which files are of the dataset
     folders: list[Path] = []
     for entry in sorted(path.rglob("*")):
-        place = entry.relative_to(path).parts
+        name = entry.relative_to(path)
         if entry.is_dir() and not entry.is_symlink():
-            folders += [entry] if place[0] in sensors else []
-        elif entry == paths.manifest:
-            continue
-        elif entry in top or (place[0] in sensors and _of_a_sensor(place[1:])):
-            entry.unlink()
-        else:
+            folders += [entry] if name.parts[0] in (*sensors, paths.integrity.name) else []
+        elif not own(name.as_posix()):
             log.warning("%s: kept, though not of the dataset", entry)
-    for folder in reversed(folders):
-        if not any(folder.iterdir()):
-            folder.rmdir()
-    paths.manifest.unlink(missing_ok=True)
+        elif entry not in last:
+            entry.unlink()
+    for entry in last:
+        if own(entry.relative_to(path).as_posix()):
+            entry.unlink(missing_ok=True)
+        for folder in reversed(folders):
+            if folder.exists() and not any(folder.iterdir()):
+                folder.rmdir()
 
 
 def own_files(path: Path) -> Callable[[str], bool]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.untrusted import read_arrays
 from lidar.dataset.layout import reading_file
 from lidar.sensors.cloud import Cloud
 from lidar.signal.past import Past, past_of
@@ -22,8 +22,8 @@ def read_truth(path: Path, *, count: int | None = None) -> dict[str, NDArray[Any
     """
     if not path.exists():
         return None
-    with reading_file(path), path.open("rb") as data, np.load(data) as file:
-        truth: dict[str, NDArray[Any]] = {name: file[name] for name in file.files}
+    with reading_file(path):
+        truth = read_arrays(path)
         if count is not None and len(truth["origin"]) != count:
             raise ValueError(f"is of {len(truth['origin'])} returns, the cloud has {count}")
     return truth

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.typing import Float
+from geoscene.untrusted import read_toml
 from lidar.defences.scores import FALSE_ALARMS, Samples, threshold_at
 from lidar.detection import RULES, Detector
 from lidar.errors import InputError
@@ -148,7 +148,7 @@ def read_calibration(path: Path | None = None, *, detector: Detector = RULES) ->
 def _read(file: Path) -> Calibration:
     tails: dict[tuple[str, str], Tail] = {}
     try:
-        document = tomllib.loads(file.read_text("utf-8"))
+        document = read_toml(file.read_text("utf-8"))
         for defence, levels in document["defence"].items():
             for level, row in levels.items():
                 tails[defence, level] = _tail(row)

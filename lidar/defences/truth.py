@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
+from geoscene.untrusted import read_arrays
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
 from lidar.physics.echoes import Origin
@@ -84,6 +85,7 @@ def frame_truth(dataset: Dataset, sensor: str, *, frame: int, count: int) -> Fra
 
 
 def _read(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32], Float]:
-    with reading_file(path), np.load(path) as file:
+    with reading_file(path):
+        file = read_arrays(path)
         xyz = file["removed_xyz"].astype(np.float64).reshape(-1, 3)
         return file["origin"], file["hidden"], file["removed"], xyz

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import zipfile
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from geoscene.files import write_atomically
 from geoscene.typing import Float
+from geoscene.untrusted import DAMAGED_ARCHIVE, read_arrays
 from lidar.errors import FormatError
 
 KIND = "geoscene random forest"
@@ -25,10 +25,7 @@ _HEADER = "header"
 _MOST = 50_000_000
 """Bytes of a file, and of the arrays in it."""
 
-_DAMAGE = (
-    *(OSError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error),
-    *(ValueError, KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError),
-)
+_DAMAGE = (*DAMAGED_ARCHIVE, MemoryError, TypeError, AttributeError)
 """What reading a damaged archive raises."""
 
 
@@ -142,11 +139,11 @@ def read_forest(path: Path) -> tuple[Forest, dict[str, Any], str]:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST:
                 raise ValueError("too large for a model")
-        with np.load(io.BytesIO(data), allow_pickle=False) as file:
-            header = json.loads(file[_HEADER].tobytes())
-            if (header["kind"], header["version"]) != (KIND, VERSION):
-                raise ValueError(f"version {header['version']}")
-            forest = Forest(**{one.name: file[one.name] for one in fields(Forest)})
+        file = read_arrays(io.BytesIO(data))
+        header = json.loads(file[_HEADER].tobytes())
+        if (header["kind"], header["version"]) != (KIND, VERSION):
+            raise ValueError(f"version {header['version']}")
+        forest = Forest(**{one.name: file[one.name] for one in fields(Forest)})
         forest.check(columns=len(header["features"]), classes=len(header["classes"]))
     except _DAMAGE as error:
         text = " ".join(str(error).split())[:120]

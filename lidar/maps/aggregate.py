@@ -106,6 +106,8 @@ def aggregate(
     if not out.name.lower().endswith(tuple(map_suffixes())) or not format_of(out).maps:
         raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
     format_of(out).require()
+    if out.is_dir():
+        raise InputError(f"{out}: is a directory; give a file such as map.laz")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     names = _scanners(dataset, options)

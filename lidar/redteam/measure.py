@@ -16,6 +16,7 @@ from geoscene.files import digest_of, write_json
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
 from geoscene.typing import Bools, Float, Ints
+from geoscene.untrusted import read_arrays
 from lidar import __version__
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
@@ -237,8 +238,8 @@ def _removed(path: Path) -> NDArray[np.int32]:
     """Features (k,) of the returns that stages removed or moved."""
     if not path.exists():
         return np.empty(0, np.int32)
-    with reading_file(path), np.load(path) as file:
-        features: NDArray[np.int32] = file["removed_feature"]
+    with reading_file(path):
+        features: NDArray[np.int32] = read_arrays(path)["removed_feature"]
     return features
 
 

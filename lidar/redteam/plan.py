@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geoscene.errors import reading
+from geoscene.untrusted import read_toml
 from lidar.defences.registry import NamedDefence, read_defences
 from lidar.detection import RULES
 from lidar.detection.registry import read_detector
@@ -114,7 +114,7 @@ def read_plan(path: Path) -> Plan:
     Raises InputError, which names the file and what in it has the error.
     """
     with reading(path, InputError, remedy="give a TOML file with [grid] and [[attack]]", known=InputError):
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8"))
     if unknown := sorted(set(document) - set(_TABLES)):
         raise InputError(f"{path}: unknown {unknown[0]}; there are the tables {', '.join(_TABLES)}")
     attacks = _attacks(path, document.get("attack", []))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
+from geoscene.untrusted import read_toml
 from lidar.errors import InputError, RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount
@@ -334,13 +334,18 @@ def rig_digest(name: str | Path) -> str:
                 parts.append((inside / "sensors" / f"{spec.preset}.toml").read_bytes())
                 continue
             parts.append(Path(spec.preset).read_bytes())
-            listed = tomllib.loads(parts[-1].decode()).get("table", {}).get("file", "")
+            listed = read_toml(parts[-1].decode()).get("table", {}).get("file", "")
             parts += [(Path(spec.preset).parent / listed).read_bytes()] if listed else []
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RigError(f"rig {name}: a sensor's file cannot be read: {error}") from error
     for part in parts:
         digest.update(len(part).to_bytes(8) + part)
     return digest.hexdigest()
+
+
+def names_folder(name: str) -> bool:
+    """Whether a sensor's name can name its folder: letters, digits, _ and - only."""
+    return bool(name) and all(c.isalnum() or c in "_-" for c in name)
 
 
 def _check_names(tables: dict[str, list[Table]]) -> None:
@@ -350,7 +355,7 @@ def _check_names(tables: dict[str, list[Table]]) -> None:
         for table in group:
             table.close()
             name = table.data.get("name", kind)
-            if not name or not all(c.isalnum() or c in "_-" for c in name):
+            if not names_folder(name):
                 raise table.error("name", f"{name!r}: letters, digits, _ and - only (it names a folder)")
             if name in seen:
                 raise table.error("name", f"{name!r} is taken by another sensor of the rig")

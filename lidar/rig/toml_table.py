@@ -11,6 +11,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from geoscene.untrusted import read_toml
 from lidar.errors import RigError
 
 _HEADER = re.compile(r"^\s*\[(\[?)\s*([A-Za-z0-9_.\-\"' ]+?)\s*\]\]?\s*(?:#.*)?$")
@@ -182,7 +183,7 @@ def read_table(path: Path | Any, *, name: str = "") -> Table:
     except (OSError, UnicodeDecodeError) as error:
         raise RigError(f"{shown}: cannot be read ({error})") from error
     try:
-        data = tomllib.loads(text)
+        data = read_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise RigError(f"{shown}: not valid TOML: {error}") from error
     return Table(shown, data, (), _lines(text))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from difflib import get_close_matches
@@ -13,6 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from geoscene.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.random_streams import generator
 from lidar.signal.effects import Counts
@@ -275,7 +275,7 @@ def _read_kind(table: Mapping[str, Any], kind: str) -> NamedStage:
 
 def _file_tables(path: Path, kind: str) -> list[Mapping[str, Any]]:
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as TOML ({error})") from None
     tables = document.pop(kind, None)

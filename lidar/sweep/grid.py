@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from geoscene.errors import reading
 from geoscene.scene import open_scene
 from geoscene.scene.layout import SceneFiles
 from geoscene.storage import url_of
+from geoscene.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.options import AccuracyOptions, DriveOptions
 from lidar.plan import sensors_of
@@ -77,7 +77,7 @@ def read_grid(path: Path) -> list[GridDrive]:
     Raises InputError, which names the drive, for anything that can be known before the drive starts.
     """
     with reading(path, InputError, remedy="give a TOML file with a table [grid]", known=InputError):
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8"))
     return drives_of(document, path)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import gzip
 import re
 import xml.etree.ElementTree as ET
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -193,7 +194,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
             yield cast("IO[bytes]", unpacked) if packed else raw
     except FileNotFoundError:
         raise FormatError(f"{path} does not exist") from None
-    except (OSError, EOFError) as error:
+    except (OSError, EOFError, zlib.error) as error:
         raise FormatError(f"{path}: cannot be read: {error}") from None
     except (ET.ParseError, LookupError) as error:  # also of an unknown encoding
         raise FormatError(f"{path}: broken XML ({error}); was sumo still writing it?") from None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from geoscene.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.signal.stage import POSES, ROAD_USERS, Stage, parameter
 
@@ -262,7 +262,7 @@ def read_weather(text: str) -> tuple[WeatherSetting, ...]:
 
 def _of_file(path: Path) -> tuple[WeatherSetting, ...]:
     try:
-        document = tomllib.loads(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: cannot be read as TOML ({error})") from None
     tables = document.pop("weather", None)

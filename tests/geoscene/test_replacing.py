@@ -11,7 +11,14 @@ import pytest
 from helpers.scenes import names_in
 
 from geoscene.errors import InputError
-from geoscene.files import atomic_file, atomic_folder, delete_leftovers, exclusive, temporary_folder
+from geoscene.files import (
+    atomic_file,
+    atomic_folder,
+    delete_leftovers,
+    exclusive,
+    replaced_folder,
+    temporary_folder,
+)
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 OLD = {"mark": "1", "a": "old", "deep/b": "old", "notes.txt": "mine", "deep/mine/c": "mine"}
@@ -103,6 +110,13 @@ def test_the_current_directory_is_not_replaced(place, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="current directory"):
         replace(Path(place))
     assert names_in(tmp_path) == ["out"]
+
+
+def test_a_file_is_not_replaced_by_a_folder(tmp_path):
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(InputError, match="is a file"), replaced_folder(tmp_path / "out", own=lambda _: bool):
+        pass
+    assert files_of(tmp_path) == {"out": "mine"}
 
 
 def test_leftovers_of_processes_that_ended_are_deleted_and_no_other_files(ended, tmp_path):

@@ -1,5 +1,6 @@
 """Damaged routes, rigs, vehicles, sensors, stages and traffic files: one clear error, no other exception."""
 
+import gzip
 import json
 from contextlib import suppress
 from importlib import resources
@@ -11,17 +12,22 @@ from helpers.mutations import mutated
 from geoscene.errors import GeosceneError
 from geoscene.frames import Frame
 from geoscene.sources.tracks import read_track
+from lidar.dataset.journal import read_journal
+from lidar.defences.calibration import read_calibration
 from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.planning.replay import read_replay
 from lidar.planning.waypoints import read_track as read_route
+from lidar.redteam.plan import read_plan
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.scanner import load_sensor
 from lidar.rig.specs import load_rig, rig_digest
 from lidar.rig.vehicle import load_vehicle
 from lidar.signal.registry import read_stages
+from lidar.sweep.grid import read_grid
 from lidar.traffic.fcd import read_fcd
+from lidar.weather.setting import read_weather
 
 FRAME = Frame.at(24.945, 60.168)
 ROUNDS = 40
@@ -166,3 +172,37 @@ def test_numbers_far_out_of_range_are_refused(folder, name, old, new, use, tmp_p
     (tmp_path / "a.toml").write_text(text.replace(old, new, 1), "utf-8")
     with pytest.raises(LidarError, match=r"a\.toml"):
         use(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000])
+@pytest.mark.parametrize(
+    "use",
+    [
+        load_sensor,
+        lambda path: read_stages([str(path)]),
+        lambda path: read_weather(str(path)),
+        read_calibration,
+        read_grid,
+        read_plan,
+    ],
+)
+def test_toml_without_an_end_is_refused(use, value, tmp_path):
+    (tmp_path / "a.toml").write_text(f"a = {value}")
+    with pytest.raises(LidarError, match=r"a\.toml"):
+        use(tmp_path / "a.toml")
+
+
+def test_gzipped_traffic_with_a_flipped_byte_is_refused(tmp_path):
+    more = " ".join(map(str, range(500)))
+    path, data = tmp_path / "fcd.xml.gz", gzip.compress(f"{FCD}<!-- {more} -->".encode())
+    path.write_bytes(data)
+    read_fcd(path)
+    for at in range(len(data) // 4, len(data) - 8, 3):
+        path.write_bytes(data[:at] + bytes([data[at] ^ 255]) + data[at + 1 :])
+        with pytest.raises(LidarError, match=r"fcd\.xml\.gz"):
+            read_fcd(path)
+
+
+def test_numbers_without_an_end_in_a_journal_are_left_out(tmp_path):
+    (tmp_path / "frames.csv").write_text(f"sensor,frame,points,digest\ntop,{'9' * 5000},1,a\ntop,1,5,b\n")
+    assert read_journal(tmp_path / "frames.csv").of("top").frame.tolist() == [1]

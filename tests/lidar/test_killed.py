@@ -120,3 +120,15 @@ def test_signing_that_was_killed_begins_again(forked, dataset, copy, key, tmp_pa
         assert not copy.paths.chain.exists()
     work()
     same_files(copy.path, whole)
+
+
+def test_a_drive_is_deleted_by_whoever_comes_after_a_kill(forked, dataset, copy, tmp_path):
+    """The file that names the sensors' folders goes after what is in them."""
+    changes = forked.run(partial(remove_dataset, copy.path), within=tmp_path).changes
+    shutil.copytree(dataset.path, copy.path, dirs_exist_ok=True)
+    for number in range(changes, 0, -4):
+        ended = forked.run(partial(remove_dataset, copy.path), within=tmp_path, die_at=number)
+        assert ended.code == -signal.SIGKILL
+        remove_dataset(copy.path)
+        assert not copy.path.exists() or names_in(copy.path) == []
+        shutil.copytree(dataset.path, copy.path, dirs_exist_ok=True)

@@ -31,11 +31,14 @@ SCALE = 0.001
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
 
-_RATIO = 10**5
+_RATIO = 10**4
 """Greatest compression of LAZ that is read: clouds are compressed to a tenth, equal points by a thousand."""
 
 _CHUNK_POINTS = 10**6
 """Points per chunk of LAZ that are read even if the file holds fewer; writers state 50,000."""
+
+_LONGEST = 4096
+"""Bytes of a point record in LAZ, at most: memory is reserved for 50,000 of them."""
 
 _FULL = 2**20
 """Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
@@ -298,7 +301,12 @@ def _check_layers(path: Path, header: Any) -> None:
     import lazrs  # noqa: PLC0415
 
     compressed, point = header.vlrs.get("LasZipVlr"), header.point_format
-    if not compressed or point.id < 6 or not header.point_count:
+    if not compressed or not header.point_count:
+        return
+    packed = lazrs.LazVlr(compressed[0].record_data).item_size()
+    if packed != point.size or packed > _LONGEST:
+        raise ValueError(f"records of {point.size} bytes, of which {packed} are compressed")
+    if point.id < 6:
         return
     layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point.id] + point.num_extra_bytes
     with path.open("rb") as file:

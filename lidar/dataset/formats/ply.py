@@ -66,7 +66,7 @@ def read(path: Path) -> Table:
     kinds = {v: k for k, v in _TYPES.items()}
     words = [line.split() for line in lines]
     try:
-        count = next(int(w[2]) for w in words if w[:2] == ["element", "vertex"])
+        count = _vertices(words)
         fields = [(w[2], np.dtype(kinds[w[1]]).newbyteorder("<")) for w in words if w[0] == "property"]
         data = np.frombuffer(body, np.dtype(fields), count)
     except (StopIteration, KeyError, ValueError, IndexError) as error:
@@ -79,6 +79,14 @@ def read(path: Path) -> Table:
         if name in table:
             table[name] = table[name].astype(np.uint16)
     return table
+
+
+def _vertices(words: list[list[str]]) -> int:
+    """The number of vertices that the words of a header state; raises ValueError or StopIteration without."""
+    number = next(int(w[2]) for w in words if w[:2] == ["element", "vertex"])
+    if number < 0:
+        raise ValueError(f"{number} vertices")
+    return number
 
 
 def count(path: Path) -> int:

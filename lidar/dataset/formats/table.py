@@ -187,10 +187,16 @@ def read_rows(path: Path, columns: int) -> NDArray[np.float32]:
 
 
 def number_in_header(path: Path, start: bytes) -> int:
-    """The last word, a number, of the line of a text header that begins with ``start``."""
+    """The last word, a number from 0, of the line of a text header that begins with ``start``.
+
+    Raises ValueError, IndexError or StopIteration if there is none.
+    """
     with path.open("rb") as file:
         head = file.read(4096)
-    return int(next(line for line in head.splitlines() if line.startswith(start)).split()[-1])
+    number = int(next(line for line in head.splitlines() if line.startswith(start)).split()[-1])
+    if number < 0:
+        raise ValueError(f"{number} points")
+    return number
 
 
 @contextmanager

@@ -204,7 +204,7 @@ def test_a_signature_joins_the_checksums_without_hiding_damage(driven, tmp_path)
     (copy / "integrity/chain.json").write_text("{}")
     assert "integrity/chain.json" in named(copy)
     (copy / CHECKSUMS).unlink()
-    add_to_checksums(copy, below="integrity")
+    add_to_checksums(copy, below="integrity", known={})
     assert not (copy / CHECKSUMS).exists()
 
 
@@ -250,3 +250,10 @@ def test_checksums_of_a_dataset_in_storage_are_compared(driven, tmp_path, monkey
     (tmp_path / "store/lidar_top/pcd/000000.pcd").write_bytes(b"cut")
     done = run_program("lidar", "verify", url)
     assert (done.returncode, done.stdout.splitlines()[0]) == (1, "lidar_top/pcd/000000.pcd: changed")
+
+
+def test_findings_are_counted_in_words(copy):
+    (copy / "poses.csv").write_bytes(b"none")
+    assert verify_dataset(copy).to_text("a")[-1].endswith(": 1 finding")
+    (copy / "trajectory.csv").unlink()
+    assert verify_dataset(copy).to_text("a")[-1].endswith(": 2 findings")

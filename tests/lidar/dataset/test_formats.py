@@ -357,3 +357,28 @@ def test_a_truncated_laz_is_named(tmp_path):
     (tmp_path / "a.laz").write_bytes(whole[: len(whole) // 3])
     with pytest.raises(FormatError, match=r"a\.laz"):
         read_table(tmp_path / "a.laz")
+
+
+def test_laz_records_of_another_length_than_is_compressed_are_refused(tmp_path):
+    """Memory would be reserved for 50,000 of them."""
+    path = tmp_path / "a.laz"
+    las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
+    whole = path.read_bytes()
+    path.write_bytes(whole[:105] + b"\xff\xff" + whole[107:])
+    with pytest.raises(FormatError, match="records of 65535 bytes"):
+        read_table(path)
+
+
+@pytest.mark.parametrize("count", ["-1", "-2", "-999999999999"])
+@pytest.mark.parametrize("name", ["pcd", "pcd-ascii", "pcd-compressed", "ply"])
+def test_fewer_than_no_points_are_refused(name, count, tmp_path):
+    form = FORMATS[name]
+    path = tmp_path / f"a{form.suffix}"
+    form.write(path, {axis: np.zeros(7, np.float32) for axis in "xyz"})
+    whole, stated = path.read_bytes(), b"vertex 000000000007" if name == "ply" else b"POINTS 7"
+    assert stated in whole
+    path.write_bytes(whole.replace(stated, stated.split()[0] + b" " + count.encode()))
+    with pytest.raises(FormatError, match="number of points"):
+        form.count(path)
+    with pytest.raises(FormatError, match=path.name):
+        read_table(path)

@@ -199,3 +199,26 @@ def test_a_sensor_without_a_rate_is_refused(copy, rate):
     write_json(copy / "calibration.json", document)
     with pytest.raises(DatasetError, match=r"calibration\.json: damaged"):
         describe(copy)
+
+
+@pytest.mark.parametrize("rows", [0, 1])
+@pytest.mark.parametrize("name", ["poses.csv", "lidar_top/timestamps.csv"])
+def test_tables_that_have_lost_their_rows_are_damaged(copy, name, rows):
+    lines = (copy / name).read_text().splitlines(keepends=True)
+    (copy / name).write_text("".join(lines[:rows]))
+    done = run_program("lidar", "info", copy)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert name in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["../outside", "/outside", "a/b", "..", "", "a\nb"])
+def test_names_of_sensors_do_not_lead_out_of_a_dataset(copy, name, tmp_path):
+    document = json.loads((copy / "calibration.json").read_text())
+    document["sensors"] = {name: document["sensors"]["lidar_top"]}
+    write_json(copy / "calibration.json", document)
+    with pytest.raises(DatasetError, match=r"calibration\.json: damaged.*none of a folder"):
+        open_dataset(copy).sensors()
+    done = run_program("lidar", "apply", copy, "--stage", "dropped_packets", "-o", tmp_path / "out")
+    assert done.returncode == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy"]
