@@ -5,6 +5,7 @@
 # make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
 # make bench-quick the same on a part of the demo, about a minute
 # make lint        style, types, layer contract
+# make docs        the documentation as a site, in build/site; broken links are errors
 # make wheel-test  build sdist and wheel, and run the installed wheel away from the repository
 PYTHON ?= python3
 VENV := .venv
@@ -13,7 +14,7 @@ STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test test-fast fuzz bench bench-quick lint wheel-test clean
+.PHONY: demo test test-fast fuzz bench bench-quick lint docs wheel-test clean
 
 $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one: make PYTHON=python3.12")'
@@ -46,6 +47,9 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: $(STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 wheel-test: $(STAMP)
 	$(BIN)/python tests/wheel.py

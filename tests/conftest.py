@@ -38,7 +38,8 @@ SLOW = frozenset(
         "test_flight_planning", "test_footprints", "test_interruptions", "test_network",
         "test_outputs", "test_overture", "test_places", "test_raycast", "test_rays",
         "test_real", "test_render", "test_roofs", "test_ros",
-        "test_scale", "test_scene_cache", "test_sensors", "test_siting", "test_storage", "test_structures",
+        "test_scale", "test_scene_cache", "test_sensors", "test_site", "test_siting", "test_storage",
+        "test_structures",
         "test_sumo", "test_sweep", "test_traffic", "test_view", "test_view_browser",
     )
 )  # fmt: skip

@@ -84,7 +84,7 @@ def in_help(name):
     return [words for text in paragraphs for words in commands(text)]
 
 
-PAGES = [str(path.relative_to(ROOT)) for path in sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])]
+PAGES = [str(path.relative_to(ROOT)) for path in sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])]
 SUCCEEDED: set[tuple[str, ...]] = set()
 """Commands that were run; repeated only where a later one needs what they write."""
 SOURCES = [page for page in PAGES if in_page(page)] + ["geoscene --help", "lidar --help"]
