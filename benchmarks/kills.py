@@ -78,6 +78,8 @@ def cases(folder: Path) -> dict[str, Case]:
         "nuscenes": Case([*convert, "nuscenes"], "out", []),
         "kitti": Case([*convert, "kitti"], "out", []),
         "mcap": Case([*convert, "mcap"], "out", []),
+        "waymo": Case([*convert, "waymo"], "out", []),
+        "npz": Case([*convert, "npz"], "out", []),
         "apply": Case(
             ["lidar", "apply", data, "--quiet", "--stage", "dropped_packets:loss=0.1"],
             "data",

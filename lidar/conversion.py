@@ -5,19 +5,23 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
+from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.export import EXPORTERS, ExportSummary
 from lidar.dataset.formats import ALL, FORMATS, Format
-from lidar.dataset.formats.table import table_cloud
+from lidar.dataset.formats.table import Table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.provenance import derived_from
-from lidar.dataset.record_clouds import write_clouds
+from lidar.dataset.record_clouds import sent_pulses, write_clouds
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.recording import Recording
 from lidar.errors import DatasetError, InputError
@@ -25,8 +29,16 @@ from lidar.options import CONVERTED_FORMATS
 from lidar.rerecord import recording_again
 from lidar.rig.devices import Scanner, scanners
 from lidar.rig.specs import rig_of
+from lidar.time_scales import drive_ns
 
 log = logging.getLogger(__name__)
+
+_CLOCK_NS = 250
+"""Nanoseconds within which times of files in the world frame are exact: GPS seconds as float64."""
+_RING = 1e9
+"""Weight of rings against nanoseconds / `_CLOCK_NS`, more than that of the longest frame."""
+_NEAR = 1e-6
+"""Metres from a scanner within which a return has no direction."""
 
 _SEQUENCE = ("calib.txt", "times.txt", "poses.txt")
 
@@ -97,16 +109,16 @@ def _source(dataset: Dataset, form: Format) -> Format:
         recorded = [FORMATS[name] for name in dataset.manifest["recipe"]["formats"]]
     if recorded == [form]:
         raise InputError(f"{dataset.path}: its clouds are in {form.name} already")
-    found = [f for f in recorded if f.frame == "sensor" and f.columns == ALL]
-    found += [f for f in recorded if f.module == form.module]
+    found = [f for f in recorded if f.module == form.module]
+    found += [f for f in recorded if f.frame == "world" or f.columns == ALL]
     if not found:
         names = ", ".join(f.name for f in recorded)
-        whole = ", ".join(f.name for f in FORMATS.values() if f.columns == ALL)
+        whole = ", ".join(f.name for f in FORMATS.values() if f.frame == "world" or f.columns == ALL)
         raise DatasetError(
             f"{dataset.path}: clouds in {names} lack what {form.name} files hold;"
             f" drive with `formats` {form.name}, or with one that can be converted: {whole}"
         )
-    return max(found, key=lambda f: f.exact)
+    return max(found, key=lambda f: f.exact or f.module == form.module)
 
 
 def _copy_all_but_clouds(dataset: Dataset, recording: Recording, *, devices: list[Scanner]) -> None:
@@ -132,14 +144,47 @@ def _convert_cloud(
     for target in paths.values():
         target.parent.mkdir(parents=True, exist_ok=True)
     (form,) = recording.contents.cloud_formats
-    if source.frame == "world":
+    if source.module == form.module and form.frame == "world":
         with reading_file(path):
             form.write(paths[form.name], source.read(path), info=recording.las_info)
         return
-    table = cloud_points(path)
+    if source.frame == "world":
+        with reading_file(path):
+            table = _as_measured(source.read(path), recording, scanner=scanner, frame=frame)
+    else:
+        table = cloud_points(path)
     velocity = None
     if scanner.sensor.fmcw:
         with reading_file(path):
             velocity = table["velocity"].astype(np.float32)
     cloud = table_cloud(table, start_ns=scanner.frame_start_ns(frame))
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=velocity)
+
+
+def _as_measured(table: Table, recording: Recording, *, scanner: Scanner, frame: int) -> Table:
+    """A table of the world frame in that of its scanner, with the times and firing blocks of its pulses.
+
+    A return is of the pulse of its ring that is nearest in time; of pulses at the same time, as of a flash,
+    the nearest in direction.
+    """
+    sent, begin = sent_pulses(recording, scanner, frame=frame), scanner.frame_start_ns(frame)
+    time_ns, mount = drive_ns(recording.start, table["gps_time"]), scanner.spec.mount
+    placed = recording.geo.scene_points(np.column_stack([table[axis] for axis in "xyz"]))
+
+    def seen(time_ns: NDArray[np.int64]) -> Float:
+        return recording.trajectory.at(time_ns).mounted(mount.translation, mount.rotation).seen(placed)
+
+    rough = seen(time_ns)
+    rough /= np.maximum(np.linalg.norm(rough, axis=1), _NEAR)[:, None]
+    known = _marks(sent.ring, sent.time_ns - begin, direction=sent.direction)
+    _, row = cKDTree(known).query(_marks(table["ring"], time_ns - begin, direction=rough))
+    matched = np.abs(sent.time_ns[row] - time_ns) <= _CLOCK_NS
+    time_ns = np.where(matched, sent.time_ns[row], time_ns)
+    points = dict(zip("xyz", seen(time_ns).T.astype(np.float32), strict=True))
+    column = table.get("column", sent.column[row])
+    return table | points | {"time_ns": (time_ns - begin).clip(0).astype(np.uint32), "column": column}
+
+
+def _marks(ring: NDArray[Any], time_ns: NDArray[np.int64], *, direction: Float) -> Float:
+    """Points (n, 5), near each other for pulses alike: ring counts before time, and time before direction."""
+    return np.column_stack([ring.astype(float) * _RING, time_ns / _CLOCK_NS, direction])

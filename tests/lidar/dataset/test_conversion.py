@@ -23,9 +23,11 @@ name = "two"
 [[lidar]]
 name = "top"
 preset = "vlp16"
+translation = [1.2, 0.0, 1.9]
 [[lidar]]
 name = "doppler"
 preset = "fmcw"
+translation = [3.5, 0.3, 0.7]
 """
 OPTIONS = DriveOptions(
     route="random",
@@ -100,21 +102,44 @@ def test_clouds_of_fewer_digits_are_converted_with_a_warning(folder, tmp_path, c
         np.testing.assert_allclose(found[name], column, rtol=0, atol=6e-3 if name == "intensity" else 1e-4)
 
 
+@pytest.mark.parametrize("name", ["laz", "e57"])
+def test_clouds_of_the_world_frame_return_to_the_scanners(folder, tmp_path, caplog, name):
+    """Times and firing blocks are exact, from the pulses; positions to the steps of LAZ or float32."""
+    convert(folder / "plain", tmp_path / name, to=name)
+    convert(tmp_path / name, tmp_path / "npz", to="npz")
+    assert f"points have the digits of {name} files" in caplog.text
+    for sensor in ("top", "doppler"):
+        for frame in range(2):
+            exact = read_table(folder / "all" / sensor / "npz" / f"{frame:06d}.npz")
+            found = read_table(tmp_path / "npz" / sensor / "npz" / f"{frame:06d}.npz")
+            assert {n: c.dtype for n, c in found.items()} == {n: c.dtype for n, c in exact.items()}
+            same = [n for n in exact if n not in ("x", "y", "z", "intensity", "range")]
+            for column in ["range", *same]:
+                np.testing.assert_array_equal(found[column], exact[column], err_msg=column)
+            assert len(found["x"]) > 1000
+            away = np.sqrt(sum((found[axis].astype(float) - exact[axis]) ** 2 for axis in "xyz"))
+            assert away.max() < 1.1e-3
+            np.testing.assert_allclose(found["intensity"], exact["intensity"], atol=0.5 / 257 + 1e-5)
+
+
 def test_clouds_that_lack_what_a_format_holds_are_refused(folder, tmp_path):
-    convert(folder / "plain", tmp_path / "laz", to="laz")
+    driven = open_dataset(folder / "all")
+    source = shutil.copytree(folder / "all", tmp_path / "source")
+    recipe = driven.manifest["recipe"] | {"formats": ["kitti"]}
+    (source / "dataset.json").write_text(json.dumps(driven.manifest | {"recipe": recipe}))
     with pytest.raises(
-        DatasetError, match=r"clouds in laz lack what pcd files hold; drive with `formats` pcd"
+        DatasetError, match=r"clouds in kitti lack what pcd files hold; drive with `formats` pcd"
     ):
-        convert(tmp_path / "laz", tmp_path / "pcd", to="pcd")
+        convert(source, tmp_path / "pcd", to="pcd")
     with pytest.raises(InputError, match=r"`to` pandaset: one of .*nuscenes.*, pcd, "):
         convert(folder / "plain", tmp_path / "out", to="pandaset")
     with pytest.raises(InputError, match="give a directory outside of"):
         convert(folder / "plain", folder / "plain" / "laz", to="laz")
     with pytest.raises(DatasetError, match="is not empty"):
-        convert(folder / "plain", tmp_path / "laz", to="las")
-    with pytest.raises(InputError, match="its clouds are in laz already"):
-        convert(tmp_path / "laz", tmp_path / "out", to="laz")
-    assert [path.name for path in tmp_path.iterdir()] == ["laz"]
+        convert(folder / "plain", source, to="las")
+    with pytest.raises(InputError, match="its clouds are in pcd already"):
+        convert(folder / "plain", tmp_path / "out", to="pcd")
+    assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 
 def test_a_damaged_cloud_ends_a_conversion_and_nothing_is_left(folder, tmp_path):
