@@ -444,7 +444,11 @@ def map_(
     *,
     out: Annotated[
         Path,
-        Parameter(name=["--out", "-o"], group=OUTPUT, help=f"File to write: {', '.join(map_suffixes())}."),
+        Parameter(
+            name=["--out", "-o"],
+            group=OUTPUT,
+            help=f"File to write: {', '.join(map_suffixes())}; with --tiles, a folder.",
+        ),
     ],
     options: MapOptions = MapOptions(),
     report: Reporting = Report(),
@@ -464,6 +468,8 @@ def map_(
     lidar map drive -o map.laz --raster dsm,dtm --resolution 0.5 --compare scene
 
     lidar map drive -o map.laz --poses gnss+imu --refine
+
+    lidar map drive -o tiles --tiles 100 --voxel 0.1 --outliers 16,2
 
     Parameters
     ----------
@@ -525,6 +531,7 @@ _LEFT_OUT = {
     "without": "classes in --without",
     "echo": "other echoes",
     "origin": "other origins",
+    "outliers": "outliers",
 }
 """Returns that maps leave out, by the reason."""
 

@@ -45,6 +45,15 @@ OUTPUT = Group("Output", sort_key=3)
 COLORS = ("class", "height", "intensity", "sensor")
 """What red, green and blue of a map can show."""
 
+TILE_FORMATS = ("laz", "las", "copc")
+"""Formats of the tiles of a map."""
+
+LARGEST_TILE = 1_000_000
+"""Metres."""
+
+MOST_NEIGHBOURS = 500
+"""Neighbours by which outliers are found."""
+
 RASTERS = ("dsm", "dtm", "density", "intensity")
 """Rasters of a map."""
 
@@ -129,6 +138,15 @@ def _span(_: object, tokens: Sequence[Token]) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f"{text}: give two numbers of seconds as FROM,TO") from None
     return first, last
+
+
+def _outliers(_: object, tokens: Sequence[Token]) -> tuple[int, float]:
+    text = tokens[0].value.strip()
+    try:
+        neighbours, factor = text.split(",")
+        return int(neighbours), float(factor)
+    except ValueError:
+        raise ValueError(f"{text}: give a number of neighbours and a factor, such as 16,2") from None
 
 
 def _lower(_: object, tokens: Sequence[Token]) -> str:
@@ -708,6 +726,20 @@ class MapOptions:
     refine: bool = False
     """Refine measured poses by aligning the sweeps to each other (extra registration)."""
 
+    outliers: Annotated[
+        tuple[int, float] | None,
+        Parameter(converter=_outliers, n_tokens=1, metavar="NEIGHBOURS,FACTOR"),
+    ] = None
+    """Leave out returns whose mean distance to this many neighbours is above the map's mean by more than
+    FACTOR standard deviations; after --voxel."""
+
+    tiles: int | None = None
+    """Write a file for each square of the projected grid with this side in whole metres, and an index, to the
+    folder that --out names."""
+
+    tile_format: str = "laz"
+    """Format of the tiles: laz, las or copc."""
+
     raster: Annotated[tuple[str, ...], WORDS] = ()
     """Rasters to write beside the map as GeoTIFF, separated by commas: dsm (highest return), dtm (mean height
     of the ground's returns), density (returns per square metre), intensity (mean)."""
@@ -721,13 +753,22 @@ class MapOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name, known in (("color", COLORS), ("echo", ECHOES)):
+        for name, known in (("color", COLORS), ("echo", ECHOES), ("tile_format", TILE_FORMATS)):
             if getattr(self, name) not in known:
                 raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
         for name in ("voxel", "resolution"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InputError(f"`{name}` {value}: give a positive number of metres")
+        if self.outliers is not None:
+            neighbours, factor = self.outliers
+            if not (1 <= neighbours <= MOST_NEIGHBOURS and 0 <= factor < math.inf):
+                raise InputError(
+                    f"`outliers` {neighbours},{factor:g}: give 1 to {MOST_NEIGHBOURS} neighbours and a"
+                    " factor of 0 or more"
+                )
+        if self.tiles is not None and not 1 <= self.tiles <= LARGEST_TILE:
+            raise InputError(f"`tiles` {self.tiles}: give 1 to {LARGEST_TILE} metres")
         classes_of(self.without)
         classes_of(self.only, option="only")
         for name, words in (("origin", ORIGINS), ("raster", RASTERS)):

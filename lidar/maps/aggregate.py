@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.files import exclusive
+from geoscene.files import atomic_folder, exclusive
 from geoscene.previews import DARK, Plan, around, card
 from geoscene.progress import Progress, silent
 from geoscene.scene import open_scene
-from lidar.dataset.formats import format_of, map_suffixes, read_table
+from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
@@ -23,10 +23,12 @@ from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.maps.colors import distinct, ramp
 from lidar.maps.compare import Comparison, Distances
+from lidar.maps.outliers import Outliers
 from lidar.maps.poses import PoseErrors, measured_trajectory, pose_errors, write_poses
 from lidar.maps.rasters import Rasters
 from lidar.maps.selection import Selection
 from lidar.maps.source import COLUMNS, Source
+from lidar.maps.tiles import INDEX, NAMES, open_tiles
 from lidar.maps.voxels import thinned
 from lidar.options import MapOptions
 
@@ -40,10 +42,11 @@ class MapSummary:
 
     points_in : returns read
     points    : points written
-    left_out  : returns left out, by the first of the reasons of `lidar.maps.selection.Selection.unwanted`
+    left_out  : returns left out, by the first of the reasons of `lidar.maps.selection.Selection.unwanted`,
+                and of those that these leave, outliers
     frames    : frames read
     missing   : number of missing frames, by scanner
-    path      : the file
+    path      : the file, or the folder of tiles
     beside    : further files: rasters, and those of comparisons
     distances : to the surfaces of the scene that the map was compared with
     poses     : errors of measured poses; None for true ones
@@ -60,8 +63,8 @@ class MapSummary:
     poses: PoseErrors | None
 
     def _repr_png_(self) -> bytes | None:
-        """A picture from above in the map's colours, for notebooks; None for an empty or very large map."""
-        if not 0 < self.points <= _MOST_DRAWN:
+        """A picture from above in the map's colours, for notebooks; None if empty, very large or in tiles."""
+        if not 0 < self.points <= _MOST_DRAWN or self.path.is_dir():
             return None
         table = read_table(self.path)
         xyz = np.column_stack([table[axis] for axis in "xyz"])
@@ -97,17 +100,13 @@ def aggregate(
 
     overwrite : replace an existing file
 
-    Rasters and comparisons are beside it, have its name and replace files of earlier maps. The map itself
-    appears last.
+    Rasters, comparisons and trajectories are beside it, have its name and replace files of earlier maps. The
+    map itself appears last. With ``options.tiles``, ``out`` is a folder, in which all of them are.
 
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
     out = Path(out)
-    if not out.name.lower().endswith(tuple(map_suffixes())) or not format_of(out).maps:
-        raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}")
-    format_of(out).require()
-    if out.is_dir():
-        raise InputError(f"{out}: is a directory; give a file such as map.laz")
+    _check(out, tiles=options.tiles is not None)
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     names = _scanners(dataset, options)
@@ -118,6 +117,9 @@ def aggregate(
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
         stream = thinned(stream, options.voxel, out=out, offset=source.geo.offset)
+    outliers = Outliers(*options.outliers) if options.outliers else None
+    if outliers:
+        stream = outliers.without(stream, out=out, offset=source.geo.offset)
     comparison = None
     if options.compare is not None:
         comparison = Comparison(open_scene(options.compare), dataset.frame, crs=dataset.crs)
@@ -126,29 +128,44 @@ def aggregate(
     if options.raster:
         stream = rasters.measured(stream)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
-    with exclusive(out), _opened(out, source) as append:
+    with _opened(out, source, options=options) as (named, append):
         written = 0
         for table in stream:
             append(_colored(table, options.color, limits=limits))
             written += rows(table)
-        write_map_provenance(dataset, out)
-        beside = rasters.write(out, crs=dataset.crs)
+        write_map_provenance(dataset, named)
+        beside = rasters.write(named, crs=dataset.crs)
         if comparison:
-            beside += comparison.write(out)
+            beside += comparison.write(named)
         if trajectory is not None:
-            beside.append(out.with_suffix(".tum"))
+            beside.append(named.with_suffix(".tum"))
             write_poses(beside[-1], trajectory, dataset=dataset)
     return MapSummary(
         read.points,
         written,
-        dict(read.left_out),
+        dict(read.left_out) | ({"outliers": outliers.left_out} if outliers else {}),
         len(read.frames),
         source.missing(),
         out,
-        beside=beside,
+        beside=beside
+        if options.tiles is None
+        else [out / name for name in (INDEX, *(p.name for p in beside))],
         distances=comparison.rows() if comparison else [],
         poses=pose_errors(trajectory, dataset.trajectory()) if trajectory is not None else None,
     )
+
+
+def _check(out: Path, *, tiles: bool) -> None:
+    """Raise InputError if ``out`` is no name of a map, or MissingExtraError if its format needs a package."""
+    named = out.name.lower().endswith(tuple(map_suffixes()))
+    if tiles and named:
+        raise InputError(f"{out}: `tiles` are written to a folder; give a name without {out.suffix}")
+    if not tiles and not (named and format_of(out).maps):
+        raise InputError(f"{out}: maps are written as {', '.join(map_suffixes())}; with `tiles`, to a folder")
+    if not tiles and out.is_dir():
+        raise InputError(f"{out}: is a directory; give a file such as map.laz")
+    if not tiles:
+        format_of(out).require()
 
 
 def _scanners(dataset: Dataset, options: MapOptions) -> list[str]:
@@ -192,10 +209,23 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
     return table | {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2]}
 
 
-def _opened(out: Path, source: Source) -> AbstractContextManager[Callable[[Table], None]]:
-    """A function that appends tables to a map."""
+@contextmanager
+def _opened(
+    out: Path, source: Source, *, options: MapOptions
+) -> Iterator[tuple[Path, Callable[[Table], None]]]:
+    """Yield the path whose folder and name files beside a map have, and a function that appends tables.
+
+    The map, or the folder of its tiles, appears at the end, unless the block raises.
+    """
     info = LasInfo(source.dataset.crs, source.geo.offset, source.dataset.start)
-    opened: AbstractContextManager[Callable[[Table], None]] = format_of(out).open_map(
-        out, info=info, columns=(*COLUMNS, "red", "green", "blue")
-    )
-    return opened
+    columns = (*COLUMNS, "red", "green", "blue")
+    if options.tiles is None:
+        with exclusive(out), format_of(out).open_map(out, info=info, columns=columns) as append:
+            yield out, append
+    else:
+        form = MAPS[options.tile_format]
+        with (
+            atomic_folder(out, mark=INDEX, names=NAMES) as folder,
+            open_tiles(folder, options.tiles, form=form, info=info, columns=columns) as append,
+        ):
+            yield folder / "tiles", append

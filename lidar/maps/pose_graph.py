@@ -13,10 +13,14 @@ from geoscene.typing import Float, Ints
 from lidar.maps.measured_poses import Measured, Motion
 
 _KNOT_NS = 1_000_000_000  # between the poses that are adjusted
-_TILT = 0.02  # rad, of roll and pitch against level
+_TILT = (0.3, 0.1)  # rad, of pitch and roll against level: roads keep their slope for longer than a second
 _COURSE = 0.05  # rad, of a heading by the course
 _MOVING = 2.0  # m/s, from which headings by the course are used
 _CORRELATED_NS = 10_000_000_000  # fixes share most of their error for longer: one counts in such a time
+_SCALES = (1000.0, 100.0, 10.0, 1.0)
+"""Standard deviations beyond which fixes lose weight, one after the other: where the poses begin far from the
+fixes, as on a slope, all of these would seem to be far off."""
+
 _ITERATIONS = 100
 _DIFFERENCE = 1e-6  # radians and metres, over which derivatives are taken
 _SMALL = 1e-7  # radians and metres: the last step
@@ -26,8 +30,8 @@ def fitted(motion: Motion, fixes: Measured) -> Float:
     """Poses (n + 1, 4, 4) at the times of a motion, true metres, that fit it and some fixes best.
 
     The pose graph has a pose for each second (6 unknowns), edges of the motion between successive ones, the
-    positions and courses of the fixes, and roll and pitch near level. Fixes far off have little weight
-    (Cauchy's loss).
+    positions and courses of the fixes, and pitch and roll not far from level. Fixes far off have little
+    weight (Cauchy's loss, at ever smaller scales: graduated non-convexity).
     """
     time_ns, relative = motion.time_ns, motion.poses()
     wanted = np.arange(time_ns[0], time_ns[-1], _KNOT_NS)
@@ -77,35 +81,42 @@ class PoseGraph:
 
     def solved(self) -> Float:
         """Poses (n, 4, 4) in true metres that fit best, by Levenberg's and Marquardt's method."""
-        values, damping = self._start(), 1e-6
-        residuals = self._residuals(values)
-        for _ in range(_ITERATIONS):
-            jacobian, weight = self._jacobian(values), self._weight(residuals)
-            normal = (jacobian.T @ jacobian.multiply(weight[:, None])).tocsc()
-            gradient = jacobian.T @ (weight * residuals)
-            step = spsolve(normal + damping * diags_array(normal.diagonal()).tocsc(), -gradient)
-            there = values + step.reshape(values.shape)
-            beyond = self._residuals(there)
-            gain = self._cost(residuals) - self._cost(beyond)
-            damping = damping / 10 if gain >= 0 else damping * 10
-            if gain >= 0:
-                values, residuals = there, beyond
-            if abs(step).max() < _SMALL or damping > 1 / _SMALL:
-                break
+        values = self._start()
+        for scale in _SCALES:
+            values = self._minimum(values, scale)
         poses = np.tile(np.eye(4), (len(values), 1, 1))
         poses[:, :3, :3] = Rotation.from_rotvec(values[:, :3]).as_matrix()
         poses[:, :3, 3] = values[:, 3:]
         return poses
 
-    def _cost(self, residuals: Float) -> float:
+    def _minimum(self, values: Float, scale: float) -> Float:
+        """The unknowns at the minimum of the cost next to some, by Levenberg's and Marquardt's method."""
+        damping, residuals = 1e-6, self._residuals(values)
+        for _ in range(_ITERATIONS):
+            jacobian, weight = self._jacobian(values), self._weight(residuals, scale)
+            normal = (jacobian.T @ jacobian.multiply(weight[:, None])).tocsc()
+            gradient = jacobian.T @ (weight * residuals)
+            step = spsolve(normal + damping * diags_array(normal.diagonal()).tocsc(), -gradient)
+            there = values + step.reshape(values.shape)
+            beyond = self._residuals(there)
+            gain = self._cost(residuals, scale) - self._cost(beyond, scale)
+            damping = damping / 10 if gain >= 0 else damping * 10
+            if gain >= 0:
+                values, residuals = there, beyond
+            if abs(step).max() < _SMALL or damping > 1 / _SMALL:
+                break
+        return values
+
+    def _cost(self, residuals: Float, scale: float) -> float:
         """Half the sum of squares, of fixes by Cauchy's loss."""
         firm, fixes = np.split(residuals, [len(residuals) - self._robust])
-        return float((firm**2).sum() + np.log1p(fixes**2).sum() / self._shared) / 2
+        loss = scale**2 * np.log1p((fixes / scale) ** 2)
+        return float((firm**2).sum() + loss.sum() / self._shared) / 2
 
-    def _weight(self, residuals: Float) -> Float:
+    def _weight(self, residuals: Float, scale: float) -> Float:
         """Weights (m,) with which squares have the gradient of the cost."""
         weight = np.ones(len(residuals))
-        weight[-self._robust :] = 1 / (1 + residuals[-self._robust :] ** 2) / self._shared
+        weight[-self._robust :] = 1 / (1 + (residuals[-self._robust :] / scale) ** 2) / self._shared
         return weight
 
     def _jacobian(self, values: Float) -> Any:
@@ -150,7 +161,7 @@ class PoseGraph:
         parts = [
             off_turn / self._edge_sigma[:, :3],
             off_shift / self._edge_sigma[:, 3:],
-            up[:, :2] / _TILT,
+            up[:, :2] / np.array(_TILT),
             (seen - self._position) / self._sigma,
             off_yaw / _COURSE,
         ]

@@ -44,10 +44,12 @@ class Squares:
 
     def add(self, data: NDArray[np.void]) -> list[Square]:
         """Append records of `records`; return the squares that they are in."""
+        if not len(data):
+            return []
         column, row = (np.floor(data[axis] / self.side).astype(np.int64) for axis in "xy")
         order = np.lexsort((row, column))  # stable: points of a square keep their order
         column, row = column[order], row[order]
-        begins = np.flatnonzero(np.r_[True, (np.diff(column) != 0) | (np.diff(row) != 0)][: len(order)])
+        begins = np.flatnonzero(np.r_[True, (np.diff(column) != 0) | (np.diff(row) != 0)])
         touched = [(int(column[k]), int(row[k])) for k in begins]
         for square, mine in zip(touched, np.split(order, begins[1:]), strict=True):
             with self.path(square).open("ab") as file:

@@ -306,3 +306,9 @@ def test_a_dataset_without_clouds_is_named(tmp_path):
     with pytest.raises(DatasetError, match="schema version 7"):
         open_dataset(data.path)
     assert isinstance(replace(data, path=Path("x")).path, Path)
+
+
+def test_a_thinned_map_of_frames_without_wanted_returns_is_empty(tmp_path):
+    options = MapOptions(voxel=0.5, only=("water",))
+    assert aggregate(dataset(tmp_path / "d"), tmp_path / "m.laz", options=options).points == 0
+    assert len(laspy.read(tmp_path / "m.laz")) == 0
