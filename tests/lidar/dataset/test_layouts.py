@@ -21,9 +21,10 @@ from lidar.dataset.boxes import read_boxes
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.export.coco import THINGS, encoded_mask
 from lidar.dataset.export.kitti_360 import SEQUENCE
+from lidar.dataset.export.waymo_range_images import Grid, pixels
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.dataset.recorded import labelled_clouds, still_points
+from lidar.dataset.recorded import Stream, labelled_clouds, still_points
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
@@ -390,6 +391,29 @@ def flat_points(dataset):
     top, flat = (labelled_clouds(dataset, name) for name in ("top", "flat"))
     for time_ns in top.time_ns:
         yield read_table(flat.files[int(np.abs(flat.time_ns - time_ns).argmin())])["x"]
+
+
+@given(st.floats(-np.pi, np.pi), st.floats(-np.pi, np.pi), st.integers(4, 5000))
+def test_columns_of_range_images_are_the_nearest_azimuths(yaw, azimuth, width):
+    turned = np.eye(4)
+    turned[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
+    stream = Stream("top", {"vehicle_from_sensor": turned.tolist()}, np.arange(1), np.arange(1), ())
+    grid = Grid(1, stream, np.zeros(1), width)
+    column = grid.column(np.array([azimuth]))
+    assert 0 <= column[0] < width
+    away = np.angle(np.exp(1j * (grid.azimuth(column)[0] - azimuth)))
+    assert abs(away) <= np.pi / width + 1e-9
+
+
+def test_second_echoes_are_in_the_second_range_image_and_third_ones_in_none():
+    stream = Stream("top", {"vehicle_from_sensor": np.eye(4).tolist()}, np.arange(1), np.arange(1), ())
+    grid = Grid(1, stream, np.array([-0.1, 0.1]), 360)
+    columns = {"x": [9, 8, 7, 9, 0], "y": [0, 0, 0, 0, -9], "ring": [1, 1, 1, 1, 0], "echo": [1, 2, 3, 1, 1]}
+    kept, pixel = pixels(grid, {name: np.array(values) for name, values in columns.items()})
+    assert kept.tolist() == [0, 4, 1]  # the fourth has the pixel of the first
+    size, ahead = 2 * 360, pixel[0]
+    assert ahead in (179, 180)  # the highest ring is the first row; columns go from behind by the left
+    assert pixel.tolist() == [ahead, 360 + ahead + 90, size + ahead]
 
 
 def test_waymo_boxes_are_the_recorded_ones_and_hold_their_points(dataset, waymo):
