@@ -19,7 +19,7 @@ import shapely
 from geoscene.buildings import build_solids
 from geoscene.classes import Class
 from geoscene.cluster import Cluster
-from geoscene.files import digest_of, write_atomically
+from geoscene.files import digest_of, naming, write_atomically
 from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
@@ -225,7 +225,7 @@ def build_tiles(
     remaining = [tile for tile in tiles if tile not in finished]
     job = _Job(plan, folder, lod, _Former.of(former, keys))
     for report in _reports(job, remaining, workers=workers, cluster=cluster):
-        with files.tile_journal.open("a", encoding="utf-8") as journal:
+        with naming(files.tile_journal), files.tile_journal.open("a", encoding="utf-8") as journal:
             journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
         yield report
     for left in files.tiles.glob("*.part"):  # of workers that were killed while writing

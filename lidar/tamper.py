@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geoscene.csv_tables import write_columns
 from lidar.camera.png import read_png
-from lidar.dataset.derived import check_target, complete_folder
+from lidar.dataset.derived import check_target, complete_folder, copy_folder
 from lidar.dataset.formats import FORMATS, LABELS, read_table
 from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, read_rows, reading_file
@@ -116,7 +116,7 @@ def tamper(
     rows = [("replaced", name, path.as_posix(), 0) for name, path in copies.items()]
     rows += [("shifted", path, "", moved[name]) for name, (path, _) in stamps.items()]
     with complete_folder(out) as part:
-        shutil.copytree(dataset.path, part, dirs_exist_ok=True)
+        copy_folder(dataset.path, part)
         for name, path in copies.items():
             shutil.copyfile(path, part / name)
         for place, truth in _truths(dataset, other, copies=copies):

@@ -162,12 +162,12 @@ def _picture(file: str) -> NDArray[np.uint8]:
     if not file:
         squares = np.indices((_SQUARES, _SQUARES)).sum(axis=0) % 2
         return np.repeat((255 * squares)[:, :, None], 3, axis=2).astype(np.uint8)
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415
 
     try:
         with Image.open(Path(file)) as picture:
             return np.asarray(picture.convert("RGB"))
-    except (OSError, ValueError, UnidentifiedImageError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(f"file = {file!r} cannot be read as a picture ({error})") from None
 
 

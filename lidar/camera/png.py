@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from geoscene.files import write_atomically
 from lidar.errors import FormatError
@@ -65,7 +65,7 @@ def read_png(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
             if image.mode not in ("RGB", "L", "I;16") or deep_colour:
                 raise FormatError(f"{path}: neither 8-bit colour nor 8- or 16-bit grey")
             return np.array(image)
-    except (OSError, UnidentifiedImageError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise FormatError(f"{path}: not a readable image ({error})") from error
 
 

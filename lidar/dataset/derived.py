@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 
+from geoscene.errors import NotWrittenError
 from geoscene.files import replaced_folder
 from lidar.dataset.layout import Paths, own_files
 from lidar.errors import DatasetError, InputError
@@ -40,4 +42,18 @@ def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:
         place = out / Path(folder).relative_to(source)
         return [name for name in names if place / name in left]
 
-    shutil.copytree(source, out, ignore=skip, dirs_exist_ok=True)
+    copy_folder(source, out, ignore=skip)
+
+
+def copy_folder(
+    source: Path, out: Path, *, ignore: Callable[[str, list[str]], list[str]] | None = None
+) -> None:
+    """Copy what is in a directory, but for the names that ``ignore`` returns of those in a folder.
+
+    Raises NotWrittenError, which names the first file that could not be copied.
+    """
+    try:
+        shutil.copytree(source, out, ignore=ignore, dirs_exist_ok=True)
+    except shutil.Error as error:
+        first, _, why = error.args[0][0]
+        raise NotWrittenError(f"{first}: cannot be copied ({str(why).partition(': ')[0]})") from error

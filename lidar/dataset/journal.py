@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from geoscene.columns import Columns
 from geoscene.csv_tables import table_blocks, write_blocks
+from geoscene.files import naming
 from geoscene.typing import Ints
 from lidar.dataset.checksums import file_digest
 
@@ -152,7 +153,7 @@ class Journal:
         """
         with self._lock:
             self.keep(sensor, frame, points=points, digests=digests)
-            with self.path.open("a", encoding="utf-8") as file:
+            with naming(self.path), self.path.open("a", encoding="utf-8") as file:
                 file.write(f"{sensor},{frame},{points},{frame_digest(digests)}\n")
 
     def file_digests(self, sensor: str, frame: int, *, count: int) -> list[bytes]:

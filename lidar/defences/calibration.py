@@ -159,14 +159,15 @@ def _read(file: Path) -> Calibration:
         raise InputError(f"{file}: is missing; lidar defend --calibrate makes one") from None
     except KeyError as error:
         raise InputError(f"{file}: is no calibration of defences ({error.args[0]} is missing)") from None
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
         raise InputError(f"{file}: is no calibration of defences ({error})") from None
 
 
 def _tail(row: Mapping[str, Any]) -> Tail:
     """A tail of a file; raises ValueError, KeyError or TypeError if it is none."""
     share, suspicion = np.array(row["share"], float), np.array(row["suspicion"], float)
-    if share.shape != suspicion.shape or (np.diff(share) >= 0).any() or (np.diff(suspicion) < 0).any():
+    falls, rises = (np.diff(share) < 0).all(), (np.diff(suspicion) >= 0).all()
+    if share.shape != suspicion.shape or not (falls and rises and np.isfinite(share).all()):
         raise ValueError("shares must fall and suspicions rise")
     return Tail(int(row["count"]), share, suspicion)
 

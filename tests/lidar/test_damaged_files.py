@@ -206,3 +206,11 @@ def test_gzipped_traffic_with_a_flipped_byte_is_refused(tmp_path):
 def test_numbers_without_an_end_in_a_journal_are_left_out(tmp_path):
     (tmp_path / "frames.csv").write_text(f"sensor,frame,points,digest\ntop,{'9' * 5000},1,a\ntop,1,5,b\n")
     assert read_journal(tmp_path / "frames.csv").of("top").frame.tolist() == [1]
+
+
+@pytest.mark.parametrize("row", ["count = inf\nshare = [0.5]", "count = 5\nshare = [nan]"])
+def test_a_calibration_with_numbers_that_are_not_finite_is_refused(row, tmp_path):
+    text = f'note = "a"\n[defence.shadow.frames]\nsuspicion = [1.0]\n{row}\n'
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(LidarError, match=r"a\.toml: is no calibration"):
+        read_calibration(tmp_path / "a.toml")

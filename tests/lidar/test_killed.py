@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 from helpers.scenes import names_in, same_files
 
+from geoscene.errors import NotWrittenError
 from geoscene.files import exclusive
 from lidar import pipeline
+from lidar.dataset.derived import copy_folder
 from lidar.dataset.layout import open_dataset, remove_dataset
 from lidar.errors import LidarError
 from lidar.integrity.keys import read_signer
@@ -132,3 +134,12 @@ def test_a_drive_is_deleted_by_whoever_comes_after_a_kill(forked, dataset, copy,
         remove_dataset(copy.path)
         assert not copy.path.exists() or names_in(copy.path) == []
         shutil.copytree(dataset.path, copy.path, dirs_exist_ok=True)
+
+
+def test_a_file_that_cannot_be_copied_is_named_in_one_line(copy, tmp_path):
+    (copy.path / "lidar_top" / "pcd" / "000001.pcd").unlink()
+    (copy.path / "lidar_top" / "pcd" / "000001.pcd").symlink_to(tmp_path / "gone")
+    with pytest.raises(NotWrittenError, match=r"000001\.pcd: cannot be copied \(.*No such file") as error:
+        copy_folder(copy.path, tmp_path / "out")
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 300

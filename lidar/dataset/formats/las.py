@@ -277,6 +277,11 @@ def _states_what_it_holds(path: Path) -> bool:
             more, extended, points = struct.unpack_from("<QIQ", head, 235)
         if not header + 54 * records <= start <= size or (extended and more + 60 * extended > size):
             return False
+        for _ in range(extended):  # records with a length each
+            file.seek(more + 20)
+            more += 60 + int.from_bytes(file.read(8), "little")
+            if more > size:
+                return False
         if kind < 128:
             return bool(start + length * points <= size)
         if points == 0:

@@ -120,3 +120,24 @@ def test_an_unreadable_image_is_named_in_the_error(tmp_path):
     path.write_bytes(b"not a png")
     with pytest.raises(FormatError, match=r"a\.png"):
         read_png(path)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_damaged_chunks_of_an_image_are_refused(number, tmp_path):
+    path = tmp_path / "a.png"
+    write_png(path, np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    whole = path.read_bytes()
+    at = [k for k in range(len(whole)) if whole[k : k + 4] in (b"IHDR", b"IDAT", b"IEND")][number - 1]
+    path.write_bytes(whole[:at] + b"\xa2\xe7\x85\x96" + whole[at + 4 :])
+    with pytest.raises(FormatError, match=r"a\.png"):
+        read_png(path)
+
+
+def test_an_image_of_a_billion_pixels_is_refused(tmp_path):
+    path = tmp_path / "a.png"
+    write_png(path, np.zeros((1, 1), np.uint8))
+    whole = path.read_bytes()
+    head = b"IHDR" + (10**5).to_bytes(4) * 2 + whole[24:29]
+    path.write_bytes(whole[:12] + head + zlib.crc32(head).to_bytes(4) + whole[33:])
+    with pytest.raises(FormatError, match=r"a\.png"):
+        read_png(path)

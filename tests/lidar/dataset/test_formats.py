@@ -16,7 +16,18 @@ from pypcd4 import Encoding, PointCloud
 from pyproj import CRS
 
 from geoscene.classes import Class
-from lidar.dataset.formats import FORMATS, LABELS, las, pcd, pcd_ascii, ply, read_cloud, read_table, text
+from lidar.dataset.formats import (
+    FORMATS,
+    LABELS,
+    MAPS,
+    las,
+    pcd,
+    pcd_ascii,
+    ply,
+    read_cloud,
+    read_table,
+    text,
+)
 from lidar.dataset.formats.las import LasInfo, open_las, read_chunks
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.errors import FormatError, InputError
@@ -381,4 +392,18 @@ def test_fewer_than_no_points_are_refused(name, count, tmp_path):
     with pytest.raises(FormatError, match="number of points"):
         form.count(path)
     with pytest.raises(FormatError, match=path.name):
+        read_table(path)
+
+
+def test_extended_records_that_a_file_cannot_hold_are_refused(tmp_path):
+    path = tmp_path / "a.copc.laz"
+    info, points = replace(INFO, offset=(0.0, 0.0, 0.0)), table(500)
+    points |= dict.fromkeys(("red", "green", "blue"), np.zeros(500, np.uint8))
+    with MAPS["copc"].open_map(path, info=info, columns=tuple(points)) as append:
+        append(points)
+    assert len(read_table(path)["x"]) == 500
+    whole = path.read_bytes()
+    at = int.from_bytes(whole[235:243], "little") + 20
+    path.write_bytes(whole[:at] + b"\xf0" * 5 + whole[at + 5 :])
+    with pytest.raises(FormatError, match="states more than it holds"):
         read_table(path)
