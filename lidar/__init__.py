@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from geoscene import __version__ as __version__
 
 if TYPE_CHECKING:
+    from lidar.conversion import convert as convert
     from lidar.dataset.formats import read_cloud as read_cloud
     from lidar.dataset.layout import Dataset as Dataset
     from lidar.dataset.layout import open_dataset as open_dataset
@@ -36,6 +37,7 @@ _HOMES = {
     "TrafficOptions": "traffic.populate",
     "TrainingData": "training",
     "aggregate": "maps.aggregate",
+    "convert": "conversion",
     "drive": "pipeline",
     "load_rig": "rig.specs",
     "load_sensor": "rig.scanner",

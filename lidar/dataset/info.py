@@ -318,7 +318,7 @@ def _road_users(dataset: Dataset) -> dict[str, int]:
     if path.exists():
         with reading_file(path), opened_rows(path) as rows:
             for row in rows:
-                users.setdefault(row["class"], set()).add(row["id"])
+                users.setdefault(Class[str(row["class"]).upper()].name.lower(), set()).add(row["id"])
     return {name: len(users[name]) for name in sorted(users)}
 
 

@@ -201,6 +201,14 @@ def test_a_sensor_without_a_rate_is_refused(copy, rate):
         describe(copy)
 
 
+def test_a_box_that_has_lost_its_class_is_damage(copy):
+    path = copy / "boxes.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([*lines[:2], ",".join(lines[2].split(",")[:2])]) + "\n")
+    with pytest.raises(DatasetError, match=r"boxes\.csv: damaged"):
+        describe(copy, full=True)
+
+
 @pytest.mark.parametrize("rows", [0, 1])
 @pytest.mark.parametrize("name", ["poses.csv", "lidar_top/timestamps.csv"])
 def test_tables_that_have_lost_their_rows_are_damaged(copy, name, rows):
