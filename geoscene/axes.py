@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 _STEPS = (1, 2, 5)
 _POWERS = range(-12, 16)
+_SHORT = 4
+"""Ratio of the ends of a logarithmic axis below which its ticks are those of a linear one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +36,7 @@ class Axis:
 
         parts : of a linear axis between ticks, at most
         """
-        if not self.log:
+        if not self.log or self.high / self.low < _SHORT:
             step = self.step or _step((self.high - self.low) / parts)
             first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
             return [float(f"{k * step:.12g}") for k in range(first, last + 1)]

@@ -24,6 +24,9 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 78, 230, 64, 58
 _LINE = 22
 """Pixels between the lines of a legend."""
 
+_SCALE = (170, 260)
+"""Pixels of the height of a scale, at least and at most."""
+
 _TICK = (90, 36)
 """Pixels between ticks of x and y, at least."""
 
@@ -245,7 +248,7 @@ def _swatch(canvas: Canvas, box: Box, *, color: Color) -> None:
 def _draw_scale(canvas: Canvas, scale: Scale, *, place: Place, bottom: float) -> float:
     """Draw the colours of a scale with its ticks from (left, top) down; return where it ends."""
     left, top = place
-    bottom = min(bottom, top + 260)
+    bottom = min(max(bottom, top + _SCALE[0]), top + _SCALE[1])
     title_room = 26
     axis = scale.axis
     values = (np.geomspace if axis.log else np.linspace)(axis.high, axis.low, 64)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.axes import Axis
 from geoscene.charts import Axes
 from geoscene.classes import Class
 from geoscene.panels import Raster, Scale, Series, figure
 from geoscene.progress import Progress
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import cloud_points, frames_within, scanner_clouds
@@ -19,9 +22,19 @@ from lidar.maps.colors import ramp
 from lidar.options import PlotOptions
 from lidar.plots.drawn import Drawn, plain, thinned
 
+Counts = NDArray[np.unsignedinteger[Any]]
+
 _SIDES = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-_ACROSS = 800
+"""Sides of cells in metres, of which those that fit the picture are chosen."""
+
+_FINEST = (0.1, 0.5, 1.0, 5.0, 10.0, 50.0)
+"""Sides in which returns are counted at first: all larger ones of `_SIDES` are multiples."""
+
+_ACROSS = 500
 """Cells across a picture, at most, unless their side is given."""
+
+_BEYOND = 50.0
+"""Metres beyond a scanner's range at which returns can be: it is not on the path, and ranges have noise."""
 
 _MOST = 1 << 26
 """Cells that are counted, at most."""
@@ -36,15 +49,17 @@ def coverage(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> D
     names = [options.sensor] if options.sensor or not lidars else list(lidars)
     streams = [frames_within(scanner_clouds(dataset, name), options.limits) for name in names]
     trajectory = dataset.trajectory()
-    reach = max(float(s.sensor.get("max_range", 100.0)) for s in streams)
+    reach = _BEYOND + max(float(s.sensor.get("max_range", 100.0)) for s in streams)
     low = trajectory.position[:, :2].min(axis=0) - reach
     high = trajectory.position[:, :2].max(axis=0) + reach
-    side = options.resolution or next((s for s in _SIDES if (high - low).max() / s <= 2 * _ACROSS), 200.0)
+    side = options.resolution or next(
+        (s for s in _FINEST if np.prod(np.ceil((high - low) / s) + 1) <= _MOST), _FINEST[-1]
+    )
     first = np.floor(low / side)
     wide, tall = (np.ceil(high / side) - first).astype(np.int64).tolist()
     if wide * tall > _MOST:
         raise InputError(f"`resolution` {side:g}: {wide} by {tall} cells are too many; give a coarser one")
-    counts = np.zeros(wide * tall, np.int64)
+    counts = np.zeros(wide * tall, np.uint32)
     total = sum(len(s.files) for s in streams)
     done = 0
     for clouds in streams:
@@ -55,27 +70,46 @@ def coverage(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> D
             matrix = clouds.mount.matrix
             placed, _ = placed_returns(table, trajectory, start_ns=start, vehicle_from_sensor=matrix)
             cell = np.floor(placed[table["label"] != Class.NOISE, :2] / side) - first
-            inside = ((cell >= 0) & (cell < (wide, tall))).all(axis=1)
-            x, y = cell[inside].astype(np.int64).T
-            counts += np.bincount(y * wide + x, minlength=wide * tall)
-    grid = counts.reshape(tall, wide)
-    if not grid.any():
+            x, y = np.clip(cell, 0, (wide - 1, tall - 1)).astype(np.int64).T
+            np.add.at(counts, y * wide + x, np.uint32(1))
+    if not counts.any():
         raise DatasetError(f"{dataset.path}: no returns in these frames of {', '.join(names)}")
-    scale = float(trajectory.scale.mean())
-    return _drawn(grid, corner=first * side, side=side, scale=scale, trajectory=trajectory, names=names)
+    grid, first = _cropped(
+        counts.reshape(tall, wide), first.astype(np.int64), track=trajectory.position / side
+    )
+    if options.resolution is None:
+        wanted = next((s for s in _SIDES if s >= side and max(grid.shape) * side / s <= _ACROSS), _SIDES[-1])
+        grid, first = _coarser(grid, first, factor=round(wanted / side))
+        side = wanted
+    return _drawn(grid, corner=first.astype(float) * side, side=side, trajectory=trajectory, names=names)
 
 
-def _drawn(
-    grid: np.ndarray, *, corner: Float, side: float, scale: float, trajectory: Trajectory, names: list[str]
-) -> Drawn:
-    """The figure of counts (h, w) from the south; ``corner`` is their south-west one, scene metres."""
+def _cropped(grid: Counts, first: Ints, *, track: Float) -> tuple[Counts, Ints]:
+    """The part of counts (h, w) that holds all of them and a track (n, 2 or more), and its first cell (x, y).
+
+    first : cell (2,) of the grid's first column and row
+    track : in cells
+    """
     rows, columns = (np.flatnonzero(grid.any(axis=axis)) for axis in (1, 0))
-    path = trajectory.position[:, :2]
-    track = np.floor((path - corner) / side).astype(np.int64)
-    first = np.minimum([columns[0], rows[0]], track.min(axis=0))
-    last = np.maximum([columns[-1], rows[-1]], track.max(axis=0))
-    part = grid[first[1] : last[1] + 1, first[0] : last[0] + 1]
-    density = part / (side / scale) ** 2
+    path = np.floor(track[:, :2]).astype(np.int64) - first
+    low = np.minimum([columns[0], rows[0]], path.min(axis=0))
+    high = np.maximum([columns[-1], rows[-1]], path.max(axis=0))
+    return grid[low[1] : high[1] + 1, low[0] : high[0] + 1], first + low
+
+
+def _coarser(grid: Counts, first: Ints, *, factor: int) -> tuple[Counts, Ints]:
+    """Counts in cells that are larger by a whole factor, whose borders are multiples of their side."""
+    before = first % factor
+    after = -(before + grid.shape[::-1]) % factor
+    whole = np.pad(grid, ((before[1], after[1]), (before[0], after[0])))
+    rows, columns = (n // factor for n in whole.shape)
+    return whole.reshape(rows, factor, columns, factor).sum(axis=(1, 3)), (first - before) // factor
+
+
+def _drawn(grid: Counts, *, corner: Float, side: float, trajectory: Trajectory, names: list[str]) -> Drawn:
+    """The figure of counts (h, w) from the south; ``corner`` is their south-west one, scene metres."""
+    scale = float(trajectory.scale.mean())
+    density = grid / (side / scale) ** 2
     seen = density > 0
     axis = Axis(
         float(density[seen].min()),
@@ -87,9 +121,9 @@ def _drawn(
     )
     pixels = np.full((*density.shape, 3), 255, np.uint8)
     pixels[seen] = by_density.colors(density[seen])
-    (west, south), (east, north) = corner + first * side, corner + (last + 1) * side
+    (west, south), (east, north) = corner, corner + side * np.array(grid.shape[::-1])
     area = float(seen.sum() * (side / scale) ** 2)
-    about = f"{', '.join(names)}: {int(part.sum()):,} returns on {area:,.0f} m^2"
+    about = f"{', '.join(names)}: {int(grid.sum()):,} returns on {area:,.0f} m^2"
     axes = Axes(
         f"Coverage by {about}, cells of {side:g} m",
         "x, m (grid east, scene frame)",
@@ -103,13 +137,13 @@ def _drawn(
         (float(south), float(north)),
         scale=by_density,
         square=True,
-        lines=[Series("path of the vehicle", thinned(*path.T), color=(200, 40, 30))],
+        lines=[Series("path of the vehicle", thinned(*trajectory.position[:, :2].T), color=(200, 40, 30))],
     )
     wide, tall = float(east - west), float(north - south)
     width = min(820, round(820 * wide / tall)) if tall > wide else 820
-    size = (308 + width, 122 + round(width * tall / wide))
+    size = (308 + width, 122 + max(round(width * tall / wide), 220))
     median = float(np.median(density[seen]))
-    numbers = {"sensors": names, "returns": int(part.sum()), "area_m2": area, "cell_m": side}
+    numbers = {"sensors": names, "returns": int(grid.sum()), "area_m2": area, "cell_m": side}
     numbers |= {"median_per_m2": median, "bounds_m": [float(v) for v in (west, south, east, north)]}
     note = f"{about} (cells of {side:g} m), median {median:.3g} per m^2"
     return Drawn(figure([raster], size=size), note, numbers)

@@ -37,6 +37,11 @@ def plain(value: float) -> str:
     return f"{value:g}"
 
 
+def whole(value: float) -> str:
+    """The text of a whole number on an axis; others have none."""
+    return f"{value:g}" if value == round(value) else ""
+
+
 def counted(value: float) -> str:
     """The text of a count on an axis."""
     return f"{value:,.0f}" if value >= 1 else f"{value:g}"

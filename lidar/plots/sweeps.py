@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from lidar.plots.drawn import (
     most_frequent,
     outline,
     plain,
+    whole,
 )
 
 _WIDTH = 872
@@ -49,6 +51,12 @@ Lasers beside each other see elevations that vary with the range, those of an HD
 _UPRIGHT = 0.7
 """Cosine of the tilt of a scanner up to which its azimuths are about those of the vehicle."""
 
+_DOWN_DEG = -50.0
+"""Median elevation of the returns of scanners that look down, below which azimuths say little."""
+
+_FLAT_DEG = 1.0
+"""Range of elevations of scanners with one level."""
+
 _LEGEND = 10
 """Classes that a figure names, at most; the others are together."""
 
@@ -57,13 +65,17 @@ _EMPTY = np.array((246, 246, 248), np.uint8)
 
 _INTENSITIES = np.arange(0.0, 257.0, 2.0)
 _RANGES = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+"""Widths of bins of ranges in metres, all multiples of the first, in which returns are counted."""
+
+_BINS = 120
+"""Bins of ranges, at most."""
 
 
 def range_image(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:
     """Range, intensity and class of one sweep from the scanner: forward in the middle, left on the left.
 
     Of the returns in a cell the nearest is shown. Rows are rings if each has about one elevation, else
-    elevations.
+    elevations; of scanners that look down, times, and columns angles across.
 
     Raises DatasetError for a sweep without returns.
     """
@@ -73,26 +85,24 @@ def range_image(dataset: Dataset, options: PlotOptions, *, progress: Progress) -
     table = cloud_points(path)
     if not len(table["x"]):
         raise DatasetError(f"{path}: has no returns; choose another frame by `frames`")
-    azimuth, elevation, distance = _directions(table)
-    azimuth, zero = _from_forward(azimuth, clouds.mount)
-    row, y, name = _image_rows(table["ring"].astype(np.int64), elevation)
-    low, high = math.floor(azimuth.min()), math.ceil(azimuth.max())
-    column = np.clip(((high - azimuth) / (high - low) * _WIDTH).astype(np.int64), 0, _WIDTH - 1)
-    count = int(row.max()) + 1
+    angle, across, rows = _image_sides(table, clouds.mount)
+    distance, row, count = _directions(table)[2], rows.row, int(rows.row.max()) + 1
+    low, high = math.floor(angle.min()), max(math.ceil(angle.max()), math.floor(angle.min()) + 1)
+    column = np.clip(((high - angle) / (high - low) * _WIDTH).astype(np.int64), 0, _WIDTH - 1)
     first = np.full((count, _WIDTH), -1)
     for_each = np.lexsort([-distance])  # the nearest is written last
     first[count - 1 - row[for_each], column[for_each]] = for_each
     seen = first >= 0
     farthest = max(float(np.percentile(distance, 99)), 1.0)
-    ranges = Axis(max(float(distance.min()), 0.5), max(farthest, 2 * float(distance.min())), log=True)
+    ranges = Axis(max(float(distance.min()), 0.5), max(farthest, 1.1 * float(distance.min())), log=True)
     codes, counts = np.unique(table["label"], return_counts=True)
     ranked = codes[np.argsort(-counts, kind="stable")][:_LEGEND].tolist()
 
     def part(title: str, pixels: NDArray[np.uint8], *, scale: Scale | None = None) -> Raster:
         image = np.where(seen[..., None], pixels[first], _EMPTY)
         legend = [] if scale else [(class_name(c), _rgb(class_codes().color[c])) for c in ranked]
-        axes = Axes(title, f"azimuth, deg (0: {zero}; left positive)", name, plain)
-        return Raster(axes, image, (high, low), y, scale=scale, legend=legend)
+        axes = Axes(title, across, rows.title, whole if rows.title == "ring" else plain)
+        return Raster(axes, image, (high, low), rows.ends, scale=scale, legend=legend)
 
     about = f"{clouds.name} ({clouds.sensor.get('model', 'scanner')}), frame {frame}"
     by_range = Scale("range, m", ranges, lambda v: _shades(v, ranges))
@@ -128,17 +138,44 @@ def _from_forward(azimuth: Float, mount: Mount) -> tuple[Float, str]:
     return (turned + 180) % 360 - 180, "the vehicle's forward"
 
 
-def _image_rows(ring: Ints, elevation: Float) -> tuple[Ints, tuple[float, float], str]:
-    """Row (n,) of each return from below, the values of y at the lower and upper border, and their name."""
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Row (n,) of each return from below, the values at the lower and upper border, and what they are."""
+
+    row: Ints
+    ends: tuple[float, float]
+    title: str
+
+
+def _image_sides(table: Table, mount: Mount) -> tuple[Float, str, _Rows]:
+    """Angles (n,) of the columns of a range image in degrees, left positive, what they are, and its rows."""
+    azimuth, elevation, _ = _directions(table)
+    if np.median(elevation) < _DOWN_DEG:
+        angle = np.degrees(np.arctan2(table["y"].astype(float), -table["z"].astype(float)))
+        rows = _even_rows(table["time_ns"] / 1e6, "time in the sweep, ms")
+        return angle, "angle across the scanner's x axis, deg (0: down; left positive)", rows
+    azimuth, zero = _from_forward(azimuth, mount)
+    rows = _image_rows(table["ring"].astype(np.int64), elevation)
+    return azimuth, f"azimuth, deg (0: {zero}; left positive)", rows
+
+
+def _image_rows(ring: Ints, elevation: Float) -> _Rows:
+    """Rings as rows if each has about one elevation, else elevations."""
     rings = int(ring.max()) + 1
     returns = np.maximum(np.bincount(ring, minlength=rings), 1)
     mean = np.bincount(ring, elevation, rings) / returns
     spread = np.sqrt(np.maximum(np.bincount(ring, elevation**2, rings) / returns - mean**2, 0))
-    if rings >= 4 and spread.max() < _LEVEL * np.ptp(elevation):
-        return ring, (-0.5, rings - 0.5), "ring"
-    low, high = float(elevation.min()), max(float(elevation.max()), float(elevation.min()) + 1e-3)
-    row = np.clip(((elevation - low) / (high - low) * _ROWS).astype(np.int64), 0, _ROWS - 1)
-    return row, (low, high), "elevation, deg"
+    flat = np.ptp(elevation) < _FLAT_DEG
+    if flat or (rings >= 4 and spread.max() < _LEVEL * np.ptp(elevation)):
+        return _Rows(ring, (-0.5, rings - 0.5), "ring")
+    return _even_rows(elevation, "elevation, deg")
+
+
+def _even_rows(value: Float, title: str) -> _Rows:
+    """Values (n,) in 64 rows."""
+    low, high = float(value.min()), max(float(value.max()), float(value.min()) + 1e-3)
+    row = np.clip(((value - low) / (high - low) * _ROWS).astype(np.int64), 0, _ROWS - 1)
+    return _Rows(row, (low, high), title)
 
 
 def _shades(distance: Float, axis: Axis) -> NDArray[np.uint8]:
@@ -181,9 +218,7 @@ def intensity(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> 
 def returns(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:
     """Returns by range: of each class, and of each origin where stages acted."""
     clouds = frames_within(scanner_clouds(dataset, options.sensor), options.limits)
-    reach = float(clouds.sensor.get("max_range", 100.0))
-    step = next((s for s in _RANGES if reach / s <= 150), 100.0)
-    edges = np.arange(0.0, reach + 2 * step, step)
+    edges: Float = np.arange(0.0, float(clouds.sensor.get("max_range", 100.0)) + 2 * _RANGES[-1], _RANGES[0])
     counts = np.zeros((256, len(edges) - 1), np.int64)
     origins = np.zeros((len(Origin), len(edges) - 1), np.int64)
     known = False
@@ -197,8 +232,14 @@ def returns(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Dr
     sweeps = len(clouds.frames)
     everything = counts.sum(axis=0)
     total = int(everything.sum())
-    middles = (edges[1:] + edges[:-1]) / 2
-    median = float(middles[np.searchsorted(np.cumsum(everything), total / 2)]) if total else math.nan
+    median = float(edges[np.searchsorted(np.cumsum(everything), total / 2)]) if total else math.nan
+    farthest = float(edges[np.flatnonzero(everything).max(initial=0) + 1])
+    step = next((s for s in _RANGES if farthest / s <= _BINS), _RANGES[-1])
+    group = np.arange(
+        0, math.ceil(farthest / step - 1e-9) * round(step / _RANGES[0]), round(step / _RANGES[0])
+    )
+    counts, origins = (np.add.reduceat(each, group, axis=1) for each in (counts, origins))
+    edges = np.arange(len(group) + 1, dtype=np.float64) * step
     about = f"{clouds.name}, {sweeps} sweeps, {total / sweeps:,.0f} returns per sweep"
 
     def panel(title: str, series: list[Series]) -> Panel:

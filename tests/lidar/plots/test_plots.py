@@ -7,12 +7,16 @@ import json
 import math
 import re
 import shutil
+from collections import Counter
 from typing import get_args
 
 import numpy as np
 import pytest
 from helpers.drives import record
 from helpers.programs import run_program
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from PIL import Image
 from pyproj import Geod
 
@@ -22,9 +26,12 @@ from geoscene.classes import Class, class_codes
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
+from lidar.geometry.mounts import Mount
 from lidar.options import DriveOptions
 from lidar.plots import FIGURES, plot
+from lidar.plots.coverage import _coarser
 from lidar.plots.drawn import thinned
+from lidar.plots.sweeps import _image_sides
 
 SCANNER = "lidar_top"
 
@@ -144,6 +151,20 @@ def test_the_range_image_of_lasers_beside_each_other_has_no_empty_rows(scene, tm
     assert (ranges != (246, 246, 248)).any(axis=(1, 2)).all()
 
 
+def test_rows_of_scanners_that_look_down_are_times():
+    table = {
+        **dict(
+            zip("xyz", np.array([[0, 0, 0], [-100, 0, 100], [-200, -200, -200]], np.float32), strict=True)
+        ),
+        "time_ns": np.array([0, 5_000_000, 10_000_000], np.uint32),
+        "ring": np.zeros(3, np.uint16),
+    }
+    angle, _, rows = _image_sides(table, Mount())
+    assert np.allclose(angle, np.degrees(np.arctan([-0.5, 0, 0.5])))
+    assert (np.diff(rows.row) > 0).all()
+    assert rows.ends == (0, 10)
+
+
 def test_coverage_counts_every_true_return(drive, tmp_path):
     svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER, "--resolution", "0.5")
     dataset = open_dataset(drive)
@@ -162,6 +183,33 @@ def test_coverage_counts_every_true_return(drive, tmp_path):
     assert (plan != 255).any(axis=2).sum() == len(cells)
     west, south, east, north = told["bounds_m"]
     assert plan.shape[:2] == (round((north - south) / 0.5), round((east - west) / 0.5))
+
+
+def test_coverage_is_drawn_in_cells_that_fit(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER)
+    (plan,) = images(svg)
+    assert 200 <= max(plan.shape[:2]) <= 500
+    side = told["cell_m"]
+    assert all(math.isclose(bound / side, round(bound / side), abs_tol=1e-6) for bound in told["bounds_m"])
+    (tmp_path / "fine").mkdir()
+    fine = drawn(drive, tmp_path / "fine", "coverage", "--sensor", SCANNER, "--resolution", "0.5")[1]
+    assert told["returns"] == fine["returns"]
+
+
+@given(
+    arrays(np.uint32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 99)),
+    st.tuples(st.integers(-50, 50), st.integers(-50, 50)),
+    st.integers(1, 7),
+)
+def test_larger_cells_hold_the_counts_of_the_smaller_ones_in_them(grid, first, factor):
+    coarse, corner = _coarser(grid, np.array(first), factor=factor)
+    expected = Counter()
+    for (row, column), count in np.ndenumerate(grid):
+        expected[(column + first[0]) // factor, (row + first[1]) // factor] += int(count)
+    found = {
+        (column + corner[0], row + corner[1]): int(count) for (row, column), count in np.ndenumerate(coarse)
+    }
+    assert {cell: count for cell, count in found.items() if count} == +expected
 
 
 def test_errors_of_fixes_are_geodesic_differences(drive, tmp_path):
