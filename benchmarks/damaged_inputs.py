@@ -554,6 +554,8 @@ def _write_derived(folder: Path) -> None:
     _run("lidar", "sign", folder / "data-ply", *keys, "-o", folder / "signed-data")
     for name in ("kitti", "nuscenes"):
         _run("lidar", "convert", data, "--to", name, "-o", folder / f"to-{name}")
+    _run("lidar", "convert", data, "--to", "tum", "-o", folder / "to-tum")
+    shutil.copy(folder / "to-tum" / "vehicle.tum", folder)
     for end in ("laz", "las", "copc.laz", "ply", "pcd", "e57"):
         _run("lidar", "map", data, "-o", folder / f"map.{end}")
     for end in ("obj", "ply", "stl"):

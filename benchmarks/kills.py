@@ -74,6 +74,9 @@ def cases(folder: Path) -> dict[str, Case]:
         "map": Case(
             ["lidar", "map", data, "--quiet", "--voxel=0.3", "--raster=dsm,density"], "m.laz", ["--noise"]
         ),
+        "map tiles": Case(["lidar", "map", data, "--quiet", "--tiles=50"], "tiles", []),
+        "laz": Case([*convert, "laz"], "data", []),
+        "page folder": Case(view, "pages", ["--layers=buildings"]),
         "copc": Case(["lidar", "map", data, "--quiet"], "m.copc.laz"),
         "nuscenes": Case([*convert, "nuscenes"], "out", []),
         "kitti": Case([*convert, "kitti"], "out", []),

@@ -29,6 +29,7 @@ from lidar.dataset.truth_files import read_truth
 from lidar.defences.calibration import read_calibration
 from lidar.detection.forest import read_forest
 from lidar.errors import FormatError
+from lidar.geometry.trajectory_tum import read_tum
 from lidar.integrity.digest_files import read_digests, read_links
 from lidar.integrity.keys import read_signer
 from lidar.maps.selection import _polygons
@@ -110,6 +111,7 @@ _CONFIGURATIONS: dict[str, Callable[[Path], object]] = {
     "drone.toml": load_vehicle,
     "stages.toml": lambda path: read_stages([str(path)]),
     "a.gpx": lambda path: read_track(path, _FRAME),
+    "vehicle.tum": read_tum,
     "a.geojson": lambda path: read_track(path, _FRAME),
     "fcd.xml": read_fcd,
     "fcd.xml.gz": read_fcd,

@@ -6,7 +6,7 @@ axes of the position from those of the body. Lines that begin with # are comment
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from geoscene.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import FormatError, InputError
+
+_LATEST_S = 2**32
+"""Seconds since 1970 before which times are."""
 
 
 def write_tum(path: Path, time_ns: NDArray[np.int64], *, position: Float, quat_xyzw: Float) -> None:
@@ -42,9 +45,11 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Float, Float]:
         if not (words := line.split()) or words[0].startswith("#"):
             continue
         try:
-            times.append(int(Decimal(words[0]) * 10**9))
+            seconds = Decimal(words[0])
+            # Before it is a whole number, which may have a million digits.
+            times.append(int(seconds * 10**9) if abs(seconds) < _LATEST_S else _LATEST_S * 10**9)
             rows.append([float(word) for word in words[1:]])
-        except (InvalidOperation, ValueError, OverflowError):
+        except (ArithmeticError, ValueError):
             raise FormatError(f"{path}, line {number}: not numbers") from None
         if len(rows[-1]) != 7:
             raise FormatError(
@@ -53,7 +58,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Float, Float]:
     poses = np.array(rows, float).reshape(-1, 7)
     if len(times) < 2:
         raise FormatError(f"{path}: {len(times)} poses; a trajectory has two or more")
-    if max(map(abs, times)) >= 2**62:
+    if max(map(abs, times)) >= _LATEST_S * 10**9:
         raise FormatError(f"{path}: times that are no POSIX seconds")
     time_ns = np.array(times, np.int64)
     if (np.diff(time_ns) <= 0).any():

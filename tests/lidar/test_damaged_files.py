@@ -17,6 +17,7 @@ from lidar.defences.calibration import read_calibration
 from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.geometry.trajectory_tum import read_tum
 from lidar.planning.replay import read_replay
 from lidar.planning.waypoints import read_track as read_route
 from lidar.redteam.plan import read_plan
@@ -214,3 +215,11 @@ def test_a_calibration_with_numbers_that_are_not_finite_is_refused(row, tmp_path
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(LidarError, match=r"a\.toml: is no calibration"):
         read_calibration(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("time", ["1e999999", "-1e99999999", "9" * 5000, "nan", "inf", "4294967296"])
+def test_times_of_a_trajectory_that_are_no_times_are_refused_at_once(time, tmp_path):
+    """Decimals hold up to 1e999999, and raise errors of their own beyond."""
+    (tmp_path / "a.tum").write_text(f"1.5 0 0 0 0 0 0 1\n{time} 0 0 0 0 0 0 1\n")
+    with pytest.raises(LidarError, match=r"a\.tum"):
+        read_tum(tmp_path / "a.tum")
