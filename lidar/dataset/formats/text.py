@@ -86,4 +86,4 @@ def read(path: Path) -> Table:
 
 def count(path: Path) -> int:
     """Number of points of a file."""
-    return path.read_bytes().count(b"\n") - 1
+    return sum(1 for line in path.read_bytes().splitlines() if line) - 1

@@ -407,3 +407,10 @@ def test_extended_records_that_a_file_cannot_hold_are_refused(tmp_path):
     path.write_bytes(whole[:at] + b"\xf0" * 5 + whole[at + 5 :])
     with pytest.raises(FormatError, match="states more than it holds"):
         read_table(path)
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\r\n", "\n\n"])
+def test_points_of_a_text_are_counted_however_it_ends(end, tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(f"x,y,z\n1,2,3\n\n4,5,6{end}", newline="")
+    assert FORMATS["csv"].count(path) == len(read_table(path)["x"]) == 2
