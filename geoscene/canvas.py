@@ -113,7 +113,7 @@ class Canvas:
         pen = ImageDraw.Draw(picture)
         for text in self._texts:
             font = ImageFont.load_default(size=text.size)
-            pen.text(text.place, text.words, fill=text.color, font=font, anchor=text.anchor)
+            pen.text(text.place, drawable(text.words), fill=text.color, font=font, anchor=text.anchor)
         file = io.BytesIO()
         picture.save(file, "PNG")
         return file.getvalue()
@@ -134,6 +134,11 @@ class Canvas:
 
 SUFFIXES = (".png", ".svg")
 """Of the files that a canvas makes."""
+
+
+def drawable(words: str) -> str:
+    """Words in letters that Pillow's own font has: it lacks the micro sign."""
+    return words.replace("µ", "u")
 
 
 def _draw(mark: _Line | _Area | _Dot | _Picture, picture: Image.Image) -> None:

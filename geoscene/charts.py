@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from geoscene.axes import log_axis
-from geoscene.canvas import INK, Color
+from geoscene.canvas import INK, Color, drawable
 
 GREY: Color = (205, 208, 214)
 """Of ticks and grids."""
@@ -110,7 +110,9 @@ def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: i
         return low + (top - low) * y_axis.share(value) if value > 0 else bottom
 
     def text(place: tuple[float, float], words: str, *, anchor: str) -> None:
-        pen.text(place, words, fill=INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white")
+        pen.text(
+            place, drawable(words), fill=INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white"
+        )
 
     text((left, 16), axes.title, anchor="la")
     text(((left + right) / 2, height - 16), axes.x, anchor="ms")

@@ -3,8 +3,9 @@
 import io
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageFont
 
+from geoscene.canvas import drawable
 from geoscene.charts import Axes, Point, metres, scatter, share
 
 RED = (200, 60, 40)
@@ -22,6 +23,13 @@ def red_box(*points):
 def test_figures_have_fitting_units():
     assert [metres(v) for v in (0, 1e-12, 2e-6, 0.25)] == ["0", "below 1 nm", "2 µm", "25 cm"]
     assert [share(v) for v in (0, 0.1, -0.0021, 1.0)] == ["0", "10 %", "-0.21 %", "100 %"]
+
+
+def test_the_font_of_pictures_has_every_letter_of_lengths():
+    font = ImageFont.load_default(size=15)
+    unknown = bytes(font.getmask("\uffff"))
+    for letter in set("".join(metres(v) for v in (0, 1e-12, 2e-9, 2e-6, 2e-3, 0.25, 3.0))) - {" "}:
+        assert bytes(font.getmask(drawable(letter))) != unknown, letter
 
 
 def test_intervals_are_lines_within_the_axes():
