@@ -256,10 +256,11 @@ def write(path: Path, table: Table, *, info: LasInfo) -> None:
 
 
 def count(path: Path) -> int:
-    """Number of points of a file: the entry at byte 247 of the header of LAS 1.4 (R15, table 3)."""
+    """Number of points of a file: an entry of the header, at byte 247 of LAS 1.4 (R15, table 3)."""
     with path.open("rb") as file:
-        file.seek(247)
-        return int.from_bytes(file.read(8), "little")
+        head = file.read(255)
+    at, end = (247, 255) if head[25] >= 4 else (107, 111)
+    return int.from_bytes(head[at:end], "little")
 
 
 def _states_what_it_holds(path: Path) -> bool:

@@ -414,3 +414,14 @@ def test_points_of_a_text_are_counted_however_it_ends(end, tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(f"x,y,z\n1,2,3\n\n4,5,6{end}", newline="")
     assert FORMATS["csv"].count(path) == len(read_table(path)["x"]) == 2
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+def test_points_of_las_are_counted_in_the_header_of_its_version(version, tmp_path):
+    file = laspy.LasData(laspy.LasHeader(version=version, point_format=1 if version == "1.2" else 6))
+    file.x = file.y = file.z = np.zeros(17)
+    file.write(tmp_path / "a.las")
+    assert FORMATS["las"].count(tmp_path / "a.las") == 17
+    (tmp_path / "b.las").write_bytes(b"LASF")
+    with pytest.raises(FormatError, match="number of points"):
+        FORMATS["las"].count(tmp_path / "b.las")
