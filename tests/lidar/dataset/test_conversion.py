@@ -142,6 +142,17 @@ def test_clouds_that_lack_what_a_format_holds_are_refused(folder, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["source"]
 
 
+def test_a_signature_of_the_former_files_is_left_out(folder, tmp_path, caplog):
+    source = shutil.copytree(folder / "plain", tmp_path / "source")
+    (tmp_path / "key").write_text("5f" * 32)
+    done = run_program("lidar", "sign", source, "--chain", tmp_path / "key")
+    assert (done.returncode, (source / "integrity" / "chain.json").is_file()) == (0, True)
+    convert(source, tmp_path / "npz", to="npz")
+    assert f"{source / 'integrity'}: left out" in caplog.text
+    assert not (tmp_path / "npz" / "integrity").exists()
+    assert verify_dataset(tmp_path / "npz").intact
+
+
 def test_a_damaged_cloud_ends_a_conversion_and_nothing_is_left(folder, tmp_path):
     source = shutil.copytree(folder / "plain", tmp_path / "source")
     cloud = source / "doppler" / "pcd" / "000001.pcd"
