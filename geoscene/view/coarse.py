@@ -6,12 +6,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geoscene.classes import Class
 from geoscene.mesh import FLOOR, Instances, Mesh
 from geoscene.splitmix import uniform_at
-from geoscene.typing import Bools, Float
+from geoscene.typing import Bools, Float, Ints
 
 _ON_EDGE = 1e-6
 """Metres within which a vertex lies on a side of a box."""
+
+_BARE = 4.0
+"""Cells along a side of a cell of bare ground."""
+
+_INSIDE, _BARE_INSIDE = 1.0, 5.0
+"""Kinds of vertices of the ground inside a box; those on its sides are between them."""
 
 _THINNEST = 0.5
 """Instances whose second-largest side is a smaller share of a cell are left out."""
@@ -23,13 +30,19 @@ def coarser_mesh(mesh: Mesh, *, cell: float, box: Sequence[float]) -> Mesh:
     Vertices move by at most the diagonal of a cell, to the vertex nearest to the middle of their cell (vertex
     clustering; Rossignac and Borrel 1993). Those of solids and of surfaces are apart, and so are those on the
     sides of ``box`` (xmin, ymin, xmax, ymax): surfaces of neighbouring boxes keep their common edges without
-    gaps. Undersides of solids are left out.
+    gaps. Vertices of bare ground alone, inside the box, stand in cells of `_BARE` sides: what lies between
+    them is even. Undersides of solids are left out.
     """
     faces = mesh.faces[~(mesh.closed & (mesh.surface & 3 == FLOOR))]
     rows = np.flatnonzero(~(mesh.closed & (mesh.surface & 3 == FLOOR)))
     ground = np.zeros(len(mesh.vertices), np.bool_)
     ground[faces[~mesh.closed[rows]]] = True
-    keep = _nearest(mesh.vertices, cell=cell, apart=_apart(mesh.vertices, ground, box=box))
+    bare = ground.copy()
+    bare[faces[mesh.klass[rows] != Class.TERRAIN]] = False
+    kind = _apart(mesh.vertices, ground, box=box)
+    kind[bare & (kind == _INSIDE)] = _BARE_INSIDE
+    sides = np.where(kind == _BARE_INSIDE, _BARE * cell, cell)
+    keep = _nearest(mesh.vertices, sides=sides, apart=kind)
     faces = keep[faces]
     a, b, c = faces.T
     whole = (a != b) & (b != c) & (c != a)
@@ -58,13 +71,13 @@ def _apart(points: Float, ground: Bools, *, box: Sequence[float]) -> Float:
         np.minimum(np.abs(points[:, axis] - low), np.abs(points[:, axis] - high)) < _ON_EDGE
         for axis, low, high in ((0, xmin, xmax), (1, ymin, ymax))
     )
-    return np.where(ground, 1 + on_x + 2 * on_y, 0).astype(float)
+    return np.where(ground, _INSIDE + on_x + 2 * on_y, 0).astype(float)
 
 
-def _nearest(points: Float, *, cell: float, apart: Float) -> np.ndarray:
-    """Of each point (n,) the row of the one that stands for its cell and kind."""
-    place = np.floor(points / cell)
-    away = np.square(points - (place + 0.5) * cell).sum(axis=1)
+def _nearest(points: Float, *, sides: Float, apart: Float) -> Ints:
+    """Of each point (n,) the row of the one that stands for its cell, of the given side, and kind."""
+    place = np.floor(points / sides[:, None])
+    away = np.square(points - (place + 0.5) * sides[:, None]).sum(axis=1)
     columns = (*points.T, away, *place.T, apart)
     order = np.lexsort(columns)
     keys = np.column_stack([*place.T, apart])[order]

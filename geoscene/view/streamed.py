@@ -27,8 +27,8 @@ MARK = "attributes.js"
 _FACTOR = 4
 """Tiles, and then nodes, along a side of a node of the next coarser level."""
 
-_CELL = 1 / 125
-"""Side of the cells of the first coarser level as a share of the side of a tile: 2 m of 250 m."""
+_CELL = 2 / 125
+"""Side of the cells of the first coarser level as a share of the side of a tile: 4 m of 250 m."""
 
 _SHARES = (1 / 3, 1 / 4)
 """Share of the instances that the first coarser level keeps, and each further one of those before."""

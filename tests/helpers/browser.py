@@ -62,11 +62,11 @@ class Browser:
         told = self._call("POST", "", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/{told['sessionId']}"
 
-    def open(self, page: Path | str, address: str = "") -> None:
+    def open(self, page: Path | str, address: str = "", *, limit_s: float = 120.0) -> None:
         """Open or reload a page from disk or at a URL, and wait until it is ready."""
         self._call("POST", "/url", {"url": "about:blank"})
         self._call("POST", "/url", {"url": (page if isinstance(page, str) else page.as_uri()) + address})
-        end = time.monotonic() + 120
+        end = time.monotonic() + limit_s
         while (state := self.js("return document.documentElement.dataset.ready")) is None:
             assert time.monotonic() < end, self.text("message")
             time.sleep(0.05)

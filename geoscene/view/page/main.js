@@ -30,7 +30,7 @@ async function start() {
     select: (text) => find(view, text),
     color: (mode) => color(view, mode),
     camera, attributes: view.attributes, boxes: view.boxes, head, settled: () => view.settled(),
-    first: view.first, bytes: () => view.bytes,
+    first: () => view.first, bytes: () => view.bytes,
     tiles: () => renderer.tiles.map(({ number, told }) => [number, told.ends[told.ends.length - 1]]),
     redraw: () => { view.dirty = true; },
     lonLat: (x, y) => toLonLat(head.lonlat, x, y),

@@ -1,6 +1,6 @@
 // Loading of a page in parts: nodes of a tree, each in a file of its own; see geoscene.view.streamed.
 
-const COARSEST = 2; // pixels by which a node may differ from the scene
+const COARSEST = 4; // pixels of a node's cells, by which vertices move at most; on average a third of it
 const AT_ONCE = 8; // files that are loaded at the same time
 const MOST_BYTES = 768e6; // on the graphics card; nodes that are not shown are given up beyond
 

@@ -1,6 +1,7 @@
 """Coarse copies stay close to the scene, leave no gaps, and cover as much with fewer trees."""
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geoscene.classes import Class
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
 from geoscene.view.coarse import coarser_mesh, fewer_instances
 
@@ -84,6 +86,18 @@ def test_a_coarser_cell_gives_fewer_faces_and_keeps_the_outline():
         covered = shapely.union_all(shapely.polygons(coarse.vertices[coarse.faces][:, :, :2]))
         assert shapely.area(covered) == pytest.approx(64.0**2, rel=0.02)
     assert counts[0] > 2 * counts[1] > 8 * counts[2]
+
+
+def test_bare_ground_is_coarser_than_what_is_mapped_and_keeps_its_edge_with_it():
+    mesh = terrain(2, 3000)
+    west = mesh.vertices[mesh.faces][:, :, 0].max(axis=1) < 32.0
+    klass = np.where(west, np.uint8(Class.GRASS), np.uint8(Class.TERRAIN))
+    half = replace(mesh, klass=klass)
+    coarse, all_mapped = (coarser_mesh(m, cell=2.0, box=BOX) for m in (half, mesh))
+    assert (coarse.klass == Class.GRASS).sum() == len(all_mapped.take(west[all_mapped.feature]))
+    assert (coarse.klass == Class.TERRAIN).sum() < 0.3 * len(all_mapped.take(~west[all_mapped.feature]))
+    covered = shapely.union_all(shapely.polygons(coarse.vertices[coarse.faces][:, :, :2]))
+    assert shapely.area(covered) == pytest.approx(64.0**2, rel=0.02)
 
 
 def test_solids_keep_walls_and_roofs_but_no_undersides():
