@@ -51,10 +51,13 @@ _SAMPLES = 3
 _NAMED = 9
 """Classes that a legend names, at most."""
 
+_LEAST = 25.0
+"""Metres that a film shows around the vehicle at least."""
+
 _LIGHTEST = 0.4
 """Luma, from 0 to 1, that edges of boxes have at least."""
 
-_BOX_STEP = 0.06
+_BOX_STEP = 0.04
 """Metres between the points that edges of boxes are drawn by."""
 
 _MARKS, _EGO, _TRACK = (84, 90, 104), (255, 255, 255), (255, 96, 64)
@@ -85,9 +88,12 @@ class Sweeps:
         if options.color == "origin" and self._truth(streams[0], 0) is None:
             raise InputError(f"`color` origin: no stage acted in {dataset.path}; choose another")
         some = np.unique(np.linspace(0, len(self.time_ns) - 1, _SAMPLES).astype(int)).tolist()
-        tables = [self._cloud(stream, row) for row in some for stream in streams[:1]]
-        self.samples: Float = np.concatenate(
-            [self.in_vehicle(row, placed) for row, (_, placed) in zip(some, tables, strict=True)]
+        tables = [self._cloud(streams[0], row) for row in some]
+        self.samples: Float = np.concatenate(  # of surfaces: snow is near, and not what a film shows
+            [
+                self.in_vehicle(row, placed[table["label"] != Class.NOISE])
+                for row, (table, placed) in zip(some, tables, strict=True)
+            ]
         )
         if not len(self.samples):
             self.samples = np.zeros((1, 3))
@@ -199,7 +205,7 @@ class SweepPane:
         self._sweeps, self._view, self._size = sweeps, _VIEWS[view], size
         away = np.hypot(sweeps.samples[:, 0], sweeps.samples[:, 1])
         low, high = np.percentile(sweeps.samples[:, 2], (2, 97))
-        half = float(np.clip(np.percentile(away, 85), 15.0, max(45.0, -2 * low)))
+        half = float(np.clip(np.percentile(away, 85), _LEAST, max(45.0, -2 * low)))
         aspect = size[0] / size[1]
         if view == "top":
             wide, tall = (half * max(aspect, 1.0), half * max(1 / aspect, 1.0))
@@ -223,7 +229,7 @@ class SweepPane:
             parts.append((self._sweeps.in_vehicle(row, edge), _one_color(color, len(edge))))
         parts += [(mark, _one_color(color, len(mark))) for mark, color in self._marks]
         xyz, rgb = (np.concatenate(some) for some in zip(*parts, strict=True))
-        image = cloud_picture(xyz, rgb, view=self._view, size=self._size, bounds=self._bounds, point=0.08)
+        image = cloud_picture(xyz, rgb, view=self._view, size=self._size, bounds=self._bounds, point=0.05)
         return written(image, f"circles every {self._step} m", key=self._sweeps.key)
 
 
