@@ -733,7 +733,7 @@ class MapOptions:
     """Leave out returns whose mean distance to this many neighbours is above the map's mean by more than
     FACTOR standard deviations; after --voxel."""
 
-    tiles: int | None = None
+    tiles: Annotated[int | None, Parameter(converter=whole)] = None
     """Write a file for each square of the projected grid with this side in whole metres, and an index, to the
     folder that --out names."""
 

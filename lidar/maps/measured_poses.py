@@ -22,7 +22,7 @@ from lidar.time_scales import posix_ns
 
 _MOVING = 1.0  # m/s, from which the course tells the heading
 _SPEEDS = (0.05, 1.0)  # m/s: standard deviation of a speed, with fixes and between them
-_SIDEWAYS = 0.05  # m/s, across the vehicle: wheels do not slip, but its body pitches and rolls
+_ACROSS = (0.05, 0.3)  # m/s, to the side and up: wheels do not slip, but the body pitches on its suspension
 _RATES = (0.002, 0.3)  # rad/s: of an angular rate, of an inertial unit and without one
 _GAP_NS = 1_500_000_000  # between fixes, from which speeds between them are uncertain
 _WINDOW_NS = 1_000_000_000  # in which courses tell the turn: those of single fixes are noisy
@@ -199,7 +199,7 @@ def _sigma(seconds: Float, *, along: Float, gyro: bool) -> Float:
     gyro  : whether the turns are those of an inertial unit
     """
     rates = np.full((len(seconds), 3), _RATES[not gyro])
-    return np.column_stack([rates, along, np.full((len(seconds), 2), _SIDEWAYS)]) * seconds[:, None]
+    return np.column_stack([rates, along, np.tile(_ACROSS, (len(seconds), 1))]) * seconds[:, None]
 
 
 def poses_by_fixes(fixes: Measured, time_ns: NDArray[np.int64]) -> Float:
