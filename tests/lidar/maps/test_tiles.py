@@ -8,6 +8,7 @@ import pyogrio
 import pytest
 import shapely
 from helpers.map_data import CRS_OUT, FRAME, dataset, expected
+from helpers.programs import run_program
 
 from geoscene.classes import Class
 from geoscene.errors import GeosceneError
@@ -138,3 +139,11 @@ def test_tiles_replace_tiles_only_and_leave_nothing_when_they_fail(tmp_path):
 def test_impossible_tiles_are_refused(given):
     with pytest.raises(InputError, match="tile"):
         MapOptions(**given)
+
+
+def test_parts_of_a_metre_are_not_cut_off(tmp_path):
+    data = dataset(tmp_path / "d").path
+    done = run_program("lidar", "map", data, "-o", tmp_path / "tiles", "--tiles", "1.5")
+    assert done.returncode == 2
+    assert "--tiles" in done.stderr
+    assert not (tmp_path / "tiles").exists()
