@@ -58,6 +58,7 @@ class Browser:
         wanted = {
             "goog:chromeOptions": options,
             "goog:loggingPrefs": {"browser": "ALL", "performance": "ALL"},
+            "timeouts": {"script": 110_000},  # milliseconds, below that of the connection
         }
         told = self._call("POST", "", {"capabilities": {"alwaysMatch": wanted}})
         self._base += f"/{told['sessionId']}"
