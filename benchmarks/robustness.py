@@ -180,9 +180,12 @@ _CHANGES = frozenset(("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", 
 def _places(words: Words, folder: Path) -> tuple[str, ...]:
     """Beginnings of the paths that a command may change: output, what is named after it, and cache."""
     cache = str(folder / "home")
-    if "-o" not in words:
+    given = [word.removeprefix("--out=") for word in words if word.startswith("--out=")]
+    if "-o" in words:
+        given.append(words[words.index("-o") + 1])
+    if not given:
         return (cache,)
-    out = Path(words[words.index("-o") + 1])
+    out = Path(given[-1])
     return cache, os.path.realpath(out.with_name(out.name.partition(".")[0]))
 
 
