@@ -140,7 +140,7 @@ numbers = st.floats(-1e6, 1e6)
 
 @settings(deadline=None, max_examples=50)
 @given(
-    seconds=st.lists(st.integers(0, 2**62 - 1), min_size=2, max_size=9, unique=True),
+    seconds=st.lists(st.integers(0, 10**18), min_size=2, max_size=9, unique=True),
     position=st.tuples(numbers, numbers, numbers),
     turn=st.tuples(*[st.floats(-3, 3)] * 3),
 )
