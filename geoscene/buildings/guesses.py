@@ -126,7 +126,7 @@ def guess_looks(
     area        : (n,) square metres of the footprint
     walls       : (n,) metres, height of the walls up to the eaves
     levels      : (n,) tagged storeys, NaN if not tagged
-    roof_height : (n,) metres, 0 for a flat roof or an unknown one
+    roof_height : (n,) metres, 0 for a flat roof, NaN for one of unknown shape
     """
     draw = _draws(osm_id)
     kind = _kinds(use, area=area, walls=walls)
@@ -135,7 +135,7 @@ def guess_looks(
     share = np.where(kind == "low", of_region["pitched_low"], of_region["pitched_tall"])
     share[np.isin(kind, ("office", "hall"))] = 0.0
     share[kind == "sacred"] = 1.0
-    pitched: Bools = (roof_height > 0) | ((draw[0] < share) & (area < _WIDEST))
+    pitched: Bools = (roof_height > 0) | (np.isnan(roof_height) & (draw[0] < share) & (area < _WIDEST))
     wall, roof = np.full(len(use), "", object), np.full(len(use), "", object)
     for name in KINDS:
         own, shelf = kind == name, of_kind.get(name, {})

@@ -130,7 +130,7 @@ def _resolve_roofs(rows: Sequence[Row], *, h: Heights, options: BuildingOptions)
     """Set missing roof heights, in place."""
     for k, row in enumerate(rows):
         if row.roof.shape == "flat":
-            h.roof[k], h.roof_source[k] = 0.0, "none"
+            h.roof[k], h.roof_source[k] = 0.0, "assumed" if row.roof.assumed else "tag"
         elif not np.isfinite(h.roof[k]):
             by_storeys = h.source[k] == "levels"
             walls = h.high[k] if by_storeys else np.inf

@@ -36,6 +36,7 @@ class RoofTags:
 
     shape         : one of SHAPES
     unknown       : the value of roof:shape if it is not one of them, else ""
+    assumed       : the shape is not tagged, or unknown: flat
     direction_deg : downslope azimuth of the face, clockwise from true north; NaN if not tagged
     across        : roof:orientation=across
     angle_deg     : pitch, NaN if not tagged
@@ -44,6 +45,7 @@ class RoofTags:
 
     shape: str
     unknown: str
+    assumed: bool
     direction_deg: float
     across: bool
     angle_deg: float
@@ -52,14 +54,15 @@ class RoofTags:
 
 def read_roof_tags(tags: Tags) -> RoofTags:
     """The tagged roof; flat if nothing is tagged. Of several shapes ("gabled;hipped") the first counts."""
-    tagged = tags.get("roof:shape") or tags.get("building:roof:shape") or "flat"
-    value = first_value(tagged)
+    tagged = tags.get("roof:shape") or tags.get("building:roof:shape", "")
+    value = first_value(tagged or "flat")
     shape = _OTHER_NAMES.get(value, value.replace("_", "-"))
     unknown = "" if shape in SHAPES else value or tagged
     read = Quantities(tags)
     return RoofTags(
         "flat" if unknown else shape,
         unknown,
+        not tagged or bool(unknown),
         read.first("roof:direction", "roof:slope:direction", parse=parse_direction),
         tags.get("roof:orientation") == "across",
         read.first("roof:angle", parse=_parse_angle, low=0.1, high=STEEPEST_DEG),

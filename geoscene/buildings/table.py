@@ -62,7 +62,7 @@ class Buildings(Columns):
     height_source    : (n,) str: tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)
-    roof_source      : (n,) str, source of roof_height: tag, levels, angle, default, or none (flat)
+    roof_source      : (n,) str, source of roof_height: tag, levels, angle, default; assumed (unknown: flat)
     levels           : (n,) storeys above ground as tagged, NaN if not
     use              : (n,) str, the value of building or building:part
     name             : (n,) str

@@ -598,6 +598,15 @@ def test_a_guessed_roof_is_bounded_by_the_storeys_below(storeys, shape, width, r
     assert table.height_sigma[0] == pytest.approx(np.hypot(max(0.15 * walls, 1.0), roof / 2), rel=0.02)
 
 
+@pytest.mark.parametrize(
+    ("tags", "source"),
+    [({}, "assumed"), ({"roof:shape": "odd"}, "assumed"), ({"roof:shape": "flat"}, "tag")],
+)
+def test_a_flat_roof_says_whether_its_shape_is_mapped(tags, source):
+    table, *_ = built(house(1, box(0, 0, 10, 10), height="9", **tags))
+    assert (table.roof_shape.tolist(), table.roof_source.tolist()) == (["flat"], [source])
+
+
 def test_a_steep_angle_over_a_large_footprint_gives_no_giant_roof():
     tags = {"building:levels": "2", "roof:shape": "hipped", "roof:angle": "75"}
     table, *_ = built(house(1, box(0, 0, 40, 40), **tags))

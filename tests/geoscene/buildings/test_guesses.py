@@ -19,7 +19,7 @@ BUILDINGS = st.lists(
         st.floats(1.0, 30_000.0),
         st.floats(0.0, 300.0),
         st.one_of(st.just(np.nan), st.floats(0.0, 100.0)),
-        st.sampled_from([0.0, 2.5]),
+        st.sampled_from([0.0, np.nan, 2.5]),
     ),
     max_size=30,
 )
@@ -41,7 +41,7 @@ def guessed(buildings, region="central_europe"):
     )
 
 
-def houses(count, *, use="house", area=120.0, walls=6.0, levels=np.nan, roof=0.0):
+def houses(count, *, use="house", area=120.0, walls=6.0, levels=np.nan, roof=np.nan):
     return [(k + 1, use, area, walls, levels, roof) for k in range(count)]
 
 
@@ -150,3 +150,9 @@ def test_every_time_zone_on_land_has_a_region_of_its_own_continent():
     named = [zone for zone in tzfpy.timezonenames() if not zone.startswith("Etc/")]
     lost = [z for z in named if not any(start and z.startswith(start) for start in starts)]
     assert {zone.partition("/")[0] for zone in lost} <= {"Atlantic"}  # islands between the regions
+
+
+@pytest.mark.parametrize("region", REGIONS)
+def test_a_roof_that_is_mapped_as_flat_is_not_covered_like_a_pitched_one(region):
+    assert not guessed(houses(200, roof=0.0), region).pitched.any()
+    assert guessed(houses(200, roof=2.5), region).pitched.all()
