@@ -160,12 +160,13 @@ class Browser:
         return [entry["message"] for entry in self._call("POST", "/se/log", {"type": "browser"})]
 
     def requests(self) -> set[str]:
-        """URLs that the browser has requested since the last call."""
+        """URLs that pages have requested since the last call; not those of the browser's own pages."""
         entries = [
             json.loads(e["message"])["message"]
             for e in self._call("POST", "/se/log", {"type": "performance"})
         ]
-        return {e["params"]["request"]["url"] for e in entries if e["method"] == "Network.requestWillBeSent"}
+        urls = {e["params"]["request"]["url"] for e in entries if e["method"] == "Network.requestWillBeSent"}
+        return {url for url in urls if not url.startswith("chrome:")}
 
     def end(self) -> None:
         """Close the window."""
