@@ -21,7 +21,7 @@ from PIL import Image
 from pyproj import Geod
 
 import lidar
-import lidar.cli
+import lidar.cli.look
 from geoscene.classes import Class, class_codes
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
@@ -73,7 +73,7 @@ def images(svg):
 
 
 def test_the_program_offers_every_figure():
-    assert get_args(lidar.cli.Plotted) == ("weather", *FIGURES)
+    assert get_args(lidar.cli.look.Plotted) == ("weather", *FIGURES)
 
 
 @pytest.mark.parametrize("what", FIGURES)

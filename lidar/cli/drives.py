@@ -1,0 +1,328 @@
+"""Commands that record drives: one, a grid of them, with attacks, and with each setting."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+from geoscene.console import (
+    FAILURE,
+    SEVERAL,
+    Report,
+    command_line,
+    note_new_folder,
+    print_json,
+    progress_bar,
+    whole,
+)
+from lidar.cli.program import Out, Reporting, print_effects
+from lidar.errors import InputError, LidarError
+from lidar.options import OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
+
+if TYPE_CHECKING:
+    from lidar.scene_cache import OpenedScene
+
+
+def drive(
+    scene: Path | None = None,
+    /,
+    *,
+    options: DriveOptions | None = None,
+    place: PlaceOptions = PlaceOptions(),
+    wanted: AccuracyOptions = AccuracyOptions(),
+    out: Out,
+    live: Annotated[tuple[str, ...] | None, SEVERAL, Parameter(group=OUTPUT, metavar="[FILE.rrd]")] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Drive a route through a scene or a map and record what the rig senses.
+
+    The same command resumes an interrupted drive; its files are those of an uninterrupted one, byte for
+    byte. Of a map, the part that the drive needs is built first and kept for later drives; the recorded files
+    are those of a drive in a scene of the whole map.
+
+    For example:
+
+    lidar drive scene --route random --duration 30 --seed 1 -o drive
+
+    lidar drive city.osm.pbf --route random --duration 30 -o drive
+
+    lidar drive scene --route 60.1662,24.9413 60.1655,24.9405 --rig vlp16 --format pcd,laz -o drive
+
+    lidar drive scene --route track.gpx --rig my_rig.toml -o drive
+
+    lidar drive scene --route drive/trajectory.csv --rig kitti --traffic on -o again
+
+    lidar drive scene --rig drone --survey all --altitude 80 -o flight
+
+    lidar drive scene --route random --rig vlp16 --accuracy 3cm -o drive
+
+    lidar drive scene --route random --weather rain=10mm/h --road by-weather -o rain
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene, or URL of one in object storage (s3://BUCKET/NAME, gs://), or a map: .osm,
+        .osm.gz, .osm.bz2, .osm.pbf or Overpass JSON.
+    out
+        Directory or URL to write the dataset to.
+    live
+        Show clouds, images, boxes and the path in a viewer of Rerun while frames are recorded (extra live),
+        or write them to FILE.rrd for it.
+    """
+    from geoscene.scene.layout import using  # noqa: PLC0415
+    from geoscene.storage import published, shown, url_of  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
+    from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
+    from lidar.view.live import live_target, opened_live  # noqa: PLC0415
+
+    options = options or DriveOptions()
+    options.check_course()
+    target = live_target(live, overwrite=report.overwrite)
+    if not url_of(out):
+        note_new_folder(out)
+    bar = partial(progress_bar, quiet=report.quiet)
+    with bar() as progress:
+        found = open_scene_or_map(scene, options, place=place, progress=progress)
+    if not report.json:
+        _print_built(found)
+    with (
+        using(found.scene, known=LidarError) as opened,
+        published(out, last="dataset.json", replaces=True, bar=bar) as folder,
+    ):
+        with bar() as progress:
+            begun = None if report.overwrite else folder
+            pick = picked(opened, options, wanted=wanted, out=begun, progress=progress)
+        if pick and not report.json:
+            print(pick.to_text(options.workers), flush=True)
+        with bar() as progress, opened_live(target) as shown_live:
+            done = driven(
+                opened,
+                folder,
+                options=options,
+                wanted=wanted,
+                pick=pick,
+                overwrite=report.overwrite,
+                progress=progress,
+                live=shown_live,
+            )
+        limits = open_dataset(folder).manifest["limits"]
+    summary = done.summary
+    document: dict[str, Any] = {
+        "path": shown(out),
+        "scene": found.scene.location,
+        **({} if found.built is None else {"tiles_built": found.built}),
+        "frames": summary.frames,
+        "resumed": summary.resumed,
+        "points": sum(summary.points.values()),
+        "points_by_sensor": summary.points,
+        "written": summary.written,
+        "duration_s": summary.duration,
+        "length_m": round(summary.length, 2),
+        "wall_s": round(summary.wall, 2),
+        "stages_s": {name: round(seconds, 3) for name, seconds in summary.stages.items()},
+        **({"effects": summary.effects} if summary.effects else {}),
+    }
+    if pick or done.reached:
+        document["accuracy"] = done.accuracy(options.workers)
+    if report.json:
+        print_json(document)
+    else:
+        total = sum(summary.points.values())
+        before = f" ({total - summary.written:,} recorded before)" if summary.resumed else ""
+        print(
+            f"{shown(out)}: {summary.duration:.1f} s, {summary.length:.0f} m, {summary.frames} frames,"
+            f" {total:,} points{before} in {summary.wall:.1f} s;"
+            f" next: {command_line('lidar', 'map', shown(out), '-o', 'map.laz')}"
+        )
+        print_effects(summary.effects if summary.written or not summary.resumed else {})
+        if reached := done.to_text():
+            print(reached)
+    for missed in done.missed():
+        print(f"lidar: {missed}", file=sys.stderr)
+    for limit in limits:
+        print(f"lidar: {limit['advice']}", file=sys.stderr)
+    for name in (name for name, points in summary.points.items() if not points):
+        print(
+            f"lidar: {name} has no returns in the whole drive; check its mount and maximum range",
+            file=sys.stderr,
+        )
+    return 0
+
+
+def _print_built(found: OpenedScene) -> None:
+    """Say what of a map's scene was built for a drive."""
+    if found.built is not None:
+        tiles = len(found.scene.tile_indices)
+        news = f"{found.built} of {tiles} tiles built" if found.built else f"{tiles} tiles, built before"
+        print(f"scene {found.scene.path}: {news}", flush=True)
+
+
+def sweep(
+    file: Path,
+    /,
+    *,
+    out: Out,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    scheduler: Annotated[str, Parameter(group=OUTPUT, metavar="ADDRESS")] = "",
+    report: Reporting = Report(),
+) -> int:
+    """Record a grid of drives: every combination of scenes, routes, seeds, rigs or other options.
+
+    The same command resumes an interrupted sweep, and repeats only drives that failed. The bytes depend
+    neither on the number of workers nor on where they are.
+
+    For example:
+
+    lidar sweep sweep.toml -o drives
+
+    Parameters
+    ----------
+    file
+        TOML file with the options of all drives in [drive], lists of values in [grid], and maps to build in
+        [[map]]; docs/sweeps.md has an example.
+    out
+        Directory to write to: a dataset for each drive, and the table sweep.json, also as sweep.csv.
+    workers
+        Processes; each records one drive at a time.
+    scheduler
+        Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers record the drives instead;
+        they need the scenes and the output folder under the same paths.
+    """
+    from lidar.sweep import sweep as run_sweep  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = run_sweep(
+            file, out, workers=workers, scheduler=scheduler, overwrite=report.overwrite, progress=progress
+        )
+    failed = summary.failed
+    if report.json:
+        print_json({"path": str(out), "drives": [asdict(row) for row in summary.rows]})
+    else:
+        points, length = (sum(r.points for r in summary.rows), sum(r.metres for r in summary.rows))
+        done = len(summary.rows) - len(failed)
+        print(f"{out}: {done} of {len(summary.rows)} drives, {length:,.0f} m, {points:,} points")
+    for error in dict.fromkeys(row.error for row in failed):  # a map may fail many drives
+        names = [row.name for row in failed if row.error == error]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        print(f"lidar: {names[0]}{more}: {error}", file=sys.stderr)
+    return FAILURE if failed else 0
+
+
+def redteam(
+    file: Path,
+    /,
+    *,
+    out: Out,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    report: Reporting = Report(),
+) -> int:
+    """Measure attacks against defences: success, detection at fixed false alarms, ROC, latency and cost.
+
+    Each drive of a grid is recorded without attack and with each attack, and judged by all defences; one or
+    more detectors of road users show which attacks succeed. Nothing is sent to any device. The same command
+    resumes an interrupted matrix.
+
+    For example:
+
+    lidar redteam matrix.toml -o matrix
+
+    Parameters
+    ----------
+    file
+        TOML file with drives as for lidar sweep, attacks in [[attack]] and defences in [defences];
+        docs/security.md has an example.
+    out
+        Directory to write to: drives, redteam.json, CSV tables and the page redteam.html.
+    workers
+        Processes; each records or judges one drive at a time.
+    """
+    from lidar.redteam import redteam as run_matrix  # noqa: PLC0415
+    from lidar.redteam.report import detection_tables, success_rows  # noqa: PLC0415
+    from lidar.redteam.run import failed_drives  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = run_matrix(file, out, workers=workers, overwrite=report.overwrite, progress=progress)
+    if report.json:
+        print_json({"path": str(out), "drives": list(summary.drives), "failed": summary.failed})
+    else:
+        print(columns(success_rows(summary.matrix)))
+        for title, table in detection_tables(summary.matrix):
+            print(f"\n{title}\n{columns(table)}")
+        print(f"\n{out}: {len(summary.drives)} drives; page: {out / 'redteam.html'}")
+    for line in failed_drives(summary.failed):
+        print(f"lidar: {line}", file=sys.stderr)
+    return FAILURE if summary.failed else 0
+
+
+def tradeoff(
+    scene: Path | None = None,
+    /,
+    *,
+    options: DriveOptions | None = None,
+    place: PlaceOptions = PlaceOptions(),
+    compared: TradeoffOptions = TradeoffOptions(),
+    others: Annotated[tuple[Path, ...], Parameter(name="--scene", n_tokens=1)] = (),
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Measure the error and the cost of each setting on a drive, and recommend the cheapest that is enough.
+
+    Errors are differences from an exact reference, pulse by pulse, with 95 % intervals; costs are CPU time
+    per simulated second, peak memory and bytes.
+
+    For example:
+
+    lidar tradeoff scene --route random --duration 10 --rig vlp16 -o tradeoff
+
+    lidar tradeoff scene --route random --duration 10 --settings rays,poses --json
+
+    Parameters
+    ----------
+    scene
+        Directory of the scene, or a map, as for lidar drive.
+    others
+        Another scene of the same place and frame, built with other options, to compare with the first;
+        repeat for more.
+    out
+        Folder to write tradeoff.json, tradeoff.html and a plot of each sensor to.
+    """
+    from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
+    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
+    from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
+    from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
+
+    options = options or DriveOptions()
+    options.check_course()
+    if options.scheduler:
+        raise InputError("`scheduler`: costs are those of this machine; leave it out")
+    if out is not None:
+        note_new_folder(out)
+        if out.exists() and not report.overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    with (
+        progress_bar(quiet=report.quiet) as progress,
+        ExitStack() as opened,
+    ):
+        needing = replace(options, traffic=options.traffic or TrafficOptions())  # it compares traffic, too
+        found_scene = open_scene_or_map(scene, needing, place=place, progress=progress).scene
+        scenes = [found_scene, *map(open_scene, others)]
+        first, *rest = [opened.enter_context(using(s, known=LidarError)) for s in scenes]
+        found = measured(first, options, compared=compared, others=rest, progress=progress)
+    if out is not None:
+        write_report(found, out)
+    if report.json:
+        print_json(document(found))
+    else:
+        print_tables(found)
+    return 0

@@ -1,0 +1,263 @@
+"""Commands that show what was recorded: descriptions, players, figures and films."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from geoscene.console import Report, note_new_folder, print_json, progress_bar, with_flags
+from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app
+from lidar.errors import InputError
+from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
+from lidar.plots import FIGURES
+
+_FIGURES = "; ".join(
+    [
+        *(f"{row.name} ({row.meaning})" for row in FIGURES.values()),
+        "weather (range by visibility, extinction and lost returns by rate, echoes of the air by range).",
+    ]
+)
+
+Plotted = Literal["weather", "range-image", "intensity", "returns", "speed", "coverage", "gnss"]
+"""Names of figures: `FIGURES`, and of models without a drive."""
+
+
+def info(
+    dataset: Path,
+    /,
+    *,
+    full: Annotated[bool, Parameter(negative=())] = False,
+    json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> int:
+    """Describe recorded data: sensors, frames, points, gaps, stages, extent, sources, licence, size.
+
+    For example:
+
+    lidar info drive
+
+    lidar info drive --full --json
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of a dataset, or directory with clouds of KITTI or nuScenes.
+    full
+        Read all clouds and tables, too: points by class, road users, rates of large tables.
+    json
+        Print all of it as JSON.
+    quiet
+        Show no progress bars.
+    """
+    from lidar.dataset.info import describe  # noqa: PLC0415
+    from lidar.dataset.info_text import info_text  # noqa: PLC0415
+
+    with progress_bar(quiet=quiet) as progress:
+        document = describe(dataset, full=full, progress=progress)
+    if json:
+        print_json(document)
+    else:
+        print(info_text(document))
+    return 0
+
+
+def view(
+    dataset: Path,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    options: PlaybackOptions = PlaybackOptions(),
+    serve: bool = False,
+    port: int = 8765,
+    open3d: bool = False,
+    report: Reporting = Report(),
+) -> int:
+    """Play a drive in a browser: the point cloud in step with images, boxes, plan and speed.
+
+    For example:
+
+    lidar view drive -o page.html
+
+    lidar view drive -o short.html --frames 0:100 --every 2
+
+    lidar view drive --serve
+
+    lidar view map.laz --open3d
+
+    The page needs no network and no server; open the file in any browser with WebGL 2.
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset; for a window of Open3D also a file of points.
+    out
+        File to write.
+    serve
+        Write no file; serve the player at 127.0.0.1 until interrupted, for drives of any length.
+    port
+        Port of the server; 0 for a free one.
+    open3d
+        Write no file; open the first frame, or a file of points, in a window of Open3D (extra open3d).
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.view.page import view_drive  # noqa: PLC0415
+
+    if (out is not None) + serve + open3d != 1:
+        raise InputError("give one of `out`, `serve` and `open3d`")
+    if open3d:
+        from lidar.view.window import show_window  # noqa: PLC0415
+
+        show_window(dataset, options=options)
+        return 0
+    if serve:
+        return _serve(dataset, options, port=port)
+    assert out is not None  # noqa: S101
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = view_drive(
+            open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
+        print_json({**asdict(summary), "path": str(out)})
+        return 0
+    images = f", {summary.images} images" if summary.images else ""
+    print(
+        f"{out}: {summary.frames} frames, {summary.returns:,} returns{images}, {summary.bytes / 1e6:.1f} MB"
+    )
+    for note in summary.notes:
+        print(f"  {with_flags(app, note)}")
+    return 0
+
+
+def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
+    """Serve the player until interrupted."""
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.view.server import DriveServer  # noqa: PLC0415
+
+    with DriveServer(open_dataset(dataset), options=options, port=port) as server:
+        print(f"{server.address} plays {len(server.drive)} frames of {dataset}; Ctrl+C ends it", flush=True)
+        with suppress(KeyboardInterrupt):
+            server.serve_forever()
+    return 0
+
+
+def plot(
+    what: Annotated[Plotted, Parameter(help=_FIGURES)],
+    dataset: Path | None = None,
+    /,
+    *,
+    options: PlotOptions = PlotOptions(),
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Plot a recorded drive, or models of weather against published values.
+
+    For example:
+
+    lidar plot range-image drive -o sweep.png
+
+    lidar plot coverage drive -o coverage.svg
+
+    lidar plot weather --sensor vlp16 -o weather.png
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset; none for weather.
+    out
+        PNG or SVG to write.
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.plots import plot as drawn  # noqa: PLC0415
+
+    if what == "weather":
+        if dataset is not None:
+            raise InputError(f"`dataset` {dataset}: weather is plotted without one; leave it out")
+        return _plot_weather(options, out, report=report)
+    if dataset is None:
+        raise InputError(f"`dataset`: give the drive to plot: lidar plot {what} DRIVE -o {out}")
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        found = drawn(
+            open_dataset(dataset),
+            what,
+            out=out,
+            options=options,
+            overwrite=report.overwrite,
+            progress=progress,
+        )
+    if report.json:
+        print_json({"path": str(out), **found.numbers})
+    else:
+        print(f"{out}: {found.note}")
+    return 0
+
+
+def _plot_weather(options: PlotOptions, out: Path, *, report: Report) -> int:
+    """Plot models of weather against published values."""
+    from geoscene.files import write_atomically  # noqa: PLC0415
+    from lidar.plots import check_out  # noqa: PLC0415
+    from lidar.rig.scanner import load_sensor  # noqa: PLC0415
+    from lidar.weather.figures import weather_figure  # noqa: PLC0415
+
+    if options.frames or options.resolution is not None:
+        raise InputError("`frames` and `resolution` are of drives; leave them out for weather")
+    check_out(out, overwrite=report.overwrite)
+    name = options.sensor or "hdl64e_s2"
+    scanner = load_sensor(Path(name) if name.endswith(".toml") else name)
+    note_new_folder(out)
+    write_atomically(out, weather_figure(scanner).encoded(out.suffix.lower()))
+    if report.json:
+        print_json({"path": str(out)})
+    else:
+        print(f"{out}: weather and a {scanner.maker} {scanner.model}")
+    return 0
+
+
+def animate(
+    dataset: Path,
+    /,
+    *,
+    options: FilmOptions = FilmOptions(),
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Make a film of a recorded drive: sweeps, camera images and the growing map, in the drive's own time.
+
+    For example:
+
+    lidar animate drive -o drive.gif --size 640x360 --frames 0:20
+
+    lidar animate drive -o drive.mp4 --show sweep --view top --color intensity
+
+    lidar animate drive -o map.mp4 --show map --speed 4
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset.
+    out
+        MP4 (extra video) or GIF to write.
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.films.film import film  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        made = film(
+            open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
+        print_json({**asdict(made), "path": str(out)})
+        return 0
+    print(
+        f"{out}: {made.images} images of {made.size[0]} x {made.size[1]} pixels, {made.seconds:.2f} s,"
+        f" {', '.join(made.shown)}"
+    )
+    for note in made.notes:
+        print(f"  {with_flags(app, note)}")
+    return 0

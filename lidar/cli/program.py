@@ -1,0 +1,46 @@
+"""The program `lidar`, and the parameters and texts that its commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import App, Parameter
+
+from geoscene.console import DEFAULTS, Report
+from lidar import __version__
+from lidar.options import OUTPUT
+
+if TYPE_CHECKING:
+    from lidar.signal.effects import Counts
+
+app = App(
+    name="lidar",
+    version=__version__,
+    default_parameter=DEFAULTS,
+    suppress_keyboard_interrupt=False,
+    help="""Drive vehicles with ray-cast sensors through scenes made by geoscene.
+
+    lidar drive scene --route random --duration 20 -o drive
+
+    lidar map drive -o map.laz
+
+    lidar rigs, lidar sensors, lidar settings and lidar stages list the choices, lidar classes the codes.
+
+    Accuracy and stability at the extremes on this machine: lidar selftest.
+    """,
+)
+app.register_install_completion_command()
+
+Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
+Reporting = Annotated[Report, Parameter(group=OUTPUT)]
+JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
+QuietFlag = Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)]
+
+
+def print_effects(effects: Counts) -> None:
+    """Say what each stage did."""
+    from lidar.signal.effects import effect_lines  # noqa: PLC0415
+
+    for line in effect_lines(effects):
+        print(line)

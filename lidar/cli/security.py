@@ -1,0 +1,344 @@
+"""Commands that judge, sign and verify recorded data, and that tamper with them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from geoscene.console import FAILURE, SEVERAL, Report, note_new_folder, print_json, progress_bar, whole
+from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting
+from lidar.errors import InputError
+from lidar.options import OUTPUT, DefendOptions, SignOptions
+
+
+def defend(
+    *datasets: Path,
+    options: DefendOptions,
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Judge recorded frames by defences against spoofing, and score the verdicts where the truth is known.
+
+    Defences see what the sensors measured, never labels or truth files. Thresholds are those that a stated
+    share of genuine returns, objects and frames passes.
+
+    For example:
+
+    lidar defend drive --defence occlusion,shadow -o verdicts
+
+    lidar defend drive --defence all --fuse max --json
+
+    lidar defend drive --defence shadow --detector learned --calibrate -o learned.toml
+
+    lidar defend drive --defence all --calibrate -o calibration.toml
+
+    Parameters
+    ----------
+    datasets
+        Directories or URLs of datasets, which are judged together.
+    out
+        Directory to write the verdicts to: defend.json, frames.csv, objects.csv and an archive of suspicions
+        of returns per frame; with --calibrate the TOML file.
+    """
+    from geoscene.scene import open_scene  # noqa: PLC0415
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.defences.calibration import read_calibration  # noqa: PLC0415
+    from lidar.defences.defend import calibrate, score_rows  # noqa: PLC0415
+    from lidar.defences.defend import defend as judged  # noqa: PLC0415
+    from lidar.defences.registry import read_defences  # noqa: PLC0415
+    from lidar.detection.registry import read_detector  # noqa: PLC0415
+
+    if not datasets:
+        raise InputError("`datasets`: give one or more")
+    if options.calibrate and out is None:
+        raise InputError("`calibrate`: give `out`, the file to write")
+    if out is not None:
+        note_new_folder(out)
+    if options.calibrate and out is not None and (out.is_dir() or (out.exists() and not report.overwrite)):
+        what = (
+            "is a directory; give a file" if out.is_dir() else "exists already; set `overwrite` to replace it"
+        )
+        raise InputError(f"{out}: {what}")
+    chosen, detector = read_defences(options.defences), read_detector(options.detector)
+    opened = [open_dataset(path) for path in datasets]
+    scene = None if options.scene is None else open_scene(options.scene)
+    if options.calibrate and out is not None:
+        with progress_bar(quiet=report.quiet) as progress:
+            made = calibrate(
+                opened,
+                chosen,
+                detector=detector,
+                scene=scene,
+                out=out,
+                seed=options.seed,
+                progress=progress,
+            )
+        if report.json:
+            print_json({"path": str(out), "note": made.note})
+        else:
+            print(f"{out}: {made.note}")
+        return 0
+    calibration = read_calibration(options.calibration, detector=detector)
+    with progress_bar(quiet=report.quiet) as progress:
+        found = judged(
+            opened,
+            chosen,
+            calibration=calibration,
+            detector=detector,
+            rule="" if options.fuse == "none" else options.fuse,
+            scene=scene,
+            out=out,
+            overwrite=report.overwrite,
+            seed=options.seed,
+            progress=progress,
+        )
+    if report.json:
+        print_json(found.document())
+    else:
+        from lidar.rig.catalog import columns  # noqa: PLC0415
+
+        print(columns(score_rows(found)))
+    return 0
+
+
+def train(
+    *datasets: Path,
+    out: Out,
+    seed: Annotated[int, Parameter(converter=whole)] = 0,
+    trees: Annotated[int, Parameter(converter=whole)] = 60,
+    every: Annotated[int, Parameter(converter=whole)] = 1,
+    workers: Annotated[int, Parameter(group=OUTPUT, converter=whole)] = 2,
+    report: Reporting = Report(),
+) -> int:
+    """Train a detector of road users on the labelled clouds of drives.
+
+    Needs scikit-learn (pip install 'geoscene[learn]'); what uses the model does not.
+
+    For example:
+
+    lidar train drive1 drive2 drive3 -o model.npz
+
+    Parameters
+    ----------
+    datasets
+        Directories of datasets with traffic, recorded without attacks.
+    out
+        File to write the model to, for --detector of lidar defend and detector of lidar redteam.
+    seed
+        Seed of the forest. The same data, options and seed give the same file.
+    trees
+        Trees of the forest.
+    every
+        Use each frame of that number: those that follow each other are nearly the same.
+    workers
+        Processes that read the clouds. The model does not depend on it.
+    """
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.train import train as trained  # noqa: PLC0415
+
+    if not datasets:
+        raise InputError("`datasets`: give one or more")
+    if out.is_dir() or (out.exists() and not report.overwrite):
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it, or give another file")
+    with progress_bar(quiet=report.quiet) as progress:
+        made = trained(datasets, out, seed=seed, trees=trees, every=every, workers=workers, progress=progress)
+    if report.json:
+        print_json(made.to_json())
+    else:
+        print(columns(made.table()))
+        print(f"{out}: {made.frames} frames; next: lidar defend {datasets[0]} --detector {out} ...")
+    return 0
+
+
+def defences(*, json: JsonFlag = False) -> int:
+    """List the defences against spoofing, with their parameters.
+
+    Parameters
+    ----------
+    json
+        Print them as JSON.
+    """
+    from lidar.defences.registry import defence_rows  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    rows = defence_rows()
+    if json:
+        print_json({"defences": rows})
+        return 0
+    cells = [["name", "parameter", "default", "from", "to", "meaning"]]
+    for row in rows:
+        needs = f" Needs: {', '.join(row['needs'])}." if row["needs"] else ""
+        past = f" Earlier frames: {row['history']}." if row["history"] else ""
+        cells.append([row["name"], "", "", "", "", f"{row['meaning']}{needs}{past}"])
+        for p in row["parameters"]:
+            ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
+            cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
+    print(columns(cells))
+    print(
+        "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE:KEY=VALUE judges recorded data"
+        "\n(docs/defences.md)."
+    )
+    return 0
+
+
+def tamper(
+    dataset: Path,
+    /,
+    *,
+    replace: Annotated[tuple[str, ...], SEVERAL] = (),
+    by: Path | None = None,
+    freeze: bool = False,
+    shift: Annotated[tuple[str, ...], SEVERAL] = (),
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Replace recorded files by those of other frames or drives, and shift time stamps between sensors.
+
+    For attacks on what is stored; tamper.truth.csv tells what was done. Other attacks on recorded data are
+    stages: lidar apply --attack.
+
+    For example:
+
+    lidar tamper drive --replace lidar_top:1-1=0 --shift lidar_top=0.05 -o tampered
+
+    Parameters
+    ----------
+    dataset
+        Directory of the dataset.
+    replace
+        Frames and the first of those that replace them: SENSOR:FIRST-LAST=SOURCE; repeat for more.
+    by
+        Directory of the dataset that these are taken from; the same one by default.
+    freeze
+        Repeat the first of them.
+    shift
+        Sensor and the seconds by which its time stamps are later: SENSOR=SECONDS; repeat for more.
+    out
+        Directory to write to.
+    """
+    from lidar.tamper import read_replacement, read_shift  # noqa: PLC0415
+    from lidar.tamper import tamper as tampered  # noqa: PLC0415
+
+    note_new_folder(out)
+    done = tampered(
+        dataset,
+        out,
+        replacements=[read_replacement(text) for text in replace],
+        by=by or "",
+        freeze=freeze,
+        shifts=[read_shift(text) for text in shift],
+        overwrite=report.overwrite,
+    )
+    if report.json:
+        print_json({**asdict(done), "path": str(out)})
+    else:
+        shifts = "".join(f"; {name} is {ns / 1e9:g} s late" for name, ns in done.shifts.items())
+        print(f"{out}: {done.files} files replaced{shifts}")
+    return 0
+
+
+def sign(
+    dataset: Path,
+    /,
+    *,
+    options: SignOptions = SignOptions(),
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Sign recorded data: a watermark in point clouds, a signed hash chain over files, or both.
+
+    For example:
+
+    lidar sign drive --watermark secret.key --chain secret.key -o signed
+
+    lidar sign drive --chain private.pem
+
+    lidar sign kitti/sequences/00 --watermark secret.key --chain secret.key -o signed_kitti
+
+    Parameters
+    ----------
+    dataset
+        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+    out
+        Directory to write to; without it, the hash chain is added to the dataset itself.
+    """
+    from lidar.integrity.keys import read_secret, read_signer  # noqa: PLC0415
+    from lidar.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.sign import sign_dataset  # noqa: PLC0415
+
+    if out is not None:
+        note_new_folder(out)
+    mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
+    signer = None if options.chain is None else read_signer(options.chain)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = sign_dataset(
+            dataset, out, watermark=mark, signer=signer, overwrite=report.overwrite, progress=progress
+        )
+    if report.json:
+        print_json({**asdict(summary), "path": str(summary.path)})
+    else:
+        parts = [f"watermark in {summary.marked} clouds, points moved by {summary.rms * 1000:.1f} mm rms"]
+        chained = f"{summary.frames} frames and {summary.files} files in a signed hash chain"
+        parts = (parts if mark else []) + ([chained] if signer else [])
+        print(f"{summary.path}: {'; '.join(parts)}")
+    return 0
+
+
+def verify(
+    dataset: Path,
+    /,
+    *,
+    options: SignOptions = SignOptions(),
+    noise: float = 0.001,
+    false_alarms: float = 0.01,
+    json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> int:
+    """Find files that were changed, lost or added, and with keys what was tampered with in signed data.
+
+    Without keys all files are compared with checksums.sha256. With keys the watermark, the signed hash chain
+    or both are verified: files, frames, blocks of a ring by 10 degrees, points. Exits with 1 if anything is
+    found.
+
+    For example:
+
+    lidar verify drive
+
+    lidar verify signed --watermark secret.key --chain secret.key
+
+    Parameters
+    ----------
+    dataset
+        Directory of the dataset or export, or of clouds of KITTI or nuScenes; without keys also a URL.
+    noise
+        Standard deviation in metres that coordinates got since the watermark, such as by another format.
+    false_alarms
+        Blocks a cloud that the watermark's test may report without tampering, on average.
+    json
+        Print all findings as JSON.
+    quiet
+        Show no progress bars.
+    """
+    from lidar.integrity.keys import read_secret, read_signer  # noqa: PLC0415
+    from lidar.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.verify import verify_dataset  # noqa: PLC0415
+
+    mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
+    signer = None if options.chain is None else read_signer(options.chain)
+    with progress_bar(quiet=quiet) as progress:
+        found = verify_dataset(
+            dataset,
+            watermark=mark,
+            signer=signer,
+            noise=noise,
+            false_alarms=false_alarms,
+            progress=progress,
+        )
+    if json:
+        print_json(found.to_json())
+    else:
+        print("\n".join(found.to_text(str(dataset))))
+    return 0 if found.intact else FAILURE
