@@ -21,7 +21,7 @@ SMALL_FILES = ENVIRONMENT | {"PYTHONDONTWRITEBYTECODE": "1"}
 
 def command(name, *words):
     """Arguments of a process that runs the program ``name``."""
-    return [sys.executable, "-m", f"{name}.cli", *map(str, words)]
+    return [sys.executable, "-m", name, *map(str, words)]
 
 
 def run_process(name, *words, env=ENVIRONMENT, **options):
