@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from geoscene.console import command_line
 from geoscene.files import write_json
 from geoscene.progress import Progress, silent
 from geoscene.typing import Float
@@ -97,7 +98,7 @@ def _with_clouds_as(
         parents = derived_from(dataset.path, dataset.manifest, by=f"convert --to {form.name}")
         write_json(Paths(part).manifest, manifest | parents)
         write_checksums(part)
-    return ExportSummary(out, {"clouds": count}, f"describe it with lidar info {out}")
+    return ExportSummary(out, {"clouds": count}, f"describe it with {command_line('lidar', 'info', out)}")
 
 
 def _source(dataset: Dataset, form: Format) -> Format:

@@ -84,7 +84,7 @@ def map_(
         for row in summary.distances:
             print(
                 f"  {row.name:20} {row.points:>12,} points  mean {1000 * row.mean_m:8.1f} mm"
-                f"  median {1000 * row.median_m:8.1f}  95 % {1000 * row.p95_m:8.1f}"
+                f"  median {1000 * row.median_m:8.1f} mm  95 % {1000 * row.p95_m:8.1f} mm"
                 + (f"  farther than {LIMIT:g} m: {row.beyond / row.points:.1%}" if row.beyond else "")
             )
         if summary.beside:

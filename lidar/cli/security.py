@@ -8,7 +8,16 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.console import FAILURE, SEVERAL, Report, note_new_folder, print_json, progress_bar, whole
+from geoscene.console import (
+    FAILURE,
+    SEVERAL,
+    Report,
+    command_line,
+    note_new_folder,
+    print_json,
+    progress_bar,
+    whole,
+)
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting
 from lidar.errors import InputError
 from lidar.options import OUTPUT, DefendOptions, SignOptions
@@ -149,7 +158,8 @@ def train(
         print_json(made.to_json())
     else:
         print(columns(made.table()))
-        print(f"{out}: {made.frames} frames; next: lidar defend {datasets[0]} --detector {out} ...")
+        words = command_line("lidar", "defend", datasets[0], "--detector", out)
+        print(f"{out}: {made.frames} frames; next: {words} ...")
     return 0
 
 

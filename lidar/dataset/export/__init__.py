@@ -6,6 +6,7 @@ Modules are imported when a dataset is exported, so that a list of the exporters
 from __future__ import annotations
 
 import importlib
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +45,7 @@ class Exporter:
     meaning : what is written, one line
     mark    : a file that is always written: a folder is overwritten only if it holds one
     names   : regular expression of the paths of the files that it writes; others are kept when overwriting
-    hint    : how to open the export; ``{path}`` stands for its folder
+    hint    : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell
     """
 
     name: str
@@ -72,7 +73,7 @@ class Exporter:
             counts = module.export(dataset, folder, progress=progress)
             write_export_provenance(dataset, folder, by=f"convert --to {self.name}")
             write_checksums(folder)
-        return ExportSummary(out, counts, self.hint.format(path=out))
+        return ExportSummary(out, counts, self.hint.format(path=out, quoted=shlex.quote(str(out))))
 
 
 _OURS = r"provenance\.json|checksums\.sha256"
@@ -107,7 +108,7 @@ EXPORTERS = {
             r"|data_3d_raw/\w+/velodyne_points/(timestamps\.txt|data/\d{10}\.bin)"
             r"|data_2d_raw/\w+/image_0[01]/(timestamps\.txt|data_rect/\d{10}\.png)"
             r"|data_2d_semantics/train/\w+/(instanceDict\.json|image_0[01]/(semantic|instance)/\d{10}\.png)",
-            hint="open it with kitti360scripts: KITTI360_DATASET={path}",
+            hint="open it with kitti360scripts: KITTI360_DATASET={quoted}",
         ),
         Exporter(
             "kitti-raw",
@@ -141,7 +142,7 @@ EXPORTERS = {
             "a ROS 2 recording (rosbag2) in MCAP",
             mark="metadata.yaml",
             names=r"metadata\.yaml|drive\.(mcap|db3)",
-            hint="play it with ros2 bag play {path}",
+            hint="play it with ros2 bag play {quoted}",
         ),
         Exporter(
             "ros2-sqlite3",
@@ -149,7 +150,7 @@ EXPORTERS = {
             "a ROS 2 recording (rosbag2) in SQLite",
             mark="metadata.yaml",
             names=r"metadata\.yaml|drive\.(mcap|db3)",
-            hint="play it with ros2 bag play {path}",
+            hint="play it with ros2 bag play {quoted}",
         ),
         Exporter(
             "tum",
@@ -157,7 +158,7 @@ EXPORTERS = {
             "trajectories of the vehicle and of every sensor as text files of TUM and of KITTI",
             mark="vehicle.tum",
             names=r"(vehicle|sensors/[^/]+)\.(tum|kitti)",
-            hint="compare with evo_ape tum {path}/vehicle.tum ESTIMATE",
+            hint="compare with evo_ape tum {quoted}/vehicle.tum ESTIMATE",
         ),
         Exporter(
             "waymo",

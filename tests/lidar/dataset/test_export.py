@@ -1,6 +1,7 @@
 """Exported datasets equal the recorded ones, read with independent parsers."""
 
 import json
+import shlex
 from datetime import UTC, datetime
 
 import numpy as np
@@ -91,6 +92,11 @@ def expected_pose(name, time_ns):
         return position, vehicle
     _, translation, rotation = MOUNTS[name]
     return position + vehicle.apply(translation), vehicle * rotation
+
+
+def test_hints_can_be_pasted_where_folders_have_spaces(dataset, tmp_path):
+    summary = EXPORTERS["tum"].export(dataset, tmp_path / "two words")
+    assert str(tmp_path / "two words" / "vehicle.tum") in shlex.split(summary.hint)
 
 
 def test_tum_trajectories_are_the_true_poses_of_vehicle_and_sensors(dataset, tmp_path):
