@@ -1,12 +1,11 @@
 """The page in a browser: drawing, picking, search, controls, and no network requests."""
 
-import os
 from io import BytesIO
 
 import numpy as np
 import pytest
 import shapely
-from helpers.browser import CHROMIUM, DRIVER, browser
+from helpers.browser import browser
 from PIL import Image
 
 from geoscene.classes import Class
@@ -44,13 +43,6 @@ def page(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def window(tmp_path_factory):
-    if not (CHROMIUM and DRIVER):
-        message = (
-            "no chromium and chromedriver here: the page is not tried (Debian: chromium chromium-driver)"
-        )
-        if os.environ.get("CI") == "true":
-            pytest.fail(message)
-        pytest.skip(message)
     with browser(tmp_path_factory.mktemp("chromium")) as opened:
         yield opened
 
