@@ -40,6 +40,8 @@ def run_program(name, *words, cwd="."):
         contextlib.chdir(cwd),
         patch.object(sys, "argv", arguments),
         patch.object(logging.getLogger(), "handlers", []),
+        # threads of Dask clusters in this process log at any time
+        patch.object(logging.getLogger("distributed"), "propagate", False),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(errors),
         pytest.raises(SystemExit) as end,
