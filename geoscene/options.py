@@ -11,6 +11,9 @@ from geoscene.console import SEVERAL, WORDS, degrees, whole
 from geoscene.errors import InputError
 from geoscene.uses import USES
 
+RELIEFS = ("off", "plain", "full")
+"""Relief of surfaces that a scene can have; each includes the former."""
+
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """Kinds of features that a scene can have besides its ground."""
 
@@ -28,6 +31,11 @@ class BuildOptions:
 
     lod: Annotated[int, Parameter(converter=whole)] = 2
     """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
+
+    relief: str = "off"
+    """Relief of surfaces: off (walls, roads and tunnels are smooth); plain (windows and doors are set back,
+    kerbs drop at crossings, tunnels are lined, surfaces are rough); full (also small parts: balconies,
+    cornices, chimneys, dormers, branches, bins). What the map does not hold is guessed and marked so."""
 
     dem: Annotated[tuple[str, ...], SEVERAL] = ()
     """Elevation files (GeoTIFF, .hgt or .hgt.zip) in any CRS; or the word tiles: public elevation tiles with
@@ -74,6 +82,8 @@ class BuildOptions:
         """Validate the options."""
         if self.lod not in (0, 1, 2):
             raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
+        if self.relief not in RELIEFS:
+            raise InputError(f"`relief` {self.relief}: {', '.join(RELIEFS[:-1])} or {RELIEFS[-1]}")
         if self.dem_gaps not in ("error", "nearest"):
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:

@@ -104,6 +104,7 @@ class Plan:
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     use       : what of the scene is written
+    relief    : of surfaces, of `geoscene.options.RELIEFS`
     layers    : feature tables in the order of feature numbers; those of objects and surfaces far from a route
                 are not complete
     ranges    : range [start, stop) of the feature numbers of each table
@@ -131,6 +132,7 @@ class Plan:
     structures: Structures
     openings: NDArray[np.object_]
     use: Use
+    relief: str
     layers: list[Layer]
     ranges: dict[str, tuple[int, int]]
     chosen: list[tuple[int, int]]
@@ -240,6 +242,7 @@ def make_plan(
         structures=structures,
         openings=local.openings,
         use=USES[options.use],
+        relief=options.relief,
         layers=layers,
         ranges=local.ranges,
         area=area,
