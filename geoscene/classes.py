@@ -115,7 +115,7 @@ _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
     Class.CYCLIST: (31, 14, 6, 72, (255, 0, 0)),
     Class.PEDESTRIAN: (30, 2, 7, 73, (220, 20, 60)),
     Class.MOTORCYCLIST: (32, 21, 5, 72, (255, 60, 140)),
-    Class.NOISE: (1, 0, 0, 7, (255, 0, 255)),
+    Class.NOISE: (1, 0, 0, 7, (0, 255, 255)),
     Class.SKY: (0, 0, 0, 1, (135, 190, 240)),
 }
 

@@ -26,6 +26,7 @@ from lidar.dataset.layout import Dataset, Paths, open_dataset, opened_rows, read
 from lidar.dataset.provenance import read_folder_provenance
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
+from lidar.geometry.mounts import OPTICAL
 from lidar.signal.registry import attack_names
 
 _TABLE_BYTES = 2**24
@@ -187,6 +188,8 @@ def _sensor(
     """Model, mount, rates, gaps and points of a sensor."""
     with reading_file(dataset.paths.calibration):
         kind, mount = str(row["kind"]), np.array(row["vehicle_from_sensor"], float)
+        if kind == "camera":
+            mount[:3, :3] = mount[:3, :3] @ OPTICAL.T  # body axes, as rigs state them
         angles = np.degrees(euler_from_quat(quat_from_matrix(mount[None, :3, :3])))[0]
         rate_hz = float(row["rate_hz"])
         if not 0 < rate_hz < math.inf:

@@ -740,9 +740,10 @@ def test_kitti_exports_take_clouds_and_labels_of_kitti_as_they_are(dataset, tmp_
         ("kitti", "sequences/00/velodyne/000007.bin"),
         ("kitti-raw", "velodyne_points/data/{:010d}.bin"),
     ):
-        EXPORTERS[kind].export(open_dataset(source), tmp_path / kind)
+        hint = EXPORTERS[kind].export(open_dataset(source), tmp_path / kind).hint
         (copied,) = (tmp_path / kind).rglob(name.format(7))
         assert copied.read_bytes() == (source / "top" / "velodyne" / "000007.bin").read_bytes()
+    assert f"'{copied.relative_to(tmp_path / kind).parts[0]}', '0001'" in hint
     labels = tmp_path / "kitti" / "sequences" / "00" / "labels" / "000007.label"
     assert labels.read_bytes() == (source / "top" / "labels" / "000007.label").read_bytes()
     shutil.rmtree(source / "top" / "velodyne")

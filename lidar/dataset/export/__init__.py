@@ -45,7 +45,8 @@ class Exporter:
     meaning : what is written, one line
     mark    : a file that is always written: a folder is overwritten only if it holds one
     names   : regular expression of the paths of the files that it writes; others are kept when overwriting
-    hint    : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell
+    hint    : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell,
+              ``{date}`` for the time of the drive's start
     """
 
     name: str
@@ -73,7 +74,8 @@ class Exporter:
             counts = module.export(dataset, folder, progress=progress)
             write_export_provenance(dataset, folder, by=f"convert --to {self.name}")
             write_checksums(folder)
-        return ExportSummary(out, counts, self.hint.format(path=out, quoted=shlex.quote(str(out))))
+        hint = self.hint.format(path=out, quoted=shlex.quote(str(out)), date=dataset.start)
+        return ExportSummary(out, counts, hint)
 
 
 _OURS = r"provenance\.json|checksums\.sha256"
@@ -117,7 +119,7 @@ EXPORTERS = {
             mark="dataformat.txt",
             names=r"dataformat\.txt|\d{4}_\d\d_\d\d/(calib_\w+\.txt|\d{4}_\d\d_\d\d_drive_0001_sync/\w+"
             r"/(timestamps\w*\.txt|data/\d{10}\.(bin|png|txt)))",
-            hint="open it with pykitti.raw('{path}', DATE, '0001')",
+            hint="open it with pykitti.raw('{path}', '{date:%Y_%m_%d}', '0001')",
         ),
         Exporter(
             "mcap",

@@ -45,6 +45,19 @@ def copy(driven, tmp_path):
     return shutil.copytree(driven, tmp_path / "copy")
 
 
+def test_a_camera_that_looks_ahead_has_no_rotation_on_the_vehicle(scene, tmp_path):
+    drive(scene, tmp_path / "d", options=DriveOptions(rig="seed", duration=0.1, workers=1))
+    mounts = {name: row["mount"] for name, row in describe(tmp_path / "d")["sensors"].items()}
+    assert (
+        mounts["camera_front"]
+        == mounts["lidar_front"]
+        == {
+            "xyz_m": [3.6, 0.0, 0.5],
+            "roll_pitch_yaw_deg": [0, 0, 0],
+        }
+    )
+
+
 def test_the_figures_are_those_of_the_files(driven, scene):
     found = describe(driven)
     clouds = [read_cloud(path) for path in sorted(driven.glob("lidar_top/pcd/*.pcd"))]
