@@ -70,11 +70,16 @@ def road_layer(graph: RoadGraph) -> Layer:
     return Layer("roads", edge_lines(graph, heights=True), columns)
 
 
-def tree_layer(trees: Trees, z: NDArray[np.float64]) -> Layer:
-    """Layer ``trees``: mapped trees and those of tree rows, as points at the foot of the trunk."""
+def tree_layer(trees: Trees, z: NDArray[np.float64], *, relief: bool = False) -> Layer:
+    """Layer ``trees``: mapped trees and those of tree rows, as points at the foot of the trunk.
+
+    relief : with habits
+    """
     columns = _columns(
         trees,
-        "feature osm_id height height_source crown crown_source trunk form form_source place_source moved",
+        "feature osm_id height height_source crown crown_source trunk form form_source"
+        + (" habit habit_source" if relief else "")
+        + " place_source moved",
     )
     return Layer("trees", shapely.points(np.column_stack([trees.xy, z])), columns)
 

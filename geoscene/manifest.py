@@ -13,7 +13,7 @@ from geoscene import __version__
 from geoscene.frames import wrapped
 from geoscene.ground import tile_span
 from geoscene.limits import height_limit, places, scale_limit
-from geoscene.objects.shapes import LEAF_AREA_DENSITY
+from geoscene.objects.shapes import leaf_area_density
 from geoscene.plan import Plan
 from geoscene.report import Problem, summarise
 from geoscene.roadgraph import find_components
@@ -76,7 +76,7 @@ def scene_manifest(
         "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
         "counts": _counts(plan, reports, problems=problems),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
-        "leaf_area_density": LEAF_AREA_DENSITY,
+        "leaf_area_density": leaf_area_density(relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         "problems": summarise(problems),

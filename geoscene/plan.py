@@ -216,7 +216,7 @@ def make_plan(
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
-        tree_layer(trees, _foot(trees.xy, local.height)),
+        tree_layer(trees, _foot(trees.xy, local.height), relief=options.relief != "off"),
         furniture_layer(furniture, _foot(furniture.xy, local.height)),
         barrier_layer(barriers),
         structure_layer(structures),
@@ -236,7 +236,9 @@ def make_plan(
         kept=kept,
         levels=local.levels,
         trees=trees,
-        forests=Forests.of(ground.layers, osm) if "trees" in options.only else None,
+        forests=Forests.of(ground.layers, osm, relief=options.relief != "off")
+        if "trees" in options.only
+        else None,
         furniture=furniture,
         barriers=barriers,
         structures=structures,
@@ -389,7 +391,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     cover, surfaces, pads = _collect(
         problems, _surfaces(osm, frame, extent=extent, buildings=buildings, made=made, only=options.only)
     )
-    found = _collect(problems, _objects(osm, frame, extent=extent, only=options.only))
+    found = _collect(problems, _objects(osm, frame, extent=extent, options=options))
     ranges = number_ranges(
         {
             "buildings": buildings.count,
@@ -544,14 +546,14 @@ def _together(polygons: NDArray[np.object_], first: NDArray[np.int64]) -> NDArra
 
 
 def _objects(
-    osm: OsmData, frame: Frame, *, extent: Bounds, only: Collection[str]
+    osm: OsmData, frame: Frame, *, extent: Bounds, options: BuildOptions
 ) -> tuple[dict[str, tuple[Any, Float, int]], list[Problem]]:
-    """What is mapped of trees, furniture and barriers, by kind; nothing of kinds not in ``only``.
+    """What is mapped of trees, furniture and barriers, by kind; nothing of kinds that are not asked for.
 
     These are a table of the objects before they are sited (None for furniture), boxes (n, 4) within which
     they will stand, and the count of their feature numbers.
     """
-    trees, problems = read_trees(osm, frame)
+    trees, problems = read_trees(osm, frame, relief=options.relief != "off")
     barriers, more = read_barriers(osm, frame, extent=extent)
     posts = mapped_furniture(osm, frame, extent=extent)[1]
     around = np.array([-_MOVED, -_MOVED, _MOVED, _MOVED])
@@ -564,10 +566,10 @@ def _objects(
     wanted = {"trees": problems, "furniture": [], "barriers": more}
     return (
         {
-            kind: row if kind in only else (row[0] and row[0].take(none), row[1][:0], 0)
+            kind: row if kind in options.only else (row[0] and row[0].take(none), row[1][:0], 0)
             for kind, row in found.items()
         },
-        [problem for kind, some in wanted.items() if kind in only for problem in some],
+        [problem for kind, some in wanted.items() if kind in options.only for problem in some],
     )
 
 

@@ -30,22 +30,24 @@ class Forests:
 
     feature : (k,) int64, forests with needle-leaved trees, by feature number, ascending
     needles : (k,) float64, their share of needle-leaved trees
+    relief  : trees have habits
     density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
     seed    : of places, sizes and forms
     """
 
     feature: Ints
     needles: Float
+    relief: bool = False
     density: float = 0.02
     seed: int = 0
 
     @classmethod
-    def of(cls, layers: Layers, osm: OsmData) -> Forests:
+    def of(cls, layers: Layers, osm: OsmData, *, relief: bool = False) -> Forests:
         """The forests among the layers of a ground."""
         kinds = {area.osm_id: area.tags.get("leaf_type", area.tags.get("wood", "")) for area in osm.areas}
         share = np.array([_SHARES.get(kinds.get(name, ""), 0.0) for name in layers.osm_id.tolist()], float)
         rows = np.flatnonzero((layers.klass == Class.FOREST_FLOOR) & (share > 0))
-        return cls(layers.feature[rows].astype(np.int64), share[rows])
+        return cls(layers.feature[rows].astype(np.int64), share[rows], relief)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Forests:
@@ -53,12 +55,14 @@ class Forests:
         shares = document["needleleaved_share"]
         feature = np.array([int(name) for name in shares], np.int64)
         needles = np.array(list(shares.values()), float)
-        return cls(feature, needles, float(document["trees_per_m2"]), int(document["seed"]))
+        relief = bool(document.get("relief", False))
+        return cls(feature, needles, relief, float(document["trees_per_m2"]), int(document["seed"]))
 
     def to_json(self) -> dict[str, Any]:
         """The document that a scene's manifest contains."""
         shares = dict(zip(map(str, self.feature.tolist()), self.needles.tolist(), strict=True))
-        return {"trees_per_m2": self.density, "seed": self.seed, "needleleaved_share": shares}
+        document = {"trees_per_m2": self.density, "seed": self.seed, "needleleaved_share": shares}
+        return document | ({"relief": True} if self.relief else {})
 
 
 def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tuple[Trees, Float]:
@@ -75,7 +79,7 @@ def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tup
     xy, draw, face = _places(floor, forests, box=box)
     feature = floor.feature[face].astype(np.int64)
     share, widest = _needle_shares(forests, feature), 1.2 * _spacing(forests)
-    trees = _sampled(xy, draw, feature=feature, share=share, widest=widest)
+    trees = _sampled(xy, draw, feature=feature, share=share, widest=widest, relief=forests.relief)
     return trees, _heights(floor.vertices[floor.faces[face]], xy)
 
 
@@ -149,7 +153,7 @@ def _needle_shares(forests: Forests, feature: Ints) -> Float:
     return np.where(known[place] == feature, share[place], 0.0)
 
 
-def _sampled(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float) -> Trees:
+def _sampled(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float, relief: bool) -> Trees:
     """Trees at places (n, 2) with size and form by random numbers (4, n)."""
     n, needled = len(xy), draw[3] < share
     height = np.where(needled, HEIGHT["needleleaved"], HEIGHT["broadleaved"]) * (0.8 + 0.4 * draw[2])
@@ -160,9 +164,11 @@ def _sampled(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: flo
         np.minimum(crown, widest),  # the spacing limits the crown
         height * TRUNK,
         np.where(needled, "needleleaved", "broadleaved"),
+        np.where(needled, "conical", "ovoid") if relief else np.full(n, ""),
         np.full(n, "sampled"),
         np.full(n, "height"),
         np.where(share > 0, "leaf_type", "default"),
+        np.full(n, "form" if relief else ""),
         np.full(n, "sampled"),
         np.zeros(n),
         np.full(n, ""),

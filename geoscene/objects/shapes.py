@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import Instances, Mesh, concatenate
+from geoscene.objects.crowns import leaf_area_densities, tree_shapes
+from geoscene.objects.solids import circle, lathe, prism, rectangle, solid
 from geoscene.typing import Float
 
 LEAF_AREA_DENSITY: dict[str, float] = {
@@ -27,84 +29,33 @@ from Asner, Scurlock and Hicke, "Global synthesis of leaf area index observation
 clipped hedges: assumed.
 """
 
-_SIDES = 8
-
 _BALL = ((0, 0), (0.65, 0.13), (0.97, 0.38), (0.97, 0.62), (0.65, 0.87), (0, 1))
 """Profile of a spherical crown: (diameter, z); 64 faces."""
 
 _CONE = ((0, 0), (1, 0.05), (0, 1))
 
 
-def prism(
-    outline: Float, bottom: float, *, top: float, taper: float = 1.0
-) -> tuple[Float, NDArray[np.int32]]:
-    """Vertices and faces of the prism over a convex outline (n, 2), counter-clockwise, metres.
-
-    taper : the upper outline's size against the lower's, about the origin, over 0
-    """
-    n = len(outline)
-    ring = np.arange(n)
-    ahead = np.roll(ring, -1)
-    points = np.vstack(
-        [np.column_stack([outline, np.full(n, bottom)]), np.column_stack([outline * taper, np.full(n, top)])]
+def leaf_area_density(*, relief: bool = False) -> dict[str, float]:
+    """`LEAF_AREA_DENSITY`, with ``relief`` also of the clusters of leaves in crowns with relief."""
+    if not relief:
+        return LEAF_AREA_DENSITY
+    forms = ("broadleaved", "needleleaved", "palm")
+    return LEAF_AREA_DENSITY | leaf_area_densities(
+        tuple((form, LEAF_AREA_DENSITY[f"crown_{form}"]) for form in forms)
     )
-    sides = [np.column_stack([ring, ahead, ahead + n]), np.column_stack([ring, ahead + n, ring + n])]
-    lid = np.column_stack([np.full(n - 2, n), ring[1:-1] + n, ring[2:] + n])
-    floor = np.column_stack([np.zeros(n - 2, int), ring[2:], ring[1:-1]])
-    return points, np.vstack([*sides, lid, floor]).astype(np.int32)
-
-
-def lathe(profile: Sequence[tuple[float, float]], *, sides: int = _SIDES) -> tuple[Float, NDArray[np.int32]]:
-    """Vertices and faces of the solid of revolution of a profile of (diameter, z), from pole to pole.
-
-    The first and last diameter are not used: the solid ends in a point there. Each ring between has the area
-    of its circle.
-    """
-    rings = len(profile) - 2
-    points = [np.array([[0.0, 0.0, profile[0][1]]])]
-    for diameter, z in profile[1:-1]:
-        points.append(np.column_stack([circle(diameter, sides), np.full(sides, z)]))
-    points.append(np.array([[0.0, 0.0, profile[-1][1]]]))
-    ring = np.arange(sides)
-    ahead = np.roll(ring, -1)
-    low = 1 + sides * np.arange(rings - 1)[:, None]
-    top = 1 + sides * (rings - 1)
-    faces = [
-        np.column_stack([np.zeros(sides, int), ahead + 1, ring + 1]),
-        np.stack([low + ring, low + ahead, low + ahead + sides], axis=-1).reshape(-1, 3),
-        np.stack([low + ring, low + ahead + sides, low + ring + sides], axis=-1).reshape(-1, 3),
-        np.column_stack([ring + top, ahead + top, np.full(sides, top + sides)]),
-    ]
-    return np.vstack(points), np.vstack(faces).astype(np.int32)
-
-
-def circle(diameter: float, sides: int = _SIDES) -> Float:
-    """A regular polygon (sides, 2), counter-clockwise, with the area of the circle of that diameter."""
-    turn = 2 * np.pi * np.arange(sides) / sides
-    radius = diameter / 2 * np.sqrt(2 * np.pi / sides / np.sin(2 * np.pi / sides))
-    outline: Float = radius * np.column_stack([np.cos(turn), np.sin(turn)])
-    return outline
-
-
-def rectangle(width: float, depth: float, *, x: float = 0.0, y: float = 0.0) -> Float:
-    """A rectangle (4, 2) about (x, y), counter-clockwise."""
-    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, depth / 2) + (x, y)
-
-
-def solid(body: tuple[Float, NDArray[np.int32]], *, klass: Class, material: str) -> Mesh:
-    """A closed mesh of (vertices, faces) of one class and material, in the material's colour."""
-    points, faces = body
-    of = materials()[material]
-    return Mesh.of(points, faces, klass=klass, material=of.code, color=of.color, closed=True)
 
 
 @functools.cache
-def shapes() -> dict[str, Mesh]:
+def shapes(*, relief: bool = False) -> dict[str, Mesh]:
     """All shapes by name, in the order of their numbers in `Instances.shape`.
 
     Crowns and trunks are of unit size (x and y from -0.5 to 0.5, z from 0 to 1), to be scaled; the rest is in
     metres at its usual size, x in the direction it faces, z up from the ground. All are closed.
+
+    relief : also those of scenes with relief, after the others
     """
+    if relief:
+        return shapes() | tree_shapes()
     return {
         "trunk": solid(prism(circle(1.0, 6), 0.0, top=1.0, taper=0.7), klass=Class.TRUNK, material="bark"),
         "crown_broadleaved": solid(lathe(_BALL), klass=Class.TREE_CROWN, material="foliage"),
@@ -213,7 +164,7 @@ def place(
     transform = np.concatenate([turn * size[:, None, :], np.reshape(position, (k, 3, 1))], axis=2)
     names = np.broadcast_to(np.asarray(name, np.str_), (k,))
     known, which = np.unique(names, return_inverse=True)
-    library = list(shapes())
+    library = list(shapes(relief=True))
     number = np.array([library.index(str(n)) for n in known], np.int32)[which.reshape(-1)]
     return Instances(
         number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()

@@ -14,6 +14,7 @@ from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
+from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
 from geoscene.objects.siting import Sites
 from geoscene.report import Problem
@@ -58,9 +59,11 @@ class Trees(Columns):
     crown   : (n,) float64 metres, diameter
     trunk   : (n,) float64 metres, diameter at breast height
     form    : (n,) str: ``broadleaved``, ``needleleaved`` or ``palm``
+    habit   : (n,) str, growth form, of `geoscene.objects.crowns.HABITS`; "" in scenes without relief
     height_source : (n,) str: ``height``, ``diameter_crown``, ``circumference``, ``default`` or ``sampled``
     crown_source : (n,) str: ``diameter_crown`` or ``height`` (by its ratio to the height)
     form_source : (n,) str: ``leaf_type``, ``genus`` or ``default``
+    habit_source : (n,) str: ``species`` (botanical names), ``form`` (the usual one of the form) or ""
     place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
               nearest clear place), ``row`` (spaced along a tree row) or ``sampled``
     moved   : (n,) float64 metres from where it is mapped
@@ -73,23 +76,29 @@ class Trees(Columns):
     crown: Float
     trunk: Float
     form: NDArray[np.str_]
+    habit: NDArray[np.str_]
     height_source: NDArray[np.str_]
     crown_source: NDArray[np.str_]
     form_source: NDArray[np.str_]
+    habit_source: NDArray[np.str_]
     place_source: NDArray[np.str_]
     moved: Float
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
 
 
-def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Trees, list[Problem]]:
+def read_trees(
+    osm: OsmData, frame: Frame, *, spacing: float = 8.0, relief: bool = False
+) -> tuple[Trees, list[Problem]]:
     """The single trees and tree rows on the map, and problems: tags that could not be used.
 
     Sizes come from ``height``, ``diameter_crown`` (metres) and ``circumference`` (metres; a value over
     36, more than any trunk, is taken as centimetres); missing sizes are derived from the others by `CROWN`
-    and `TRUNK`; the form comes from ``leaf_type``, else the genus.
+    and `TRUNK`; the form comes from ``leaf_type``, else the genus. With relief, habits come from the
+    botanical names, and the crowns of some are more slender.
 
     spacing : metres between trees of a row
+    relief  : trees have habits
     """
     problems: list[Problem] = []
     lonlat: list[tuple[float, float]] = []
@@ -114,15 +123,23 @@ def read_trees(osm: OsmData, frame: Frame, *, spacing: float = 8.0) -> tuple[Tre
     height_source, form, form_source = (np.array(columns[k], np.str_) for k in range(3, 6))
     mapped = np.isfinite(crown)
     ratio = np.array([CROWN[str(f)] for f in form])
+    habit, habit_source = np.full((2, len(ids)), "", object)
+    if relief:
+        pairs = [habit_of(_botanical(tag), form=str(f)) for tag, f in zip(tags, form, strict=True)]
+        habit[:] = [name for name, _ in pairs]
+        habit_source[:] = ["species" if told else "form" for _, told in pairs]
+        ratio = np.array([HABITS[name].crown for name, _ in pairs])
     return Trees(
         np.concatenate(places),
         height,
         np.where(mapped, crown, height * ratio),
         np.where(np.isfinite(trunk), trunk, height * TRUNK),
         form,
+        habit.astype(np.str_),
         height_source,
         np.where(mapped, "diameter_crown", "height"),
         form_source,
+        habit_source.astype(np.str_),
         np.array(["node" if osm_id.startswith("node/") else "row" for osm_id in ids], np.str_),
         np.zeros(len(ids)),
         np.array(ids, np.str_),
@@ -165,24 +182,38 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
     """
     n = len(trees)
     z = np.zeros(n) if height is None else np.asarray(height(*trees.xy.T), float)
-    base = trees.height * np.array([_CROWN_BASE[str(form)] for form in trees.form], float)
+    grown = trees.habit != ""
+    share = [
+        HABITS[str(h)].base if h else _CROWN_BASE[str(f)]
+        for h, f in zip(trees.habit, trees.form, strict=True)
+    ]
+    base = trees.height * np.array(share, float)
     middle = (base + trees.height) / 2
+    stem = np.where(trees.form == "palm", "trunk_palm", "trunk_flared")
     trunks = place(
-        "trunk",
+        np.where(grown, stem, "trunk"),
         np.column_stack([trees.xy, z - 0.3]),
         size=np.column_stack([trees.trunk, trees.trunk, middle + 0.3]),
         feature=trees.feature,
     )
     column, row = np.floor(trees.xy.T * 100).astype(np.int64)
-    heading = 2 * np.pi * uniform_at(column, row, count=1)[0]
+    turn, draw = uniform_at(column, row, count=2)
+    variant = np.char.mod("_%d", np.floor(VARIANTS * draw).astype(np.int64))
     crowns = place(
-        np.char.add("crown_", trees.form),
+        np.char.add("crown_", np.where(grown, np.char.add(trees.habit, variant), trees.form)),
         np.column_stack([trees.xy, z + base]),
         size=np.column_stack([trees.crown, trees.crown, trees.height - base]),
-        heading=heading,
+        heading=2 * np.pi * turn,
         feature=trees.feature,
     )
     return Instances.concatenate([trunks, crowns])
+
+
+def _botanical(tags: Tags) -> str:
+    """The botanical names of a tree in one text, genus first."""
+    return " ".join(
+        tags[key] for key in ("genus", "species", "taxon", "cultivar", "taxon:cultivar") if key in tags
+    )
 
 
 def _along(line: Float, spacing: float) -> Float:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
-from geoscene.objects.shapes import lathe
+from geoscene.objects.solids import lathe
 from geoscene.typing import Float
 
 Rgb = tuple[int, int, int]

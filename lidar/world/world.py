@@ -356,7 +356,8 @@ class World:
         kinds, found = list(self._leaves), np.zeros(len(self._surfaces.klass), np.uint8)
         for k, name in enumerate(self._names):
             if name in kinds:
-                found[starts[k] : starts[k + 1]] = 1 + kinds.index(name)
+                leafy = self._meshes[k].klass == Class.TREE_CROWN  # limbs in a crown let no ray pass
+                found[starts[k] : starts[k + 1]][leafy] = 1 + kinds.index(name)
         if "hedge" in kinds:
             found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
         return found

@@ -9,7 +9,8 @@ import shapely
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
-from geoscene.objects.shapes import place, prism, rectangle, shapes
+from geoscene.objects.shapes import place, shapes
+from geoscene.objects.solids import prism, rectangle
 from geoscene.scene import open_scene
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.tile_files import Tile, write_tile
