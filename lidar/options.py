@@ -910,6 +910,48 @@ def frame_limits(text: str) -> tuple[int, float]:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
+class EvaluateOptions:
+    """Options of an evaluation of an estimate against the truth."""
+
+    align: Annotated[str, Parameter(converter=_lower)] = "se3"
+    """Motion of the estimated trajectory onto the true one: none, origin (first poses), se3 or sim3 (least
+    squares, with scale), yaw-position (turn about z only)."""
+
+    associate: Annotated[str, Parameter(converter=_lower)] = "interpolated"
+    """Poses at the same times: interpolated (the truth at the estimate's times) or nearest."""
+
+    max_gap: float | None = None
+    """Seconds between poses of the truth that are interpolated (1 by default), or between matched poses
+    (nearest: 0.01 by default), at most."""
+
+    delta: Annotated[tuple[str, ...], WORDS] = ("1f", "10m", "100m")
+    """Frames (1f) and metres of the true way (10m) of relative errors, separated by commas; those longer than
+    the way are left out."""
+
+    sensor: str = ""
+    """Sensor whose poses the estimate holds; by default they are the vehicle's."""
+
+    map_error: Annotated[bool, Parameter(negative=())] = False
+    """Map the dataset's clouds with the aligned estimate, and measure the distances to the scene's true
+    surfaces."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        for name, known in (
+            ("align", ("none", "origin", "se3", "sim3", "yaw-position")),
+            ("associate", ("interpolated", "nearest")),
+        ):
+            if getattr(self, name) not in known:
+                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
+        if self.max_gap is not None and not 0 <= self.max_gap < math.inf:
+            raise InputError(f"`max_gap` {self.max_gap:g}: give seconds, 0 or more")
+        for word in self.delta:
+            if not re.fullmatch(r"[1-9]\d{0,8}f|\d{1,9}(\.\d+)?m", word) or not float(word[:-1]):
+                raise InputError(f"`delta` {word}: give frames or metres, such as 1f or 10m")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
 class ConvertOptions:
     """Options of a conversion of a dataset."""
 
