@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings, read_buildings
+from geoscene.buildings.facades import Setting, read_setting
 from geoscene.errors import InputError
 from geoscene.features import (
     barrier_layer,
@@ -105,6 +106,7 @@ class Plan:
     openings  : area of each structure where the ground is left out, None for most
     use       : what of the scene is written
     relief    : of surfaces, of `geoscene.options.RELIEFS`
+    facades   : what the openings of walls depend on; None without relief
     layers    : feature tables in the order of feature numbers; those of objects and surfaces far from a route
                 are not complete
     ranges    : range [start, stop) of the feature numbers of each table
@@ -133,6 +135,7 @@ class Plan:
     openings: NDArray[np.object_]
     use: Use
     relief: str
+    facades: Setting | None
     layers: list[Layer]
     ranges: dict[str, tuple[int, int]]
     chosen: list[tuple[int, int]]
@@ -221,6 +224,9 @@ def make_plan(
         barrier_layer(barriers),
         structure_layer(structures),
     ]
+    facades = None
+    if options.relief != "off":
+        facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
     plan = Plan(
         frame=frame,
         terrain=terrain,
@@ -245,6 +251,7 @@ def make_plan(
         openings=local.openings,
         use=USES[options.use],
         relief=options.relief,
+        facades=facades,
         layers=layers,
         ranges=local.ranges,
         area=area,

@@ -9,7 +9,7 @@ import pickle
 import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +17,7 @@ import numpy as np
 import shapely
 
 from geoscene.buildings import build_solids
+from geoscene.buildings.facades import wall_relief
 from geoscene.classes import Class
 from geoscene.cluster import Cluster
 from geoscene.files import digest_of, naming, write_atomically
@@ -60,6 +61,7 @@ class TileReport:
     water      : plan area of the water on it
     digest     : digest of the tile's file
     problems   : buildings that were simplified, and features that were dropped
+    facades    : openings of walls by what they are; empty without relief
     """
 
     i: int
@@ -74,6 +76,11 @@ class TileReport:
     water: float
     digest: str
     problems: tuple[Problem, ...]
+    facades: dict[str, int] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """The report as a JSON object."""
+        return {name: value for name, value in asdict(self).items() if name != "facades" or value}
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +175,11 @@ def build_tile(
     mesh = concatenate([solids.shifted(-origin), rest])
     if not plan.use.colors:
         mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
-    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies))
+    relief, counts = None, dict[str, int]()
+    if plan.facades is not None:
+        layout = wall_relief(solids, plan.facades, base=plan.base, height=plan.height)
+        relief, counts = layout.relief.placed(-origin, faces=len(mesh)), layout.counts
+    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief))
     forest_trees = 0
     if plan.forests is not None:
         box = tile_box(plan.ground, tile[0], j=tile[1])
@@ -187,6 +198,7 @@ def build_tile(
         _plan_area(rest.take(~rest.closed & (rest.klass == Class.WATER))),
         digest,
         tuple(problems),
+        counts,
     )
 
 
@@ -226,7 +238,7 @@ def build_tiles(
     job = _Job(plan, folder, lod, _Former.of(former, keys))
     for report in _reports(job, remaining, workers=workers, cluster=cluster):
         with naming(files.tile_journal), files.tile_journal.open("a", encoding="utf-8") as journal:
-            journal.write(json.dumps({"keys": asdict(keys), **asdict(report)}) + "\n")
+            journal.write(json.dumps({"keys": asdict(keys), **report.to_json()}) + "\n")
         yield report
     for left in files.tiles.glob("*.part"):  # of workers that were killed while writing
         left.unlink()
@@ -358,4 +370,4 @@ def _read_journal(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]
 
 def tiles_document(keys: Keys, reports: Sequence[TileReport]) -> dict[str, Any]:
     """The JSON object of the tile reports of a finished scene."""
-    return {"keys": asdict(keys), "tiles": [asdict(r) for r in sorted(reports, key=lambda r: (r.i, r.j))]}
+    return {"keys": asdict(keys), "tiles": [r.to_json() for r in sorted(reports, key=lambda r: (r.i, r.j))]}

@@ -161,11 +161,15 @@ def guess_looks(
     )
 
 
+def seeds(osm_id: Names) -> Ints:
+    """A number (n,) for each OSM id, from which what is guessed of the feature is drawn."""
+    digests = [hashlib.blake2b(str(name).encode(), digest_size=8).digest() for name in osm_id]
+    return np.array([int.from_bytes(some, "little", signed=True) for some in digests], np.int64)
+
+
 def _draws(osm_id: Names) -> Float:
     """Seven random numbers (7, n) in [0, 1) of each OSM id."""
-    digests = [hashlib.blake2b(str(name).encode(), digest_size=8).digest() for name in osm_id]
-    state = np.array([int.from_bytes(some, "little", signed=True) for some in digests], np.int64)
-    return uniform_at(state, np.zeros(len(osm_id), np.int64), count=7)
+    return uniform_at(seeds(osm_id), np.zeros(len(osm_id), np.int64), count=7)
 
 
 def _kinds(use: Names, *, area: Float, walls: Float) -> Names:

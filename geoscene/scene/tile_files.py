@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.buildings.facades import Facades, Openings, WallRelief
 from geoscene.classes import Class
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import digest, write_atomically
@@ -28,11 +29,13 @@ class Tile:
     origin    : (3,) float64, whole metres: tile coordinates + origin = scene coordinates
     mesh      : in tile coordinates
     instances : in tile coordinates; trees of forests are not in files (see `with_forests`)
+    relief    : openings of the walls, in tile coordinates; None in scenes without relief
     """
 
     origin: Float
     mesh: Mesh
     instances: Instances = field(default_factory=Instances.empty)
+    relief: WallRelief | None = None
 
 
 def with_forests(tile: Tile, forests: Forests, *, box: Sequence[float]) -> Tile:
@@ -63,7 +66,8 @@ def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
 def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
     instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
-    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances})
+    relief = {} if tile.relief is None else _relief_arrays(tile.relief)
+    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief})
     write_atomically(path, data)
     return digest(data)
 
@@ -76,14 +80,45 @@ def read_tile(path: Path) -> Tile:
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = read_arrays(path)
         instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(Instances)}
-        return Tile(arrays["origin"], _mesh(arrays), Instances(**instances))
+        mesh = _mesh(arrays)
+        relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
+        return Tile(arrays["origin"], mesh, Instances(**instances), relief)
+
+
+def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
+    facades = {f"facade_{f.name}": getattr(relief.facades, f.name) for f in fields(Facades)}
+    openings = {f"opening_{f.name}": getattr(relief.openings, f.name) for f in fields(Openings)}
+    return {**facades, **openings, "relief_cells": relief.cells, "relief_wall": relief.wall}
+
+
+def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:
+    """The relief in a tile's arrays; raises ValueError if its tables do not fit each other."""
+    facades = Facades(**{f.name: _column(arrays, f"facade_{f.name}") for f in fields(Facades)})
+    openings = Openings(**{f.name: _column(arrays, f"opening_{f.name}") for f in fields(Openings)})
+    cells, wall = _column(arrays, "relief_cells"), _column(arrays, "relief_wall")
+    for table in (facades, openings):
+        if {len(column) for column in table.columns().values()} - {len(table)}:
+            raise ValueError(f"columns of {type(table).__name__} differ in length")
+    ends = facades.first + facades.grid.prod(axis=1)
+    if len(wall) != faces or ends.max(initial=0) > len(cells) or facades.first.min(initial=0) < 0:
+        raise ValueError("walls of the relief do not fit its cells or the faces")
+    if cells.max(initial=-1) >= len(openings) or wall.max(initial=-1) >= len(facades):
+        raise ValueError("rows of the relief are beyond its tables")
+    return WallRelief(facades, cells, openings, wall)
 
 
 def _mesh(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Mesh:
     return Mesh(**{f.name: _column(arrays, prefix + f.name) for f in fields(Mesh)})
 
 
-_ROWS = {"vertices": (3,), "faces": (3,), "color": (3,), "instance_transform": (3, 4)}
+_ROWS = {
+    "vertices": (3,), "faces": (3,), "color": (3,), "instance_transform": (3, 4), "facade_foot": (3,),
+    "facade_tangent": (2,), "facade_size": (2,), "facade_start": (2,), "facade_cell": (2,),
+    "facade_grid": (2,), "opening_panel": (4,), "opening_sill": (4,), "opening_opening": (4,),
+    "opening_bars": (2,),
+    "opening_trim_color": (3,), "opening_frame_color": (3,), "opening_infill_color": (3,),
+    "opening_room_color": (3,),
+}  # fmt: skip
 """Shape of a row of a column; of all others a number."""
 
 

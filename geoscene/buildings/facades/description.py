@@ -6,7 +6,7 @@ footprints and solids stay as mapped, and a ray that hits a wall decides there w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,12 +95,18 @@ class WallRelief:
     """The facades of a tile.
 
     facades  : the walls
-    cells    : (c,) int16, row of ``openings`` of each cell, -1 for none
+    cells    : (c,) int32, row of ``openings`` of each cell, -1 for none
     openings : kinds of openings
     wall     : (m,) int32, row of ``facades`` of each face of the tile's mesh, -1 for other faces
     """
 
     facades: Facades
-    cells: NDArray[np.int16]
+    cells: NDArray[np.int32]
     openings: Openings
     wall: NDArray[np.int32]
+
+    def placed(self, offset: Float, *, faces: int) -> WallRelief:
+        """The relief moved by ``offset`` (3,), of a mesh of ``faces`` faces that begins with its own."""
+        wall = np.full(faces, -1, np.int32)
+        wall[: len(self.wall)] = self.wall
+        return replace(self, facades=replace(self.facades, foot=self.facades.foot + offset), wall=wall)

@@ -1,0 +1,116 @@
+"""Lays out openings on the walls of a tile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.buildings.facades.description import Facades, WallRelief
+from geoscene.buildings.facades.doors import facing_street, put_guessed_doors, put_mapped_doors
+from geoscene.buildings.facades.fit import Sheet
+from geoscene.buildings.facades.grids import Elevations, nth
+from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_openings
+from geoscene.buildings.facades.setting import Setting
+from geoscene.buildings.facades.walls import find_walls
+from geoscene.mesh import Mesh
+from geoscene.splitmix import uniform_at
+from geoscene.typing import Bools, Float, Height, Ints
+
+_PLINTH = 0.35
+"""Metres from the floor to the glass of a shop front; assumed."""
+
+_SIGN = 0.7
+"""Metres from the glass of a shop front to the ceiling, where its sign is; assumed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The relief of a tile's walls, and what was counted.
+
+    counts : walls with openings, openings by what they are, entrances mapped and left out
+    """
+
+    relief: WallRelief
+    counts: dict[str, int]
+
+
+def wall_relief(mesh: Mesh, setting: Setting, *, base: Float, height: Height | None) -> Layout:
+    """The relief of the walls of a mesh of buildings.
+
+    mesh   : in scene metres, features are rows of the table of buildings
+    base   : (count,) z of each building's base, NaN where it is not known
+    height : z of the ground at x, y; None if it is 0 everywhere
+    """
+    walls, of_face = find_walls(mesh)
+    at, some = Elevations.of(walls, setting, base=base, height=height)
+    number = np.full(len(walls), -1, np.int32)
+    number[some] = np.arange(len(some))
+    walls, grids, cells = at.walls, at.grids, at.cells
+    chosen, counts = _choose(at)
+    openings, index = make_openings(chosen, at.styles, wall=cells.wall)
+    kept = np.zeros(len(walls), np.bool_)
+    kept[cells.wall[index >= 0]] = True
+    again = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
+    again[:-1][kept] = np.arange(np.count_nonzero(kept))
+    of_face = again[np.where(of_face >= 0, number[of_face], -1)]
+    index = index[kept[cells.wall]]
+    walls, grids = walls.take(kept), grids.take(kept)
+    sizes = grids.count.prod(axis=1)
+    facades = Facades(
+        walls.feature,
+        walls.foot,
+        walls.tangent,
+        walls.size,
+        np.column_stack([grids.start, grids.floor - grids.bottom]),
+        grids.cell,
+        grids.ground,
+        grids.count.astype(np.int32),
+        (np.cumsum(sizes) - sizes).astype(np.int32),
+    )
+    counts = {"walls": len(walls), **counts}
+    return Layout(WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32)), counts)
+
+
+def _choose(at: Elevations) -> tuple[Chosen, dict[str, int]]:
+    """What each cell holds, and how many openings there are by what they are."""
+    sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
+    facing = facing_street(at)
+    _put_windows(sheet, at)
+    _put_shops(sheet, at, facing=facing)
+    mapped = put_mapped_doors(sheet, at)
+    put_guessed_doors(sheet, at, facing=facing)
+    place = nth(_sizes(at.walls.feature))[wall] * 65536 + cells.storey * 256 + cells.column
+    draw = uniform_at(styles.seed[wall], place, count=2, seed=1)
+    closed = (sheet.kind == WINDOW) & (draw[0] < styles.closed[wall])
+    counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped
+    return Chosen(sheet.kind, sheet.place, closed, draw[1], cells.height), counts
+
+
+def _put_windows(sheet: Sheet, at: Elevations) -> None:
+    """Put a window into each cell where it fits."""
+    cell = np.flatnonzero((at.styles.window[:, 2] > 0)[at.cells.wall])
+    wall = at.cells.wall[cell]
+    middle, window = at.grids.middle[wall], at.styles.window[wall]
+    half = (window[:, 2] - window[:, 0]) / 2
+    box = np.column_stack([middle - half, window[:, 1], middle + half, window[:, 3]])
+    fits = sheet.fits(cell, WINDOW, box=box, above=0.2)
+    sheet.put(cell[fits], WINDOW, box=box[fits])
+
+
+def _put_shops(sheet: Sheet, at: Elevations, *, facing: Bools) -> None:
+    """Put shop fronts into the ground floors of shops to a street."""
+    middle, height = at.grids.middle[at.cells.wall], at.cells.height
+    cell = np.flatnonzero((at.cells.storey == 0) & (at.styles.shop & facing)[at.cells.wall] & (middle >= 0.8))
+    middle, half = middle[cell], np.minimum(middle[cell] - 0.15, 2.0)
+    top = np.floor(np.minimum(height[cell] - _SIGN, 3.2) * 20) / 20
+    box = np.column_stack([middle - half, np.full(len(cell), _PLINTH), middle + half, top])
+    fits = sheet.fits(cell, SHOP, box=box, above=0.1)
+    sheet.put(cell[fits], SHOP, box=box[fits])
+
+
+def _sizes(sorted_keys: NDArray[np.integer]) -> Ints:
+    """Sizes of the runs of equal keys."""
+    first = np.flatnonzero(np.diff(sorted_keys, prepend=-1))
+    return np.diff(first, append=len(sorted_keys)).astype(np.int64)

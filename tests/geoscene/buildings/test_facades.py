@@ -1,0 +1,200 @@
+"""Openings of walls follow tags and types, lie within their walls, and face free space."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import affinity
+
+from geoscene.buildings import build_solids, read_buildings
+from geoscene.buildings.facades import read_setting, wall_relief
+from geoscene.buildings.facades.walls import find_walls
+from geoscene.classes import materials
+from geoscene.frames import Frame
+from geoscene.mesh import WALL
+from geoscene.sources.data import Area, OsmData, Point
+
+FRAME = Frame.at(8.7, 49.4)
+GLASS = materials()["glass"].code
+
+
+def lonlat(xy):
+    return np.column_stack(FRAME.to_geographic(*np.asarray(xy, float).T))
+
+
+def house(number, shape, **tags):
+    """A building with the scene coordinates of a shape; ``__`` in a key stands for a colon."""
+    tags = {key.replace("__", ":"): value for key, value in ({"building": "yes"} | tags).items()}
+    return Area(f"way/{number}", tags, shapely.transform(shape, lonlat), np.empty(0, np.int64))
+
+
+def entrance(xy, kind="yes"):
+    lon, lat = lonlat([xy])[0]
+    return Point("node/1", {"entrance": kind}, lon, lat)
+
+
+def facades_of(*areas, points=(), street=None, height=None):
+    """Table, mesh and layout of a map, whose only street is a line of scene coordinates."""
+    osm = OsmData((8.6, 49.3, 8.8, 49.5), [], list(areas), list(points), [])
+    table, _ = read_buildings(osm, FRAME)
+    mesh, _ = build_solids(table, base=np.zeros(table.count))
+    lines = np.array([] if street is None else [shapely.LineString(street)], object)
+    setting = read_setting(osm, FRAME, buildings=table, streets=lines)
+    return table, mesh, wall_relief(mesh, setting, base=np.zeros(table.count), height=height)
+
+
+def panels_of(relief, *, part="panel"):
+    """Wall, row, column and corners (n, 4) in wall coordinates of all openings, and their kind."""
+    f = relief.facades
+    out = []
+    for w in range(len(f)):
+        columns, rows = f.grid[w]
+        index = relief.cells[f.first[w] : f.first[w] + columns * rows].reshape(rows, columns)
+        for r, c in np.argwhere(index >= 0):
+            floor = f.start[w, 1] + (f.ground[w] + (r - 1) * f.cell[w, 1] if r else 0.0)
+            corner = np.tile([f.start[w, 0] + c * f.cell[w, 0], floor], 2)
+            kind = index[r, c]
+            out.append((w, r, c, corner + getattr(relief.openings, part)[kind], kind))
+    return out
+
+
+def outside(relief, wall, box):
+    """Two points in plan, 1 m in front of the ends of a panel."""
+    f = relief.facades
+    out = np.array([f.tangent[wall, 1], -f.tangent[wall, 0]])
+    return [f.foot[wall, :2] + u * f.tangent[wall] + out for u in box[[0, 2]]]
+
+
+@st.composite
+def blocks(draw):
+    """Rotated unions of boxes, often with courtyards."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    corner, size = rng.uniform(-20, 20, (4, 2)), rng.uniform(1, 25, (4, 2))
+    shape = shapely.union_all([shapely.box(*c, *(c + s)) for c, s in zip(corner, size, strict=True)])
+    return affinity.rotate(shape, float(rng.uniform(0, 90)))
+
+
+@given(
+    blocks(),
+    st.floats(3, 80),
+    st.sampled_from(["yes", "house", "office", "retail", "church", "industrial", "parking", "garage"]),
+    st.sampled_from(["flat", "gabled", "hipped", "skillion"]),
+    st.integers(1, 10**9),
+)
+@settings(max_examples=30, deadline=None)
+def test_panels_lie_within_their_walls_and_apart(shape, height, use, roof, number):
+    table, mesh, layout = facades_of(
+        house(number, shape, building=use, height=f"{height:.1f}", roof__shape=roof),
+        street=[(-60, -40), (60, -40)],
+    )
+    relief = layout.relief
+    f = relief.facades
+    of_wall = {}
+    for w, _, _, box, _ in panels_of(relief):
+        of_wall.setdefault(w, []).append(shapely.box(*box))
+    corners = mesh.vertices[mesh.faces]
+    for w, boxes in of_wall.items():
+        faces = corners[relief.wall == w]
+        u = (faces[:, :, :2] - f.foot[w, :2]) @ f.tangent[w]
+        off = (faces[:, :, :2] - f.foot[w, :2]) @ np.array([f.tangent[w, 1], -f.tangent[w, 0]])
+        assert np.abs(off).max() < 2e-3
+        uv = np.stack([u, faces[:, :, 2] - f.foot[w, 2]], axis=2)
+        wall = shapely.union_all(shapely.polygons(uv), grid_size=1e-4)
+        assert shapely.buffer(wall, -0.049, join_style="mitre").covers(shapely.union_all(boxes))
+        assert not shapely.STRtree(boxes).query(boxes, predicate="intersects").shape[1] > len(boxes)
+    assert set(mesh.surface[relief.wall >= 0].tolist()) <= {WALL}
+    assert set(table.outline[mesh.feature[relief.wall >= 0]].tolist()) <= {0}
+
+
+@given(st.integers(1, 10**9), st.integers(1, 12))
+@settings(max_examples=25, deadline=None)
+def test_a_building_has_as_many_rows_of_windows_as_storeys_are_tagged(number, levels):
+    shape = shapely.box(0, 0, 24, 12)
+    tags = {"building__levels": str(levels), "roof__shape": "flat"}
+    _, _, layout = facades_of(house(number, shape, building="apartments", **tags))
+    rows = {r for _, r, _, _, _ in panels_of(layout.relief)}
+    assert rows == set(range(levels))
+    assert set(layout.relief.facades.grid[:, 1].tolist()) == {levels}
+
+
+def test_walls_closer_than_a_metre_to_another_building_are_blank_up_to_its_roof():
+    _, _, layout = facades_of(
+        house(1, shapely.box(0, 0, 12, 12), building="apartments", height="21"),
+        house(2, shapely.box(12.6, 0, 24, 12), building="apartments", height="9"),
+    )
+    f = layout.relief.facades
+    tall = [
+        (w, box)
+        for w, _, _, box, _ in panels_of(layout.relief)
+        if f.feature[w] == 0 and abs(f.tangent[w, 1] - 1) < 1e-6
+    ]
+    assert len(tall) >= 6
+    assert all(box[1] > 9.0 for _, box in tall)
+    low = [w for w, *_ in panels_of(layout.relief) if f.feature[w] == 1]
+    assert not any(abs(f.tangent[w, 1] + 1) < 1e-6 for w in low)
+
+
+def test_a_door_is_at_each_mapped_entrance_and_nowhere_else():
+    shape = shapely.box(0, 0, 20, 10)
+    _, _, layout = facades_of(
+        house(1, shape, building="apartments", height="13"),
+        points=[entrance((6.3, 0.0))],
+        street=[(-10, 20), (40, 20)],
+    )
+    assert layout.counts["entrances_mapped"] == layout.counts["doors"] == 1
+    openings = layout.relief.openings
+    (door,) = [
+        (w, box)
+        for w, r, _, box, kind in panels_of(layout.relief, part="opening")
+        if r == 0 and box[1] < 0.3 and openings.infill[kind] != GLASS
+    ]
+    foot, tangent = layout.relief.facades.foot[door[0]], layout.relief.facades.tangent[door[0]]
+    place = foot[:2] + door[1][[0, 2]].mean() * tangent
+    assert np.abs(place - [6.3, 0.0]).max() < 0.35
+
+
+def test_doors_are_guessed_where_a_street_is():
+    shape = shapely.box(0, 0, 14, 10)
+    _, _, layout = facades_of(house(1, shape, building="house", height="6"), street=[(-30, -8), (40, -8)])
+    assert layout.counts["doors"] == 1
+    (wall,) = {w for w, r, _, box, _ in panels_of(layout.relief, part="opening") if box[1] < 0.2}
+    assert layout.relief.facades.tangent[wall] == pytest.approx([1, 0], abs=1e-6)
+
+
+def test_openings_are_above_the_ground_in_front_of_them():
+    def height(x, y):
+        return 0.35 * np.maximum(x, 0.0) + 0.0 * y
+
+    shape = shapely.box(0, 0, 20, 10)
+    _, _, layout = facades_of(house(1, shape, building="apartments", height="16"), height=height)
+    for w, _, _, box, _ in panels_of(layout.relief):
+        for x, y in outside(layout.relief, w, box):
+            ground = height(np.array([x]), np.array([y]))[0] - 0.35 * (abs(x) > 20) * 0.7
+            assert layout.relief.facades.foot[w, 2] + box[1] > ground
+
+
+def test_what_is_guessed_depends_on_the_building_alone():
+    first = house(7, shapely.box(0, 0, 20, 10), building="apartments", height="16")
+    second = house(3, shapely.box(40, 0, 60, 10), building="apartments", height="19")
+    alone = facades_of(first)[2].relief
+    table, _, both = facades_of(second, first)
+    row = table.osm_id.tolist().index("way/7")
+    kept = [
+        (w, r, c, box) for w, r, c, box, _ in panels_of(both.relief) if both.relief.facades.feature[w] == row
+    ]
+    for (_, r, c, box), (_, r2, c2, box2, _) in zip(kept, panels_of(alone), strict=True):
+        assert (r, c) == (r2, c2)
+        assert box == pytest.approx(box2)
+
+
+def test_each_face_of_a_straight_wall_is_in_it():
+    _, mesh, _ = facades_of(house(1, affinity.rotate(shapely.box(0, 0, 20, 10), 33), height="10"))
+    walls, of_face = find_walls(mesh)
+    assert len(walls) == 4
+    assert (of_face[mesh.surface == WALL] >= 0).all()
+    assert np.sort(walls.size[:, 0]) == pytest.approx([10, 10, 20, 20], abs=1e-3)
+    moved = replace(mesh, vertices=mesh.vertices + np.array([5000.0, -3000.0, 100.0]))
+    assert len(find_walls(moved)[0]) == 4
