@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,11 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
+from lidar.raycast.columns import Rays
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
-from lidar.raycast.rays import free_rays, limited, posed_rays
+from lidar.raycast.rays import beyond, free_rays, limited, posed_rays, taken
+from lidar.raycast.refine import Refiner
 from lidar.raycast.scene import Float64Scene
 
 log = logging.getLogger(__name__)
@@ -59,8 +61,13 @@ class Caster:
     backend         : ``embree``; ``float64``, the same hits without Embree, 10 to 50 times slower; or
                       ``auto``: Embree if it is available, else float64
 
+    ``refiners`` replace hits on faces of the own mesh by hits on the surfaces behind them; every cast goes
+    through them.
+
     Raises InputError for an invalid mesh and BackendError if Embree is not available.
     """
+
+    refiners: Sequence[Refiner] = ()
 
     def __init__(
         self,
@@ -119,6 +126,7 @@ class Caster:
         mask: int = ALL,
         time: ArrayLike | None = None,
         order: NDArray[np.integer] | None = None,
+        on: NDArray[np.int32] | None = None,
         normals: bool = False,
         precision: str = "exact",
         retrace: bool = True,
@@ -134,6 +142,8 @@ class Caster:
         time       : (n,) ray times 0 to 1 within the motion of moving instances; 0 by default
         order      : (n,) permutation, the order in which rays form packets; fastest where 16 rays in a
                      row are nearly parallel (16 azimuths of one channel, 16 pixels)
+        on         : (n,) faces of the own mesh on which rays start, as in `Hits.face`; -1 for none. Give it
+                     for rays that start on a hit, which a refiner may have moved behind the plane of its face
         normals    : whether to compute `Hits.normal`
         precision  : ``exact``; ``refined``: the float64 range on the face that Embree finds in float32, also
                      near its edges; ``float32``: Embree's range. The latter two may hit faces in which a ray
@@ -155,7 +165,7 @@ class Caster:
             precision=precision,
             retrace=retrace,
         )
-        return self.scene.cast(rays, normals=normals, threads=threads)
+        return self._first_hits(rays, on, normals=normals, threads=threads)
 
     def cast_posed(
         self,
@@ -194,7 +204,7 @@ class Caster:
             precision=precision,
             retrace=retrace,
         )
-        return self.scene.cast(rays, normals=normals, threads=threads)
+        return self._first_hits(rays, None, normals=normals, threads=threads)
 
     def occluded(
         self,
@@ -205,13 +215,68 @@ class Caster:
         near: float = 0.0,
         mask: int = ALL,
         time: ArrayLike | None = None,
+        on: NDArray[np.int32] | None = None,
         threads: int = 1,
     ) -> NDArray[np.bool_]:
         """Whether each ray (n,) hits anything between ``near`` and ``far`` (a number or (n,)).
+
+        ``on`` and the other parameters are those of `cast`.
 
         Offset the origins of shadow rays by a millimetre along the normal, or they hit their own surface.
         Within a tenth of a millimetre (at 400 m from the caster's origin) of an edge
         a ray counts as occluded.
         """
         rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
-        return self.scene.occluded(rays, threads=threads)
+        return self._any_hit(rays, on, threads=threads)
+
+    def _first_hits(self, rays: Rays, on: NDArray[np.int32] | None, *, normals: bool, threads: int) -> Hits:
+        """The first hits of checked rays."""
+        if on is None:
+            hits = self.scene.cast(rays, normals=normals, threads=threads)
+            for refiner in self.refiners:
+                refiner.refine(rays, hits, threads=threads)
+            return hits
+        hits, at = self._left(rays, on, normals=normals)
+        for row, part in _parts(rays, at):
+            found = self._first_hits(part, None, normals=normals, threads=threads)
+            found.range[:] += at[row]
+            for column, new in zip(hits.columns().values(), found.columns().values(), strict=True):
+                if len(column):
+                    column[row] = new
+        return hits
+
+    def _any_hit(self, rays: Rays, on: NDArray[np.int32] | None, *, threads: int) -> NDArray[np.bool_]:
+        """Whether checked rays hit anything."""
+        if on is not None:
+            hits, at = self._left(rays, on, normals=False)
+            blocked = hits.face >= 0
+            for row, part in _parts(rays, at):
+                blocked[row] = self._any_hit(part, None, threads=threads)
+            return blocked
+        blocked = self.scene.occluded(rays, threads=threads)
+        if self.refiners and np.isfinite(rays.far).any():
+            # The surface behind a plane that is in the way can lie beyond the end of the ray.
+            row = np.flatnonzero(blocked)
+            part = taken(rays, row)
+            blocked[row] = self._first_hits(part, None, normals=False, threads=threads).face >= 0
+        return blocked
+
+    def _left(self, rays: Rays, on: NDArray[np.int32], *, normals: bool) -> tuple[Hits, Float]:
+        """Hits of rays on the surface in which they start, and the ray parameter at which others leave it."""
+        n = len(rays.directions)
+        if on.shape != (n,):
+            raise InputError(f"{n} rays start on {len(on)} faces; give one per ray, -1 for none")
+        none, normal = np.full(n, -1, np.int32), np.zeros((n if normals else 0, 3))
+        hits = Hits(np.full(n, np.inf), none, none.copy(), np.zeros(n, np.float32), normal)
+        at = np.zeros(n)
+        for refiner in self.refiners:
+            at = np.maximum(at, refiner.leave(rays, on, hits))
+        return hits, at
+
+
+def _parts(rays: Rays, at: Float) -> Iterator[tuple[NDArray[np.intp], Rays]]:
+    """Rays that start in front of all planes, and those that cross one from behind, from there on."""
+    for row in (np.flatnonzero(at == 0.0), np.flatnonzero((at > 0.0) & (at < np.inf))):
+        if len(row):
+            part = taken(rays, row)
+            yield row, part if at[row[0]] == 0.0 else beyond(part, at[row])

@@ -128,6 +128,26 @@ def in_scene(rays: Rays) -> tuple[Float, Float]:
     return o, d
 
 
+def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
+    """Selected rays, without an order."""
+    return rays._replace(
+        directions=_rows(rays.directions[row], "directions"),
+        offsets=_rows(rays.offsets[row], "origins") if len(rays.offsets) > 1 else rays.offsets,
+        pose=rays.pose[row] if len(rays.pose) else rays.pose,
+        order=np.empty(0, np.int64),
+        time=rays.time[row] if len(rays.time) else rays.time,
+        far=rays.far[row] if len(rays.far) > 1 else rays.far,
+    )
+
+
+def beyond(rays: Rays, at: Float) -> Rays:
+    """The rest of rays from the ray parameters (n,) on; it is exact, as the rays start on a face."""
+    origin, direction = in_scene(rays)
+    return free_rays(origin + at[:, None] * direction, direction)._replace(
+        time=rays.time, far=np.maximum(rays.far - at, 0.0), mask=rays.mask, retrace=rays.retrace
+    )
+
+
 def _refusal(rays: Rays, bad: int) -> InputError:
     where = f" at the pose {rays.position[rays.pose[bad]].tolist()}" if rays.pose.size else ""
     if len(rays.offsets):

@@ -1,0 +1,9 @@
+"""Surfaces behind the planes of faces, met by formula: openings of facades."""
+
+from lidar.relief.march import FRAME as FRAME
+from lidar.relief.march import INFILL as INFILL
+from lidar.relief.march import PARTS as PARTS
+from lidar.relief.march import ROOM as ROOM
+from lidar.relief.march import SILL as SILL
+from lidar.relief.walls import WallRefiner as WallRefiner
+from lidar.relief.walls import WallTables as WallTables
