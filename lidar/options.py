@@ -69,6 +69,9 @@ FILM_VIEWS = ("chase", "top")
 FILM_COLORS = ("class", "height", "intensity", "time", "origin")
 """What colours of returns in a film can show."""
 
+METHODS = ("kiss-icp", "genz-icp", "small_gicp")
+"""Methods of odometry."""
+
 ECHOES = ("all", "first", "last", "single")
 """Echoes of a pulse that a map can be made of."""
 
@@ -138,6 +141,15 @@ def _span(_: object, tokens: Sequence[Token]) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f"{text}: give two numbers of seconds as FROM,TO") from None
     return first, last
+
+
+def _six(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
+    text = tokens[0].value.strip()
+    with suppress(ValueError):
+        values = tuple(float(word) for word in text.split(","))
+        if len(values) == 6 and all(map(math.isfinite, values)):
+            return values
+    raise ValueError(f"{text}: give six numbers, three of metres and three of degrees")
 
 
 def _outliers(_: object, tokens: Sequence[Token]) -> tuple[int, float]:
@@ -782,6 +794,39 @@ class MapOptions:
             west, south, east, north = self.bounds_deg
             if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
                 raise InputError("`bounds_deg`: give west, south, east and north in degrees, in this order")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class OdometryOptions:
+    """Options of odometry."""
+
+    method: Annotated[str, Parameter(converter=_lower, n_tokens=1)]
+    """Method: kiss-icp, genz-icp or small_gicp (laser scanners)."""
+
+    sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
+    """Names of the sensors to use. Scanners: by default the one whose sweeps have the most points; several
+    are merged."""
+
+    start_pose: Annotated[
+        tuple[float, ...] | None, Parameter(converter=_six, n_tokens=1, metavar="X,Y,Z,ROLL,PITCH,YAW")
+    ] = None
+    """Where the vehicle begins: scene metres, and degrees as alpha, beta and gamma of poses.csv. By default
+    poses are relative to the first."""
+
+    settings: Annotated[
+        tuple[tuple[str, str], ...],
+        Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
+    ] = ()
+    """One setting of the method; repeat for more. docs/odometry.md lists them."""
+
+    settings_file: Path | None = None
+    """TOML file of settings; --set goes before it."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.method not in METHODS:
+            raise InputError(f"`method` {self.method}: one of {', '.join(METHODS)}")
 
 
 @Parameter(name="*")

@@ -3,7 +3,7 @@
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
-from lidar.cli.data import apply, convert, denoise, map_
+from lidar.cli.data import apply, convert, denoise, map_, odometry
 from lidar.cli.drives import drive, redteam, sweep, tradeoff
 from lidar.cli.evaluation import evaluate
 from lidar.cli.lists import classes, rigs, selftest, sensors, settings, stages
@@ -28,6 +28,7 @@ for _command in (
     plot,
     animate,
     denoise,
+    odometry,
     defend,
     train,
     defences,

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from geoscene.console import Report, note_new_folder, print_json, progress_bar
 from lidar.cli.program import Out, Reporting, print_effects
 from lidar.dataset.formats import map_suffixes
-from lidar.options import OUTPUT, ApplyOptions, ConvertOptions, DenoiseOptions, MapOptions
+from lidar.options import OUTPUT, ApplyOptions, ConvertOptions, DenoiseOptions, MapOptions, OdometryOptions
 
 
 def map_(
@@ -240,4 +240,48 @@ def denoise(
         print_json(found.to_json())
     else:
         print(columns(found.table()))
+    return 0
+
+
+def odometry(
+    dataset: Path,
+    /,
+    *,
+    options: OdometryOptions,
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Estimate the motion of a recorded vehicle from what its sensors measured, without the true poses.
+
+    Writes trajectory.tum (TUM), trajectory.kitti (KITTI), poses.csv with standard deviations where the method
+    states them, and odometry.json, which says what was done.
+
+    For example:
+
+    lidar odometry drive --method small_gicp -o estimate
+
+    lidar odometry drive --method kiss-icp --sensor lidar_top --set voxel=0.5 -o estimate
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset.
+    out
+        Directory to write to.
+    """
+    from lidar.odometry.run import estimate_motion  # noqa: PLC0415
+
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        summary = estimate_motion(
+            dataset, out, options=options, overwrite=report.overwrite, progress=progress
+        )
+    found = summary.to_json()
+    if report.json:
+        print_json({"path": str(out), **found})
+    else:
+        print(
+            f"{out}: {found['poses']} poses by {options.method}, {summary.length_m:.1f} m,"
+            f" in {summary.seconds:.1f} s"
+        )
     return 0

@@ -15,6 +15,7 @@ from lidar.dataset.recorded import Stream, labelled_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_tum import write_tum
+from lidar.maps.aligned_motion import aligned_motion
 from lidar.maps.measured_poses import (
     fixes_along,
     fixes_of,
@@ -24,7 +25,6 @@ from lidar.maps.measured_poses import (
     trajectory_in,
     trajectory_of,
 )
-from lidar.maps.odometry import aligned_motion
 from lidar.maps.pose_graph import fitted
 from lidar.time_scales import posix_ns
 

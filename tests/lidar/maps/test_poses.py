@@ -17,8 +17,8 @@ from lidar.dataset.recorded import Stream
 from lidar.errors import FormatError, InputError
 from lidar.geometry.trajectory_tum import read_tum, write_tum
 from lidar.maps.aggregate import aggregate
+from lidar.maps.aligned_motion import aligned_motion
 from lidar.maps.measured_poses import Measured, Motion, measured_motion, poses_by_fixes
-from lidar.maps.odometry import aligned_motion
 from lidar.maps.pose_graph import fitted
 from lidar.options import MapOptions
 from lidar.time_scales import posix_ns

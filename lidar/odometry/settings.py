@@ -1,0 +1,80 @@
+"""Settings of odometry methods: their defaults, bounds and texts."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable
+from dataclasses import dataclass, field, fields, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from lidar.errors import InputError
+
+
+def _setting(default: float, meaning: str, *, low: float, high: float) -> Any:
+    return field(default=default, metadata={"meaning": meaning, "low": low, "high": high})
+
+
+@dataclass(frozen=True, slots=True)
+class OdometrySettings:
+    """Settings of odometry; docs/odometry.md lists them."""
+
+    min_range: float = _setting(
+        3.0, "metres from a scanner, below which points are left out", low=0, high=1000
+    )
+    max_range: float = _setting(
+        0.0,
+        "metres from a scanner, beyond which none are used; 0: its range, at most 100",
+        low=0,
+        high=1e4,
+    )
+    voxel: float = _setting(
+        0.0,
+        "metres, of the map; 0: max_range / 100 (kiss-icp), 0.3 (genz-icp), 0.5 (small_gicp)",
+        low=0,
+        high=100,
+    )
+    acceleration: float = _setting(
+        3.0, "m/s^2 along the road, which the motion of the sweep before leaves open", low=1e-3, high=1e3
+    )
+    turn_acceleration: float = _setting(1.0, "rad/s^2, likewise", low=1e-3, high=1e3)
+
+
+def read_settings(pairs: Iterable[tuple[str, str]], *, path: Path | None = None) -> OdometrySettings:
+    """Settings that differ from the defaults by a TOML file, and by names and values as text after it.
+
+    Raises InputError for unknown names, other values, and a file that cannot be read.
+    """
+    changes: list[tuple[str, Any, str]] = []
+    if path is not None:
+        try:
+            table = tomllib.loads(path.read_text("utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
+            raise InputError(f"`settings_file` {path}: not a readable TOML file ({why})") from None
+        changes += [(name, value, f"{path}: ") for name, value in table.items()]
+    changes += [(name, text, "`settings` ") for name, text in pairs]
+    known = {f.name: f for f in fields(OdometrySettings)}
+    values: dict[str, Any] = {}
+    for name, value, where in changes:
+        if name not in known:
+            near = get_close_matches(name, sorted(known), 3, 0.5)
+            hint = f"is {' or '.join(near)} meant? " if near else ""
+            raise InputError(f"{where}{name}: unknown; {hint}There are {', '.join(known)}")
+        values[name] = _number(value, where=f"{where}{name}", of=known[name])
+    return replace(OdometrySettings(), **values)
+
+
+def _number(value: Any, *, where: str, of: Any) -> float | int:
+    """A value as the number of a setting; raises InputError if it is none or out of bounds."""
+    low, high, whole = of.metadata["low"], of.metadata["high"], isinstance(of.default, int)
+    try:
+        number = float(value) if not isinstance(value, bool) else math.nan
+    except (TypeError, ValueError):
+        number = math.nan
+    if not low <= number <= high or (whole and number != int(number)):
+        kind = "a whole number" if whole else "a number"
+        raise InputError(f"{where} {value}: give {kind} from {low:g} to {high:g}")
+    return int(number) if whole else number
