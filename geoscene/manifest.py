@@ -75,6 +75,7 @@ def scene_manifest(
         },
         "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
         "counts": _counts(plan, reports, problems=problems),
+        **({} if plan.relief == "off" else {"relief": _relief(plan)}),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
         "leaf_area_density": leaf_area_density(relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
@@ -164,6 +165,17 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
         "bridge_pieces": int((~plan.structures.tunnel).sum()),
         "tunnel_pieces": int(plan.structures.tunnel.sum()),
         "instances": sum(r.instances for r in reports),
+    }
+
+
+def _relief(plan: Plan) -> dict[str, Any]:
+    """What the scene has for its relief, by kind and source."""
+    furniture = plan.furniture
+    return {
+        "habits": _tally(plan.trees.habit),
+        "habit_source": _tally(plan.trees.habit_source),
+        "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
+        "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
     }
 
 

@@ -40,7 +40,16 @@ from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
 from geoscene.objects.forests import Forests
-from geoscene.objects.furniture import Furniture, mapped_furniture, read_furniture
+from geoscene.objects.furniture import (
+    POSTS,
+    STANDS,
+    Furniture,
+    mapped_furniture,
+    read_furniture,
+)
+from geoscene.objects.sidewalks import with_details, with_guesses
+from geoscene.objects.siting import Sites
+from geoscene.objects.street import Taken, guess_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
@@ -220,7 +229,7 @@ def make_plan(
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
         tree_layer(trees, _foot(trees.xy, local.height), relief=options.relief != "off"),
-        furniture_layer(furniture, _foot(furniture.xy, local.height)),
+        furniture_layer(furniture, _foot(furniture.xy, local.height), relief=options.relief != "off"),
         barrier_layer(barriers),
         structure_layer(structures),
     ]
@@ -421,7 +430,9 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
-        for name, table in _sited(osm, frame, ground=ground, found=found, side=roads.side, problems=problems)
+        for name, table in _sited(
+            osm, frame, ground=ground, found=found, side=roads.side, relief=options.relief, problems=problems
+        )
     )
 
     shapes = {
@@ -557,27 +568,36 @@ def _objects(
 ) -> tuple[dict[str, tuple[Any, Float, int]], list[Problem]]:
     """What is mapped of trees, furniture and barriers, by kind; nothing of kinds that are not asked for.
 
-    These are a table of the objects before they are sited (None for furniture), boxes (n, 4) within which
-    they will stand, and the count of their feature numbers.
+    These are a table of the objects before they are sited (of furniture: the guesses or None), boxes (n, 4)
+    within which they will stand, and the count of their feature numbers.
     """
     trees, problems = read_trees(osm, frame, relief=options.relief != "off")
     barriers, more = read_barriers(osm, frame, extent=extent)
-    posts = mapped_furniture(osm, frame, extent=extent)[1]
+    relief = options.relief
+    posts = mapped_furniture(osm, frame, extent=extent, relief=relief)[1]
+    guesses = guess_furniture(osm, frame, extent=extent) if relief == "full" else None
+    each = POSTS if relief == "off" else STANDS
+    extra = 0 if guesses is None else len(guesses)
+    places = posts if guesses is None else np.concatenate([posts, guesses.xy])
     around = np.array([-_MOVED, -_MOVED, _MOVED, _MOVED])
     found: dict[str, tuple[Any, Float, int]] = {
         "trees": (trees, np.tile(trees.xy, 2) + around, len(trees)),
-        "furniture": (None, np.tile(posts, 2) + around, 2 * len(posts)),
+        "furniture": (guesses, np.tile(places, 2) + around, each * len(posts) + extra),
         "barriers": (barriers, shapely.bounds(barriers.polygon).reshape(-1, 4), len(barriers)),
     }
-    none = np.empty(0, np.int64)
     wanted = {"trees": problems, "furniture": [], "barriers": more}
     return (
         {
-            kind: row if kind in options.only else (row[0] and row[0].take(none), row[1][:0], 0)
+            kind: row if kind in options.only else (_no_rows(row[0]), row[1][:0], 0)
             for kind, row in found.items()
         },
         [problem for kind, some in wanted.items() if kind in options.only for problem in some],
     )
+
+
+def _no_rows(table: Any) -> Any:
+    """A table without its rows; None stays None."""
+    return None if table is None else table.take(np.empty(0, np.int64))
 
 
 def _sited(
@@ -587,13 +607,27 @@ def _sited(
     ground: GroundPlan,
     found: Mapping[str, tuple[Any, Float, int]],
     side: Side,
+    relief: str,
     problems: list[Problem],
 ) -> list[tuple[str, Any]]:
     """Trees, furniture and barriers, moved off carriageways, by name."""
     trees = _collect(problems, clear_of(ground, found["trees"][0]))
-    given = osm if found["furniture"][2] else replace(osm, points=[])
-    furniture = _collect(problems, read_furniture(given, frame, plan=ground, left_hand=side == "left"))
+    guesses, _, count = found["furniture"]
+    given = osm if count else replace(osm, points=[])
+    furniture = _collect(
+        problems, read_furniture(given, frame, plan=ground, left_hand=side == "left", relief=relief)
+    )
     barriers = _collect(problems, open_barriers(found["barriers"][0], ground))
+    if relief != "off":
+        furniture = with_details(furniture, Sites.of(ground), full=relief == "full")
+    if guesses is not None and count:
+        taken = Taken(
+            np.concatenate([furniture.xy, trees.xy]),
+            np.concatenate([furniture.shape, np.full(len(trees), "")]),
+            barriers.polygon,
+        )
+        first = count - len(guesses)
+        furniture = with_guesses(furniture, guesses, sites=Sites.of(ground), taken=taken, first=first)
     return [("trees", trees), ("furniture", furniture), ("barriers", barriers)]
 
 

@@ -17,6 +17,8 @@ from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import place, shapes
 from geoscene.objects.siting import Sites
+from geoscene.objects.street import stands as bicycle_stands
+from geoscene.objects.street import street_shape
 from geoscene.report import Problem
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, Point, Tags
@@ -36,6 +38,9 @@ _FARTHEST = 30.0
 
 _WITHOUT_SURFACE = 4.0
 """Metres from the centre line where no road surface is known: half a street of two lanes, and a clearance."""
+
+POSTS, STANDS = 2, 16
+"""Feature numbers of a node: posts beside a road, and stands of a bicycle parking."""
 
 _TRAVELLED = frozenset(
     {"motorway", "trunk", "primary", "secondary", "tertiary", "unclassified", "residential", "living_street",
@@ -70,8 +75,11 @@ class Furniture(Columns):
                 nearest clear place) or ``roadside`` (mapped on a road's own node, moved beside that road)
     moved    : (n,) float64 metres from where it is mapped
     heading_source : (n,) str: ``direction`` (tag), ``road`` (towards its traffic or the road) or ``default``
-    osm_id   : (n,) str
-    feature  : (n,) int32: as read, twice the row of its node among `mapped_furniture`; a second post adds 1
+    source   : (n,) str: ``mapped``, ``outdoor_seating`` (tables at a place that the map says to have some) or
+                ``guess``
+    osm_id   : (n,) str: of its node; of guesses, the street or the place to eat
+    feature  : (n,) int32: as read, `POSTS` (with relief `STANDS`) times the row of its node among
+                `mapped_furniture`; further posts and stands add 1, 2 ...; then guesses follow
     """
 
     xy: Float
@@ -82,12 +90,13 @@ class Furniture(Columns):
     place_source: NDArray[np.str_]
     moved: Float
     heading_source: NDArray[np.str_]
+    source: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
 
 
 def read_furniture(
-    osm: OsmData, frame: Frame, *, plan: GroundPlan, left_hand: bool = False
+    osm: OsmData, frame: Frame, *, plan: GroundPlan, left_hand: bool = False, relief: str = "off"
 ) -> tuple[Furniture, list[Problem]]:
     """The street furniture on the map within the ground's extent, and what was moved or left out.
 
@@ -103,9 +112,12 @@ def read_furniture(
     Lamps face the nearest road. Left out and listed as problems are signals and signs of bridges and tunnels,
     objects inside buildings, and those without a clear place within `geoscene.objects.siting.FARTHEST`.
 
+    With relief, bicycle parkings are rows of stands.
+
     left_hand : traffic keeps left
+    relief    : of `geoscene.options.RELIEFS`; with ``plain`` and ``full`` there are more kinds
     """
-    chosen, mapped = mapped_furniture(osm, frame, extent=plan.extent)
+    chosen, mapped = mapped_furniture(osm, frame, extent=plan.extent, relief=relief)
     roads, sites = _Roads.of(osm, frame), Sites.of(plan)
     addressing = np.array([_addresses(shape) and bool(roads.at(p)) for p, shape in chosen], np.bool_)
     amid = ~addressing & sites.driven(mapped)
@@ -116,6 +128,7 @@ def read_furniture(
         for k in np.flatnonzero(~found).tolist()
     ]
     rows: list[_Row] = []
+    each = POSTS if relief == "off" else STANDS
     for k in np.flatnonzero(found).tolist():
         point, shape = chosen[k]
         height, height_source = _height(point, shape, problems=problems)
@@ -127,8 +140,12 @@ def read_furniture(
         if not stands:
             problems.append(Problem(point.osm_id, "furniture", "dropped", "on-bridge-or-in-tunnel"))
         source = "roadside" if addressing[k] else "moved" if amid[k] else "node"
+        if shape == "bicycle_stand":
+            at, heading, heading_source = stands[0]
+            row = bicycle_stands(point.tags, place=at, heading=heading, most=STANDS)
+            stands = [(place, heading, heading_source) for place in row]
         rows += [
-            (*stand, shape, height, height_source, source, point.osm_id, mapped[k], 2 * k + nth)
+            (*stand, shape, height, height_source, source, point.osm_id, mapped[k], each * k + nth)
             for nth, stand in enumerate(stands)
         ]
     table, lost = _beside_roads(_table(rows), sites, left_hand=left_hand)
@@ -142,13 +159,13 @@ def read_furniture(
 
 
 def mapped_furniture(
-    osm: OsmData, frame: Frame, *, extent: Sequence[float]
+    osm: OsmData, frame: Frame, *, extent: Sequence[float], relief: str = "off"
 ) -> tuple[list[tuple[Point, str]], Float]:
     """The nodes within an extent that are street furniture, with their shapes, and their places (n, 2)."""
     chosen = [
         (point, shape)
         for point in osm.points
-        if (shape := shape_of(point.tags)) is not None and not _off_ground(point.tags)
+        if (shape := shape_of(point.tags, relief=relief)) is not None and not _off_ground(point.tags)
     ]
     x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
     xmin, ymin, xmax, ymax = extent
@@ -160,7 +177,7 @@ def furniture_instances(furniture: Furniture, *, height: Height | None = None) -
     """An instance of a shape for each object, in scene coordinates, standing on the terrain."""
     n = len(furniture)
     z = np.zeros(n) if height is None else np.asarray(height(*furniture.xy.T), float)
-    usual = np.array([_usual_height(str(shape)) for shape in furniture.shape], float)
+    usual = np.array([usual_height(str(shape)) for shape in furniture.shape], float)
     size = np.ones((n, 3))
     size[:, 2] = furniture.height / usual
     return place(
@@ -172,8 +189,10 @@ def furniture_instances(furniture: Furniture, *, height: Height | None = None) -
     )
 
 
-def shape_of(tags: Tags) -> str | None:
+def shape_of(tags: Tags, *, relief: str = "off") -> str | None:
     """Name of the shape for a node's tags, None if it is not street furniture."""
+    if relief != "off" and (shape := street_shape(tags)) is not None:
+        return shape
     for (key, value), shape in _KINDS.items():
         if tags.get(key) == value:
             return shape
@@ -206,14 +225,14 @@ def _off_ground(tags: Tags) -> bool:
     )
 
 
-def _usual_height(shape: str) -> float:
+def usual_height(shape: str) -> float:
     """Height of a shape in metres."""
-    return float(shapes()[shape].vertices[:, 2].max())
+    return float(shapes(relief=True)[shape].vertices[:, 2].max())
 
 
 def _height(point: Point, shape: str, *, problems: list[Problem]) -> tuple[float, str]:
     """(metres, source) of the height of an object."""
-    usual = _usual_height(shape)
+    usual = usual_height(shape)
     if "height" not in point.tags:
         return usual, "default"
     metres = parse_length(point.tags["height"])
@@ -395,6 +414,7 @@ def _table(rows: list[_Row]) -> Furniture:
         np.array(place_source, np.str_),
         np.hypot(*(xy - np.array(mapped, float).reshape(-1, 2)).T),
         np.array(heading_source, np.str_),
+        np.full(len(rows), "mapped"),
         np.array(osm_id, np.str_),
         np.array(number, np.int32),
     )

@@ -26,7 +26,7 @@ _TRACK = 0.8
 
 _ALL_AROUND = 2 * np.pi * np.arange(24) / 24
 _DRIVEN = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL, Class.TUNNEL)
-_UNUSABLE = (*_DRIVEN, Class.KERB, Class.BUILDING_PAD, Class.WATER)
+UNUSABLE = (*_DRIVEN, Class.KERB, Class.BUILDING_PAD, Class.WATER)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class Sites:
                 break
             radius = np.arange(near, far + CLEARANCE, _STEP)
             tried = xy[rows, None, None] + radius[:, None, None] * toward[rows, None]  # (n, radius, k, 2)
-            clear = ~np.isin(self.classes(tried.reshape(-1, 2)), _UNUSABLE).reshape(tried.shape[:3])
+            clear = ~np.isin(self.classes(tried.reshape(-1, 2)), UNUSABLE).reshape(tried.shape[:3])
             roomy = clear[:, :-room] & clear[:, room:]
             nth = np.arange(len(rows))
             ring = roomy.any(axis=2).argmax(axis=1)

@@ -71,8 +71,13 @@ def rectangle(width: float, depth: float, *, x: float = 0.0, y: float = 0.0) -> 
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, depth / 2) + (x, y)
 
 
-def solid(body: Body, *, klass: Class, material: str) -> Mesh:
-    """A closed mesh of (vertices, faces) of one class and material, in the material's colour."""
+def solid(body: Body, *, klass: Class, material: str, color: tuple[int, int, int] | None = None) -> Mesh:
+    """A closed mesh of (vertices, faces) of one class and material, in a colour or the material's."""
     points, faces = body
     of = materials()[material]
-    return Mesh.of(points, faces, klass=klass, material=of.code, color=of.color, closed=True)
+    return Mesh.of(points, faces, klass=klass, material=of.code, color=color or of.color, closed=True)
+
+
+def box(size: tuple[float, float], z: tuple[float, float], *, at: tuple[float, float] = (0.0, 0.0)) -> Body:
+    """Vertices and faces of a box of some size in x and y about a place, between two heights, metres."""
+    return prism(rectangle(*size, x=at[0], y=at[1]), z[0], top=z[1])
