@@ -5,7 +5,7 @@ from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from lidar.cli.data import apply, convert, denoise, map_, odometry
 from lidar.cli.drives import drive, redteam, sweep, tradeoff
-from lidar.cli.evaluation import evaluate
+from lidar.cli.evaluation import detect, evaluate
 from lidar.cli.lists import classes, rigs, selftest, sensors, settings, stages
 from lidar.cli.look import animate, info, plot, view
 from lidar.cli.program import app
@@ -19,6 +19,7 @@ for _command in (
     sweep,
     redteam,
     tradeoff,
+    detect,
     evaluate,
     info,
     map_,

@@ -1,4 +1,4 @@
-"""Commands that compare estimates with the truth."""
+"""Commands that make detections, and that compare estimates with the truth."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.console import Report, note_new_folder, print_json, progress_bar
-from lidar.cli.program import Reporting
+from geoscene.console import Report, command_line, note_new_folder, print_json, progress_bar
+from lidar.cli.program import Out, Reporting
+from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions
 
 
@@ -21,7 +22,7 @@ def evaluate(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Measure the errors of an estimated trajectory against the truth, with 95 % intervals.
+    """Measure an estimate against the truth: a trajectory with 95 % intervals, detections or tracks.
 
     For example:
 
@@ -31,20 +32,28 @@ def evaluate(
 
     lidar evaluate poses.txt --against drive --sensor velodyne --align origin --json
 
+    lidar evaluate detections --against drive
+
+    lidar evaluate tracks.txt --against drive -o evaluation
+
     Parameters
     ----------
     estimate
         Trajectory in the layout of TUM (timestamp tx ty tz qx qy qz qw), of KITTI (12 numbers a line), or of
-        poses.csv; or a dataset.
+        poses.csv; or a dataset. Detections: a folder of KITTI's NNNNNN.txt, or nuScenes' results as JSON.
+        Tracks: a text file of KITTI's tracking benchmark or of MOT.
     against
-        The truth: a dataset, or a trajectory.
+        The truth: a dataset, or for a trajectory another one.
     out
         Folder to make: figures, tables, aligned trajectory and a page.
     """
+    from lidar.evaluation.objects import kind_of  # noqa: PLC0415
     from lidar.evaluation.report import report_folder, tables, write_trajectory_report  # noqa: PLC0415
     from lidar.evaluation.trajectory import evaluate_trajectory, method_of  # noqa: PLC0415
     from lidar.rig.catalog import columns  # noqa: PLC0415
 
+    if kind_of(estimate):
+        return _evaluate_objects(estimate, against, options=options, out=out, report=report)
     with progress_bar(quiet=report.quiet) as progress:
         if out is None:
             found = evaluate_trajectory(estimate, against, options=options, progress=progress)
@@ -62,4 +71,86 @@ def evaluate(
         print(columns([head, *rows]))
     if out is not None:
         print(f"\n{out}: evaluation.html, figures and tables")
+    return 0
+
+
+def _evaluate_objects(
+    estimate: Path, against: Path, *, options: EvaluateOptions, out: Path | None, report: Report
+) -> int:
+    """Measure detections or tracks."""
+    from lidar.evaluation.objects import evaluate_objects  # noqa: PLC0415
+    from lidar.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
+    from lidar.rig.catalog import columns  # noqa: PLC0415
+
+    if options != EvaluateOptions():
+        raise InputError(f"{estimate}: detections and tracks take no options of trajectories; leave them out")
+    if out is None:
+        found = evaluate_objects(estimate, against)
+    else:
+        note_new_folder(out)
+        with report_folder(out, overwrite=report.overwrite) as folder:
+            found = evaluate_objects(estimate, against)
+            write_object_report(found, folder)
+    if report.json:
+        print_json(found.to_json())
+        return 0
+    print(f"{found.kind}: {found.frames:,} frames")
+    for title, head, rows in found.tables():
+        print(f"\n{title}")
+        print(columns([head, *rows]))
+    if out is not None:
+        print(f"\n{out}: evaluation.html and tables")
+    return 0
+
+
+def detect(
+    dataset: Path,
+    /,
+    *,
+    to: Annotated[str, Parameter(help="Layout: kitti or nuscenes.")],
+    detector: str = "rules",
+    out: Out,
+    report: Reporting = Report(),
+) -> int:
+    """Find road users in recorded clouds, and write them in the layout of a benchmark.
+
+    For example:
+
+    lidar detect drive --to kitti -o detections
+
+    lidar detect drive --to nuscenes --detector learned -o detections
+
+    lidar evaluate detections --against drive
+
+    Parameters
+    ----------
+    dataset
+        Directory or URL of the dataset.
+    detector
+        rules, learned, or the file of a model (lidar train).
+    out
+        Folder to make: NNNNNN.txt of each frame, or results.json.
+    """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.detection.registry import read_detector  # noqa: PLC0415
+    from lidar.evaluation.detect import LAYOUTS  # noqa: PLC0415
+    from lidar.evaluation.detect import detect as detected  # noqa: PLC0415
+
+    if to not in LAYOUTS:
+        raise InputError(f"`to` {to}: one of {', '.join(LAYOUTS)}")
+    note_new_folder(out)
+    with progress_bar(quiet=report.quiet) as progress:
+        counts = detected(
+            open_dataset(dataset),
+            out,
+            layout=to,
+            detector=read_detector(detector),
+            overwrite=report.overwrite,
+            progress=progress,
+        )
+    if report.json:
+        print_json({"path": str(out), **counts})
+        return 0
+    words = command_line("lidar", "evaluate", out, "--against", dataset)
+    print(f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames; next: {words}")
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from lidar import __version__
 from lidar.errors import InputError
 from lidar.evaluation.figures import figures_of
 from lidar.evaluation.intervals import Statistics, Value
+from lidar.evaluation.nuscenes_detection import NuScenesScore
+from lidar.evaluation.objects import ObjectScores
 from lidar.evaluation.pose_errors import absolute, by_axis
 from lidar.evaluation.trajectory import Compared, TrajectoryErrors, method_of
 
@@ -74,6 +77,21 @@ def write_trajectory_report(compared: Compared, folder: Path, *, estimate: Path)
     title = f"{Path(errors.estimate).name} against {Path(errors.truth).name}"
     write_atomically(folder / "evaluation.html", html_page(title, "".join(body)))
     write_json(folder / DOCUMENT, {"generator": f"geoscene lidar {__version__}", **errors.to_json()})
+
+
+def write_object_report(found: ObjectScores, folder: Path) -> None:
+    """Write ``evaluation.json``, ``scores.csv`` (but of nuScenes' scores) and ``evaluation.html``."""
+    if not isinstance(found.scores, NuScenesScore):
+        rows = [asdict(one) for one in found.scores]
+        write_columns(
+            folder / "scores.csv",
+            {name: ["" if row[name] is None else row[name] for row in rows] for name in rows[0]},
+        )
+    body = [f"<p>{found.kind}: {found.frames:,} frames</p>"]
+    body += [f"<h2>{title}</h2>{html_table(head, rows)}" for title, head, rows in found.tables()]
+    title = f"{Path(found.estimate).name} against {Path(found.truth).name}"
+    write_atomically(folder / "evaluation.html", html_page(title, "".join(body)))
+    write_json(folder / DOCUMENT, {"generator": f"geoscene lidar {__version__}", **found.to_json()})
 
 
 def tables(errors: TrajectoryErrors) -> list[tuple[str, list[str], Rows]]:

@@ -20,7 +20,7 @@ from lidar.dataset.layout import Dataset
 SEQUENCE = "00"
 """Name of the sequence."""
 
-_OBJECTS = 2
+OBJECTS = 2
 """Camera in which KITTI labels objects."""
 
 
@@ -44,18 +44,18 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
         for number in drive.cameras:
             drive.write_image(sequence / f"image_{number}" / f"{name}.png", number=number, row=row)
         progress("KITTI", row + 1, total=len(drive))
-    objects = _write_objects(drive, sequence) if _OBJECTS in drive.cameras and drive.boxes else 0
+    objects = _write_objects(drive, sequence) if OBJECTS in drive.cameras and drive.boxes else 0
     return {"clouds": len(drive), "images": len(drive) * len(drive.cameras), "objects": objects}
 
 
 def _write_objects(drive: KittiDrive, sequence: Path) -> int:
     """Write the object labels and the calibration of each frame; return the number of objects."""
-    boxes, stream = drive.image_boxes(_OBJECTS), drive.cameras[_OBJECTS]
+    boxes, stream = drive.image_boxes(OBJECTS), drive.cameras[OBJECTS]
     calibration = "\n".join([*_object_calibration(drive), ""]).encode("ascii")
     count = 0
     for row in range(len(drive)):
-        frame = int(stream.frames[drive.images[_OBJECTS][row]])
-        lines = object_lines(drive, number=_OBJECTS, row=row, image_boxes=boxes.get(frame, {}))
+        frame = int(stream.frames[drive.images[OBJECTS][row]])
+        lines = object_lines(drive, number=OBJECTS, row=row, image_boxes=boxes.get(frame, {})).values()
         write_atomically(
             sequence / "label_2" / f"{row:06d}.txt", "".join(f"{s}\n" for s in lines).encode("ascii")
         )

@@ -31,14 +31,14 @@ _VISIBLE = (0.4, 0.8)
 _NEAR = 0.1
 """Metres before the camera at which boxes are cut off."""
 
-_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 _EDGES = np.array([[a, b] for a in range(8) for b in (a ^ 1, a ^ 2, a ^ 4) if b > a])
 
 
 def object_lines(
     drive: KittiDrive, *, number: int, row: int, image_boxes: Mapping[int, Mapping[str, Any]]
-) -> list[str]:
-    """The lines of the road users of which pixels are visible in a frame's image, ordered by their numbers.
+) -> dict[int, str]:
+    """The line of each road user of which pixels are visible in a frame's image, by its number, in order.
 
     number      : of the camera
     image_boxes : 2D boxes in the image, by road user
@@ -48,8 +48,9 @@ def object_lines(
     sensor = drive.cameras[number].sensor
     pose = drive.trajectory.at([int(drive.clouds.time_ns[row])])
     camera = pose.mounted(drive.reference.translation, drive.reference.rotation)
-    lines = []
-    for box, flat in ((boxes[key], image_boxes[key]) for key in seen):
+    lines = {}
+    for key in seen:
+        box, flat = boxes[key], image_boxes[key]
         turn = camera.rotation[0].T @ matrix_from_quat([box[k] for k in ("qx", "qy", "qz", "qw")])
         middle = (
             (np.array([box[k] for k in "xyz"]) - camera.position[0]) / camera.scale[0] @ camera.rotation[0]
@@ -57,7 +58,7 @@ def object_lines(
         size = np.array([box[k] for k in ("length", "width", "height")])
         bottom = middle - turn[:, 2] * size[2] / 2
         yaw = np.arctan2(-turn[2, 0], turn[0, 0])
-        corners = bottom + (_CORNERS * size) @ turn.T
+        corners = bottom + (CORNERS * size) @ turn.T
         side = np.array([sensor["width"], sensor["height"]] * 2) - 1
         values = [
             truncation(corners, drive.projections[number], sides=side[:2]),
@@ -69,7 +70,7 @@ def object_lines(
             yaw,
         ]
         kind = TYPES.get(Class[box["class"].upper()], "Misc")
-        lines.append(" ".join([kind, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in values)]))
+        lines[key] = " ".join([kind, *(str(v) if isinstance(v, int) else f"{v:.4f}" for v in values)])
     return lines
 
 
@@ -79,19 +80,26 @@ def truncation(corners: Float, projection: Float, *, sides: Float) -> float:
     corners : (8, 3), the reference camera's frame; bits of their numbers tell the sides x, y and z
     sides   : (2,) greatest pixel coordinates of the image
     """
+    if (found := outline(corners, projection)) is None:
+        return 1.0
+    low, high = found
+    inside = np.clip(np.minimum(high, sides) - np.maximum(low, 0), 0, None)
+    return float(1 - inside.prod() / (high - low).prod())
+
+
+def outline(corners: Float, projection: Float) -> tuple[Float, Float] | None:
+    """Least and greatest pixels (2,) of the projection of a box's corners (8, 3); None behind the camera."""
     points = np.column_stack([corners, np.ones(8)]) @ projection.T
     ends = points[_EDGES]
     depth = ends[..., 2]
     before = (depth > _NEAR).any(axis=1)
     if not before.any():
-        return 1.0
+        return None
     ends, depth = ends[before], depth[before]
     across = np.clip((_NEAR - depth) / np.where(depth[:, ::-1] == depth, 1.0, depth[:, ::-1] - depth), 0, 1)
     ends = ends + (ends[:, ::-1] - ends) * across[..., None]
     pixels = (ends[..., :2] / ends[..., 2:]).reshape(-1, 2)
-    low, high = pixels.min(axis=0), pixels.max(axis=0)
-    inside = np.clip(np.minimum(high, sides) - np.maximum(low, 0), 0, None)
-    return float(1 - inside.prod() / (high - low).prod())
+    return pixels.min(axis=0), pixels.max(axis=0)
 
 
 def _wrapped(angle: float) -> float:

@@ -90,10 +90,10 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without labelled clouds in the sensor frame.
     """
-    return _Export(dataset, _streams(dataset), out=folder).write(progress)
+    return _Export(dataset, streams_of(dataset), out=folder).write(progress)
 
 
-def _streams(dataset: Dataset) -> dict[str, Stream]:
+def streams_of(dataset: Dataset) -> dict[str, Stream]:
     """Scanners, the first as LIDAR_TOP, and cameras with colour images, by channel."""
     streams: dict[str, Stream] = {}
     for name, sensor in dataset.sensors("lidar", "camera").items():
@@ -109,7 +109,7 @@ def _streams(dataset: Dataset) -> dict[str, Stream]:
     return streams
 
 
-def _token(*parts: object) -> str:
+def token_of(*parts: object) -> str:
     """A token of 32 hexadecimal digits: a hash of the arguments."""
     return hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=16).hexdigest()
 
@@ -121,27 +121,32 @@ def _chained(rows: Sequence[Row]) -> None:
         row["next"] = rows[k + 1]["token"] if k + 1 < len(rows) else ""
 
 
+def table_frame(trajectory: Trajectory) -> tuple[Float, Float]:
+    """Scale (3,) and origin (3,) of the tables' positions: the scene's over the scale, less the origin."""
+    scale = np.array([trajectory.scale[0], trajectory.scale[0], 1.0])
+    places = trajectory.position / scale
+    return scale, np.append(np.floor(places[:, :2].min(axis=0) - _MARGIN), 0.0)
+
+
 class _Export:
     """The tables of one drive, and the folder they are written to."""
 
     def __init__(self, dataset: Dataset, streams: Mapping[str, Stream], *, out: Path) -> None:
         self.dataset, self.streams, self.out = dataset, streams, out
         self.trajectory: Trajectory = dataset.trajectory()
-        self.scale = np.array([self.trajectory.scale[0], self.trajectory.scale[0], 1.0])
-        places = self.trajectory.position / self.scale
-        self.zero = np.append(np.floor(places[:, :2].min(axis=0) - _MARGIN), 0.0)
+        self.scale, self.zero = table_frame(self.trajectory)
         self.name = dataset.path.resolve().name
         self.tables: dict[str, list[Row]] = defaultdict(list)
 
     def write(self, progress: Progress) -> dict[str, int]:
         """Write all files; return the numbers of samples, clouds, images and boxes."""
         top = self.streams["LIDAR_TOP"]
-        keys = _key_frames(top.time_ns)
+        keys = key_rows(top.time_ns)
         samples = [
             {
-                "token": _token(self.name, "sample", int(top.frames[k])),
+                "token": token_of(self.name, "sample", int(top.frames[k])),
                 "timestamp": self._stamp(int(top.time_ns[k])),
-                "scene_token": _token(self.name, "scene"),
+                "scene_token": token_of(self.name, "scene"),
             }
             for k in keys
         ]
@@ -181,12 +186,12 @@ class _Export:
         return [float(v) for v in position / self.scale - self.zero]
 
     def _add_sensor(self, channel: str, stream: Stream) -> None:
-        token, modality = _token("sensor", channel), stream.sensor["kind"]
+        token, modality = token_of("sensor", channel), stream.sensor["kind"]
         self.tables["sensor"].append({"token": token, "channel": channel, "modality": modality})
         mount = np.array(stream.sensor["vehicle_from_sensor"])
         self.tables["calibrated_sensor"].append(
             {
-                "token": _token(self.name, "calibrated", channel),
+                "token": token_of(self.name, "calibrated", channel),
                 "sensor_token": token,
                 "translation": mount[:3, 3].tolist(),
                 "rotation": _wxyz(mount[:3, :3]),
@@ -200,7 +205,7 @@ class _Export:
         """Write a frame's cloud or image and add its pose; return its row of ``sample_data``."""
         stream = self.streams[channel]
         time, source, lidar = int(stream.time_ns[k]), stream.files[k], stream.sensor["kind"] == "lidar"
-        token = _token(self.name, channel, int(stream.frames[k]))
+        token = token_of(self.name, channel, int(stream.frames[k]))
         key = bool((near == k).any())
         sample = np.flatnonzero(near == k)[0] if key else nearest(key_times, stream.time_ns[k : k + 1])[0]
         pose = self.trajectory.at([time])
@@ -224,7 +229,7 @@ class _Export:
             "token": token,
             "sample_token": samples[sample]["token"],
             "ego_pose_token": token,
-            "calibrated_sensor_token": _token(self.name, "calibrated", channel),
+            "calibrated_sensor_token": token_of(self.name, "calibrated", channel),
             "timestamp": self._stamp(time),
             "fileformat": "pcd" if lidar else "png",
             "is_key_frame": key,
@@ -256,16 +261,16 @@ class _Export:
             if sample is None or (box["points"] == 0 and box["visibility"] == 0.0):
                 continue
             kind = CATEGORIES[int(class_codes().nuscenes[Class[box["class"].upper()]])]
-            instance = _token(self.name, "instance", box["id"])
+            instance = token_of(self.name, "instance", box["id"])
             category[instance] = kind
             seen = int(np.searchsorted([0.4, 0.6, 0.8], box["visibility"], side="right"))
             annotations[instance].append(
                 {
-                    "token": _token(self.name, "annotation", box["id"], box["frame"]),
+                    "token": token_of(self.name, "annotation", box["id"], box["frame"]),
                     "sample_token": sample["token"],
                     "instance_token": instance,
                     "visibility_token": str(seen + 1),
-                    "attribute_tokens": [_token("attribute", name) for name in _attributes(kind, box)],
+                    "attribute_tokens": [token_of("attribute", name) for name in attributes_of(kind, box)],
                     "translation": self._position(np.array([box[k] for k in "xyz"])),
                     "size": [box[k] for k in ("width", "length", "height")],
                     "rotation": [box[k] for k in ("qw", "qx", "qy", "qz")],
@@ -279,7 +284,7 @@ class _Export:
             self.tables["instance"].append(
                 {
                     "token": instance,
-                    "category_token": _token("category", category[instance]),
+                    "category_token": token_of("category", category[instance]),
                     "nbr_annotations": len(rows),
                     "first_annotation_token": rows[0]["token"],
                     "last_annotation_token": rows[-1]["token"],
@@ -292,12 +297,12 @@ class _Export:
         with reading_file(path):
             place = str(manifest["scene"]["name"] or manifest["scene"]["path"])
             attribution, vehicle = str(manifest["attribution"]), str(manifest["rig"])
-        log_token = _token(self.name, "log")
+        log_token = token_of(self.name, "log")
         east, north = (self.zero * self.scale)[:2] + self.dataset.frame.origin
         self.tables["sample"] = list(samples)
         self.tables["scene"] = [
             {
-                "token": _token(self.name, "scene"),
+                "token": token_of(self.name, "scene"),
                 "log_token": log_token,
                 "nbr_samples": len(samples),
                 "first_sample_token": samples[0]["token"],
@@ -322,7 +327,7 @@ class _Export:
         write_png(self.out / mask, self._map_mask())
         self.tables["map"] = [
             {
-                "token": _token(self.name, "map"),
+                "token": token_of(self.name, "map"),
                 "log_tokens": [log_token],
                 "category": "semantic_prior",
                 "filename": mask,
@@ -377,7 +382,8 @@ _TABLES = (
 
 def _named(table: str, names: Iterable[str], *, numbered: bool = False) -> list[Row]:
     return [
-        {"token": _token(table, name), "name": name, "description": name} | ({"index": k} if numbered else {})
+        {"token": token_of(table, name), "name": name, "description": name}
+        | ({"index": k} if numbered else {})
         for k, name in enumerate(names)
     ]
 
@@ -389,13 +395,13 @@ def _wxyz(rotation: Float) -> list[float]:
     return [w, x, y, z]
 
 
-def _key_frames(time_ns: Ints) -> Ints:
+def key_rows(time_ns: Ints) -> Ints:
     """Indices of the frames nearest to every `KEY_NS`, without repetition."""
     wanted = np.arange(time_ns[0], time_ns[-1] + 1, KEY_NS)
     return np.unique(nearest(time_ns, wanted))
 
 
-def _attributes(kind: str, box: dict[str, Any]) -> list[str]:
+def attributes_of(kind: str, box: dict[str, Any]) -> list[str]:
     """NuScenes' attributes of a road user: moving, stopped, parked, ..."""
     speed = float(np.hypot(box["vx"], box["vy"]))
     if kind.startswith("human"):
