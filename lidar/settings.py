@@ -16,7 +16,7 @@ from lidar.physics import settings as scanner_settings
 from lidar.physics.reflect import INCIDENCE_LAWS
 from lidar.physics.settings import ScannerSettings
 from lidar.raycast import PRECISIONS
-from lidar.world.settings import ORIGINS, WorldSettings
+from lidar.world.settings import ORIGINS, RELIEFS, WorldSettings
 
 _SWITCH = {"on": True, "yes": True, "true": True, "1": True}
 _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
@@ -27,6 +27,7 @@ _CHOICES: dict[str, Iterable[object]] = {
     "poses": scanner_settings.POSES,
     "precision": PRECISIONS,
     "origin": ORIGINS,
+    "relief": RELIEFS,
 }
 
 

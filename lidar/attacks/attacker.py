@@ -20,7 +20,8 @@ from lidar.physics.pulse_identity import METRES_PER_NS
 from lidar.raycast.geometry import ALL
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter
-from lidar.world.world import GLASS, World
+from lidar.world.surfaces import GLASS
+from lidar.world.world import World
 
 POWER_AT = 10.0
 """Metres from the sensor at which the parameter ``power`` holds."""

@@ -20,7 +20,8 @@ from lidar.physics.fresnel import mirrored
 from lidar.raycast import Hits
 from lidar.rig.camera_model import pixel_rays, project, unproject
 from lidar.rig.specs import CameraSpec
-from lidar.world.world import Surfaces, World
+from lidar.world.surfaces import Surfaces
+from lidar.world.world import World
 
 _BAND = 1 << 16
 """Rays per batch: small enough for their columns to stay in the processor's cache."""
@@ -383,7 +384,7 @@ def _shaded(
             lit[which] = True
     out = np.empty((n, 3), np.float32)
     gloss, facet = np.zeros(n if wet else 0, np.float32), np.empty((n if wet else 0, 3), np.float32)
-    if len(walls.style):
+    if len(walls.style) and world.walls is None:
         wall = np.where(hits.instance < 0, walls.wall[hits.face], np.int32(-1))
     else:
         wall = np.full(n, -1, np.int32)

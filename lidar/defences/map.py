@@ -15,7 +15,8 @@ from lidar.defences.verdict import FEW, Gaps, Verdict, greatest
 from lidar.physics.link import amplitude
 from lidar.raycast.geometry import ALL
 from lidar.signal.stage import parameter
-from lidar.world.world import FOLIAGE, GLASS, WATER, World
+from lidar.world.surfaces import FOLIAGE, GLASS, WATER
+from lidar.world.world import World
 
 _SECTORS = 360
 

@@ -7,3 +7,6 @@ from lidar.relief.march import ROOM as ROOM
 from lidar.relief.march import SILL as SILL
 from lidar.relief.walls import WallRefiner as WallRefiner
 from lidar.relief.walls import WallTables as WallTables
+from lidar.relief.walls import joined as joined
+from lidar.relief.walls import pairs_of as pairs_of
+from lidar.relief.walls import tables_of as tables_of

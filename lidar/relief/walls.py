@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from geoscene.buildings.facades import Openings, WallRelief
+from geoscene.buildings.facades import WallRelief
 from geoscene.typing import Float
 from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits
@@ -388,17 +388,3 @@ def _rooms(tables: Any, face: Any, place: Any, direction: Any, out: Any) -> None
         distance[i], hit[i] = max(t, 0.0), tables.faces[number] + ROOM - 1
         cosine[i] = abs(across) / np.sqrt(x * x + y * y + z * z)
         _write_normal(frame, w, axis, dx, dy, normal, i)
-
-
-def surfaces_of_pairs(
-    relief: WallRelief, pairs: Pairs, *, room: int
-) -> tuple[NDArray[np.int32], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Feature (f,), material (f,) and colour (f, 3) of a tile's additional faces.
-
-    room : code of the material of rooms
-    """
-    o: Openings = relief.openings.take(pairs.kind)
-    material = np.stack([o.trim, o.frame_material, o.infill, np.full(len(o.trim), room, np.uint8)], axis=1)
-    color = np.stack([o.trim_color, o.frame_color, o.infill_color, o.room_color], axis=1)
-    feature = np.repeat(relief.facades.feature[pairs.wall], PARTS).astype(np.int32)
-    return feature, material.reshape(-1), color.reshape(-1, 3)

@@ -11,7 +11,7 @@ from geoscene.typing import Float
 from lidar.random_streams import uniform_of
 from lidar.raycast import Caster, Hits
 from lidar.sensors.rays import Rays
-from lidar.world.world import Faces
+from lidar.world.surfaces import Faces
 
 PROJECTION = 0.5
 """Projected area per leaf area, for leaves of uniformly distributed orientation (Ross 1981)."""

@@ -25,7 +25,8 @@ from lidar.physics.reflect import (
 from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import normal_of
 from lidar.raycast import Hits
-from lidar.world.world import OPEN, Faces, World
+from lidar.world.surfaces import OPEN, Faces
+from lidar.world.world import World
 
 
 @functools.cache

@@ -18,6 +18,10 @@ ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""
 
 
+RELIEFS = ("off", "full")
+"""What is used of the relief of a scene."""
+
+
 @dataclass(frozen=True, slots=True)
 class WorldSettings:
     """Settings of the world around the vehicle. The defaults are the whole scene within range.
@@ -30,6 +34,8 @@ class WorldSettings:
     trees     : single trees and those of rows
     furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
     barriers  : walls, fences and hedges
+    relief    : of `RELIEFS`: ``full``, what the scene holds; ``off``: walls are planes, in a scene with
+                relief, too
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
     """
@@ -40,6 +46,7 @@ class WorldSettings:
     trees: bool = True
     furniture: bool = True
     barriers: bool = True
+    relief: str = "full"
     wetness: float = 0.0
     snow: float = 0.0
 
@@ -48,6 +55,8 @@ class WorldSettings:
         faults = []
         if self.origin not in ORIGINS:
             faults.append(f"origin={self.origin}: known are {', '.join(ORIGINS)}")
+        if self.relief not in RELIEFS:
+            faults.append(f"relief={self.relief}: known are {', '.join(RELIEFS)}")
         if not self.reach > 0:
             faults.append(f"reach={self.reach:g}: give metres above 0, or inf")
         faults += [

@@ -43,8 +43,11 @@ def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: S
     forest = tile.instances.take(np.arange(len(mapped), len(tile.instances)))
     classes = np.array([mesh.klass[0] for mesh in shapes], np.uint8)
     mapped = mapped.take(np.flatnonzero(~np.isin(classes[mapped.shape], without)))
+    keep = ~np.isin(tile.mesh.klass, without)
+    relief = tile.relief
     return replace(
         tile,
-        mesh=tile.mesh.take(~np.isin(tile.mesh.klass, without)),
+        mesh=tile.mesh.take(keep),
+        relief=None if relief is None else replace(relief, wall=relief.wall[keep]),
         instances=Instances.concatenate([mapped, forest]),
     )

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import Class, materials
-from geoscene.columns import Columns
+from geoscene.classes import Class
 from geoscene.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
@@ -18,28 +16,30 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
+from lidar.raycast.refine import Refiner
+from lidar.relief import WallRefiner, WallTables, joined
+from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import CELL, Shelter, shelter_of
+from lidar.world.surfaces import (
+    GLASS,
+    MISS,
+    OPEN,
+    SOLID,
+    WATER,
+    Faces,
+    Surfaces,
+    mask_bits,
+    packed,
+    surfaces_of,
+)
 from lidar.world.tile_selection import selected_tile
 
 Region = tuple[float, float, float, float]
 
-SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
-"""Mask bits of a world's faces, by material: ``mask=ALL & ~GLASS`` lets rays pass through windows."""
-
-OPEN = 128
-"""Bit of a material's code on faces open to the sky, in a world that is wet or under snow."""
-
-_STEEPEST = 0.5
-"""Least vertical part of the normal of a face that water and snow stay on: up to 60 degrees of slope."""
-
 _ABOVE, _CEILING = 0.05, 100.0
 """Metres above a face from which, and up to which, roofs are looked for."""
 
-_BARE = ("glass", "water", "skin", "retroreflector")
-"""Materials that the weather leaves as they are."""
-
-_SEEN_THROUGH = {"glass": GLASS, "foliage": FOLIAGE, "conifer": FOLIAGE, "water": WATER}
 OVERHANG = 50.0
 """Metres by which a building may extend beyond its tile and still be loaded."""
 _WITHIN = 160.0  # metres around a place within which shelter is known, at most
@@ -49,101 +49,22 @@ _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
 
-@dataclass(frozen=True, slots=True)
-class Surfaces(Columns):
-    """Surfaces that rays hit, one row per ray; a miss has feature -1 and zero elsewhere.
-
-    feature  : (n,) int32, feature number of the scene, or of the actor
-    klass    : (n,) uint8, code of `geoscene.classes.Class`
-    material : (n,) uint8, code of `geoscene.classes.Material`, with the bit `OPEN` where water or snow lies
-    surface  : (n,) uint8, OTHER, WALL, ROOF or FLOOR of `geoscene.mesh`
-    color    : (n, 3) uint8, sRGB
-    """
-
-    feature: NDArray[np.int32]
-    klass: NDArray[np.uint8]
-    material: NDArray[np.uint8]
-    surface: NDArray[np.uint8]
-    color: NDArray[np.uint8]
-
-
-class Faces(NamedTuple):
-    """Attributes of the faces of a world, for compiled code.
-
-    A hit is on row ``face + start[instance]`` of ``packed``, a miss (both -1) on its last.
-
-    start : (k + 1,) int64, first row of each instance's shape; the last is 0, the caster's own mesh
-    named : (k,) int32, feature number of each instance
-    packed : (m,) int64, feature << 32 | kind of leaves << 16 | class << 8 | material
-    low, high : bounds of all feature numbers
-    leaves : (l,) float64, m2/m3, leaf area per volume behind a face by its kind of leaves; 0 for kind 0, none
-    """
-
-    start: NDArray[np.int64]
-    named: NDArray[np.int32]
-    packed: NDArray[np.int64]
-    low: int
-    high: int
-    leaves: Float
-
-
-def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
-    """The column `Faces.packed` of surfaces and of their kinds of leaves (none by default)."""
-    column = surfaces.feature.astype(np.int64) << 32
-    if leaves is not None:
-        column |= leaves.astype(np.int64) << 16
-    column |= surfaces.klass.astype(np.int64) << 8
-    column |= surfaces.material
-    return column
-
-
-def surfaces_of(mesh: Mesh, settings: WorldSettings) -> Surfaces:
-    """The faces of a mesh as surfaces, with the bit `OPEN` where water or snow may lie."""
-    material = mesh.material
-    if settings.wetness or settings.snow:
-        material = material | np.where(_is_open(mesh), np.uint8(OPEN), np.uint8(0))
-    return Surfaces(mesh.feature, mesh.klass, material, mesh.surface, mesh.color)
-
-
-def _is_open(mesh: Mesh) -> NDArray[np.bool_]:
-    """Faces (m,) that face the sky and are not of a material that the weather leaves as it is."""
-    known = materials()
-    up = mesh.normals()[:, 2] > _STEEPEST
-    open_faces: NDArray[np.bool_] = up & ~np.isin(mesh.material, [known[name].code for name in _BARE])
-    return open_faces
-
-
-_MISS = Surfaces(
-    np.full(1, -1, np.int32),
-    np.zeros(1, np.uint8),
-    np.zeros(1, np.uint8),
-    np.zeros(1, np.uint8),
-    np.zeros((1, 3), np.uint8),
-)
-
-
-def _bits(material: NDArray[np.uint8]) -> NDArray[np.uint32]:
-    """Mask bits of materials."""
-    table = np.full(256, SOLID, np.uint32)
-    known = materials()
-    for name, bit in _SEEN_THROUGH.items():
-        table[known[name].code] = bit
-    return table[material]
-
-
 def _shape(mesh: Mesh, *, backend: str) -> Caster:
-    return Caster(mesh.vertices, mesh.faces, mask=_bits(mesh.material), backend=backend)
+    return Caster(mesh.vertices, mesh.faces, mask=mask_bits(mesh.material), backend=backend)
 
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
     """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
 
-    centre : (m, 3) of the faces, scene metres
+    surfaces : of the faces of the mesh, then of those that ``walls`` adds
+    walls    : openings of its walls, None for none
+    centre   : (m, 3) of the faces of the mesh, scene metres; then zeros
     """
 
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
+    walls: WallTables | None
     shape: NDArray[np.int32]
     transform: Float
     feature: NDArray[np.int32]
@@ -189,6 +110,7 @@ class World:
         self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
+        self._walls: WallRefiner | None = None
         self._concatenate_tables()
 
     @classmethod
@@ -243,6 +165,7 @@ class World:
             first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
             instances=[self._still, self._moving[0]],
         )
+        self.caster.refiners = self._refiners()
         if self.settings.wetness or self.settings.snow:
             self.caster.update(instances=[self._still])
             self._shelter()
@@ -308,21 +231,47 @@ class World:
         """Attributes of all faces, for compiled code."""
         return self._faces
 
+    @property
+    def walls(self) -> WallRefiner | None:
+        """The openings of walls, None without any."""
+        return self._walls
+
+    def _refiners(self) -> list[Refiner]:
+        """What lies behind the planes of faces of the loaded tiles.
+
+        A kind of surface is one `lidar.raycast.refine.Refiner`. It finds its own faces by `Hits.face`, which
+        is also the row in the table of surfaces of the world.
+        """
+        loaded = {self._first[rank]: tile.walls for rank, tile in self._tiles.items() if tile.walls}
+        self._walls = None
+        if loaded:
+            count = len(self._surfaces)
+            self._walls = WallRefiner(joined(list(loaded.values()), faces=list(loaded), count=count))
+        return [self._walls] if self._walls else []
+
     def _read(self, rank: int) -> _Tile:
         tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._meshes)
         mesh, copies = tile.mesh, tile.instances
         parts = split(
-            mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=_bits(mesh.material)
+            mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=mask_bits(mesh.material)
         )
         transform = copies.transform.copy()
         transform[:, :, 3] += tile.origin
+        surfaces, walls = surfaces_of(mesh, self.settings), None
+        centre = mesh.vertices[mesh.faces].mean(axis=1) + tile.origin
+        if tile.relief is not None and self.settings.relief != "off":
+            bits = mask_bits(np.arange(256, dtype=np.uint8))
+            walls, added = openings_of(tile.relief, origin=tile.origin, bits=bits)
+            surfaces = Surfaces.concatenate([surfaces, added])
+            centre = np.concatenate([centre, np.zeros((len(added), 3))])
         return _Tile(
             {_PARTS * rank + k: part for k, part in enumerate(parts)},
-            surfaces_of(mesh, self.settings),
+            surfaces,
+            walls,
             copies.shape,
             transform,
             copies.feature,
-            mesh.vertices[mesh.faces].mean(axis=1) + tile.origin,
+            centre,
         )
 
     def _concatenate_tables(self) -> None:
@@ -330,7 +279,7 @@ class World:
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
         self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
-        self._surfaces = Surfaces.concatenate([*tables, _MISS])
+        self._surfaces = Surfaces.concatenate([*tables, MISS])
         self._packed = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())

@@ -11,7 +11,7 @@ from lidar.raycast import Caster
 from lidar.raycast.geometry import split
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of
-from lidar.world.world import Faces, Surfaces, packed, surfaces_of
+from lidar.world.surfaces import Faces, Surfaces, packed, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 

@@ -18,7 +18,8 @@ from lidar.raycast import ALL
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.scene import Float64Scene
 from lidar.world.settings import WorldSettings, origin_limit
-from lidar.world.world import FOLIAGE, GLASS, OPEN, World
+from lidar.world.surfaces import FOLIAGE, GLASS, OPEN
+from lidar.world.world import World
 
 TILE = 100.0
 DOWN = np.array([[0.0, 0.0, -1.0]])
