@@ -478,6 +478,7 @@ def _print_scene(report: dict[str, Any]) -> None:
         f" direction{steep}",
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
+        "guessed": _listed(report.get("relief", {}).get("parts_guessed", {})),
     }
     for_drives = "area" in report
     if for_drives or report["options"].get("along"):

@@ -75,7 +75,7 @@ def scene_manifest(
         },
         "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
         "counts": _counts(plan, reports, problems=problems),
-        **({} if plan.relief == "off" else {"relief": _relief(plan)}),
+        **({} if plan.relief == "off" else {"relief": _relief(plan, reports)}),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
         "leaf_area_density": leaf_area_density(relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
@@ -168,14 +168,18 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
     }
 
 
-def _relief(plan: Plan) -> dict[str, Any]:
+def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
     """What the scene has for its relief, by kind and source."""
     furniture = plan.furniture
+    parts = Counter[str]()
+    for report in reports:
+        parts.update(report.guessed)
     return {
         "habits": _tally(plan.trees.habit),
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
+        "parts_guessed": dict(sorted(parts.items())),
     }
 
 

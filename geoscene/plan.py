@@ -66,6 +66,7 @@ from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
 from geoscene.structures import (
+    StructureOptions,
     Structures,
     buildings_over,
     find_openings,
@@ -396,7 +397,16 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         area=area,
     )
     structures = _collect(
-        problems, read_structures(made, roads.graph, osm=osm, frame=frame, height=roads.height, area=area)
+        problems,
+        read_structures(
+            made,
+            roads.graph,
+            osm=osm,
+            frame=frame,
+            height=roads.height,
+            options=StructureOptions.of_relief(options.relief),
+            area=area,
+        ),
     )
     structures = within_extent(structures, extent)
     height = roads.height

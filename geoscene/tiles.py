@@ -7,6 +7,7 @@ import io
 import json
 import pickle
 import secrets
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -32,7 +33,7 @@ from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Tile, read_tile, write_tile
-from geoscene.structures import structure_meshes
+from geoscene.structures import StructureOptions, built_structures
 from geoscene.typing import Ints
 from geoscene.watertight import validate_mesh
 
@@ -51,17 +52,21 @@ _SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "
 class TileReport:
     """Contents of a tile.
 
-    solids     : number of closed solids, buildings included
-    watertight : number of solids that passed the check
-    buildings  : number of building solids
-    faces      : number of faces
-    instances  : number of instances of shapes, those of forests included
-    forest_trees : number of trees of forests
-    area       : plan area of the ground in square metres
-    water      : plan area of the water on it
-    digest     : digest of the tile's file
-    problems   : buildings that were simplified, and features that were dropped
-    facades    : openings of walls by what they are; empty without relief
+        solids     : number of closed solids, buildings included
+        watertight : number of solids that passed the check
+        buildings  : number of building solids
+        faces      : number of faces
+        instances  : number of instances of shapes, those of forests included
+        forest_trees : number of trees of forests
+        area       : plan area of the ground in square metres
+        water      : plan area of the water on it
+        digest     : digest of the tile's file
+        problems   : buildings that were simplified, and features that were dropped
+    <<<<<<< HEAD
+        facades    : openings of walls by what they are; empty without relief
+    =======
+        guessed    : number of guessed parts by kind, those of buildings aside
+    >>>>>>> 09cdab2 (Give tunnels a lining, walkways, niches and equipment in scenes with relief)
     """
 
     i: int
@@ -77,10 +82,12 @@ class TileReport:
     digest: str
     problems: tuple[Problem, ...]
     facades: dict[str, int] = field(default_factory=dict)
+    guessed: dict[str, int] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """The report as a JSON object."""
-        return {name: value for name, value in asdict(self).items() if name != "facades" or value}
+        """The report as a JSON object, without empty tables of relief."""
+        relief = ("facades", "guessed")
+        return {name: value for name, value in asdict(self).items() if name not in relief or value}
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,11 +119,24 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
     return concatenate([mesh for mesh, _ in made]), problems
 
 
-def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances, list[Problem]]:
-    """Mesh (ground, barriers, structures), instances (trees, furniture) and problems of tile (i, j).
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What a tile holds besides its buildings.
 
-    Mesh and instances are in scene metres.
+    mesh      : ground, barriers and structures, scene metres
+    instances : trees and furniture, scene metres
+    problems  : features that were dropped
+    guessed   : number of guessed parts by kind
     """
+
+    mesh: Mesh
+    instances: Instances
+    problems: list[Problem]
+    guessed: Counter[str]
+
+
+def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
+    """All of tile (i, j) but its buildings."""
     i, j = tile
     height, problems = plan.height, list[Problem]()
 
@@ -139,34 +159,47 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> tuple[Mesh, Instances, lis
             furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=height)
         ),
     ]
-    solids = [
-        *made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height)),
-        *made(
-            plan.structures,
-            "structures",
-            make=lambda rows: structure_meshes(plan.structures, rows, height=height, openings=plan.openings),
-        ),
-    ]
+    solids = made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height))
     meshes += [mesh for some in solids for mesh in some]
-    return concatenate(meshes), Instances.concatenate([Instances.empty(), *copies]), problems
+    options = StructureOptions.of_relief(plan.relief)
+    structures = made(
+        plan.structures,
+        "structures",
+        make=lambda rows: built_structures(
+            plan.structures, rows, height=height, openings=plan.openings, options=options
+        ),
+    )
+    guessed = Counter[str]()
+    for built in (built for some in structures for built in some):
+        meshes.append(built.mesh)
+        guessed.update(built.guessed)
+    instances = Instances.concatenate([Instances.empty(), *copies])
+    return Surroundings(concatenate(meshes), instances, problems, guessed)
 
 
 def build_tile(
-    plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int, former: Path | None
+    plan: Plan,
+    folder: Path,
+    *,
+    tile: tuple[int, int],
+    lod: int,
+    former: tuple[Path, TileReport] | None,
 ) -> TileReport:
     """Build tile (i, j), write it into ``folder`` and return a report of its contents.
 
-    former : tile file of an earlier build whose ground is reused
+    former : tile file of an earlier build whose ground is reused, and its report
     """
     size = plan.ground.tile_size
     solids, problems = make_solids(plan, tile, lod=lod)
     if former is not None:
-        old = read_tile(former)
+        file, report = former
+        old, guessed = read_tile(file), report.guessed
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
         origin, rest, copies = old.origin, old.mesh.take(~is_building), old.instances
     else:
-        ground, copies, found = make_ground(plan, tile)
-        problems += found
+        around = make_ground(plan, tile)
+        ground, copies, guessed = around.mesh, around.instances, dict(sorted(around.guessed.items()))
+        problems += around.problems
         low = float(np.floor(ground.vertices[:, 2].min(initial=0.0)))
         origin = np.array([tile[0] * size, tile[1] * size, low])
         # Without unused vertices, as when the ground is taken from a former scene.
@@ -199,6 +232,7 @@ def build_tile(
         digest,
         tuple(problems),
         counts,
+        guessed,
     )
 
 
@@ -309,7 +343,7 @@ class _Former:
         if self.all:
             write_atomically(SceneFiles(folder).tile(*tile), former.read_bytes())
             return self.reports[tile]
-        return build_tile(plan, folder, tile=tile, lod=lod, former=former)
+        return build_tile(plan, folder, tile=tile, lod=lod, former=(former, self.reports[tile]))
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from geoscene.structures.ground_contact import opening_layers as opening_layers
 from geoscene.structures.passages import buildings_over as buildings_over
 from geoscene.structures.pieces import within_extent as within_extent
 from geoscene.structures.read import read_structures as read_structures
+from geoscene.structures.solids import built_structures as built_structures
 from geoscene.structures.solids import structure_meshes as structure_meshes
 from geoscene.structures.table import StructureOptions as StructureOptions
 from geoscene.structures.table import Structures as Structures

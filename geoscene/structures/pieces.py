@@ -155,7 +155,8 @@ def _wholes(
         if len(own) and (raised.klass[own] == Class.RAIL).all():
             shape = shape.buffer(_BESIDE_RAILS, cap_style="flat", join_style="mitre", mitre_limit=1.5)
         if members.tunnel[m] or not (raised.klass[own] == Class.BRIDGE).any():
-            grow = options.margin + options.wall if members.tunnel[m] else options.rim
+            beside = options.margin if members.foot[m] else max(options.margin, options.walkway)
+            grow = beside + options.wall if members.tunnel[m] else options.rim
             grown = shape.buffer(grow, join_style="mitre", mitre_limit=1.5)
             shape = grown.intersection(flat.buffer(_SIDE, cap_style="flat", join_style="mitre"))
         half[m] = _half(shape, flat)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -10,10 +11,12 @@ from numpy.typing import NDArray
 
 from geoscene import polylines
 from geoscene.classes import Class, materials
-from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh
+from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
+from geoscene.structures.fittings import tunnel_fittings
 from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
+from geoscene.structures.lining import NICHE, WALKWAY, Lining, read_lining
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Bools, Float, Height, Ints
 
@@ -29,7 +32,30 @@ def structure_meshes(
     openings: NDArray[np.object_] | None = None,
     options: StructureOptions | None = None,
 ) -> list[Mesh]:
+    """The meshes of `built_structures`."""
+    solids = built_structures(table, rows, height=height, openings=openings, options=options)
+    return [built.mesh for built in solids]
+
+
+@dataclass(frozen=True, slots=True)
+class Built:
+    """A piece as a mesh, and how many guessed parts of each kind it has."""
+
+    mesh: Mesh
+    guessed: dict[str, int]
+
+
+def built_structures(
+    table: Structures,
+    rows: Sequence[int] | NDArray[np.integer] | None = None,
+    *,
+    height: Height | None = None,
+    openings: NDArray[np.object_] | None = None,
+    options: StructureOptions | None = None,
+) -> list[Built]:
     """One closed solid for each of the chosen rows (all by default), in scene coordinates.
+
+    With a lining, tunnels also have closed bodies that stand or hang within them.
 
     Upward faces of a carriageway have the class and material of its surfaces, all others class BRIDGE or
     TUNNEL.
@@ -51,24 +77,40 @@ def _solid(
     height: Height | None,
     openings: NDArray[np.object_] | None,
     options: StructureOptions,
-) -> Mesh:
-    plan = cut_plan(table.polygon[k], _linework(table, k, openings=openings))
+) -> Built:
+    lining = read_lining(table, k) if options.lining and table.tunnel[k] else None
+    plan = cut_plan(table.polygon[k], _linework(table, k, openings=openings, lining=lining))
     if not len(plan.faces):
-        return Mesh.empty()
+        return Built(Mesh.empty(), {})
     z = surface_heights(table, k, xy=plan.xy)
     ground = np.zeros(len(z)) if height is None else np.asarray(height(*plan.xy.T), float)
     middle = plan.middle
     rim = ~shapely.contains_xy(table.inner[k], *middle.T)
     if table.tunnel[k]:
         levels, solid = _tunnel(
-            table, k, plan=plan, z=z, ground=ground, rim=rim, openings=openings, options=options
+            table,
+            k,
+            plan=plan,
+            z=z,
+            ground=ground,
+            rim=rim,
+            openings=openings,
+            options=options,
+            lining=lining,
         )
         floor = 1
     else:
         levels, solid = _bridge(table, k, plan=plan, z=z, ground=ground, rim=rim)
         floor = 2
     shell = raise_shell(plan, levels, solid=solid)
-    return _with_surfaces(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
+    body = _with_surfaces(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
+    if lining is None:
+        return Built(body, {})
+    fittings = tunnel_fittings(table, k, tube=body, equipment=options.equipment)
+    areas = {"walkways": lining.walkway, "niches": lining.niches}
+    parts = {name: 0 if area.is_empty else len(shapely.get_parts(area)) for name, area in areas.items()}
+    guessed = {name: count for name, count in (parts | fittings.counts).items() if count}
+    return Built(concatenate([body, fittings.mesh]), guessed)
 
 
 def _bridge(
@@ -91,22 +133,39 @@ def _tunnel(
     rim: Bools,
     openings: NDArray[np.object_] | None,
     options: StructureOptions,
+    lining: Lining | None,
 ) -> tuple[Float, Bools]:
-    """Tunnel with the levels underside, floor, ceiling, roof; walls between floor and ceiling."""
+    """Tunnel with the levels underside, floor, ceiling, roof; walls between floor and ceiling.
+
+    With a lining the levels of walkways and of the ceilings of niches are between floor and ceiling.
+    """
     ceiling = z + table.rise[k]
     opening = None if openings is None else openings[k]
     roof = tunnel_roof(plan.xy, ceiling, ground=ground, opening=opening, options=options)
     full = np.ones(len(rim), np.bool_)
-    return np.column_stack([z - table.body[k], z, ceiling, roof]), np.column_stack([full, rim, full])
+    levels, solid = [z - table.body[k], z, ceiling, roof], [full, rim, full]
+    if lining is not None and not shapely.is_empty(lining.niches):
+        niche = shapely.contains_xy(lining.niches, *plan.middle.T)
+        levels.insert(2, z + NICHE)
+        solid.insert(1, rim & ~niche)
+    if lining is not None and not shapely.is_empty(lining.walkway):
+        walkway = shapely.contains_xy(lining.walkway, *plan.middle.T)
+        levels.insert(2, z + WALKWAY)
+        solid.insert(1, rim | walkway)
+    return np.column_stack(levels), np.column_stack(solid)
 
 
-def _linework(table: Structures, k: int, *, openings: NDArray[np.object_] | None) -> NDArray[np.object_]:
+def _linework(
+    table: Structures, k: int, *, openings: NDArray[np.object_] | None, lining: Lining | None
+) -> NDArray[np.object_]:
     """Lines along which the piece is triangulated: outlines of its surfaces, parapets, breaks in height."""
     lines = [
         *shapely.boundary(table.surfaces.polygon[table.tops[k]]),
         shapely.boundary(table.inner[k]),
         shapely.boundary(table.pier[k]),
     ]
+    if lining is not None:
+        lines += [shapely.boundary(lining.walkway), shapely.boundary(lining.niches)]
     if openings is not None and openings[k] is not None:
         lines.append(shapely.boundary(openings[k]))
     sloped = slopes_across(table, k)

@@ -30,6 +30,9 @@ class StructureOptions:
     margin       : distance from the surfaces in a tunnel to its walls
     pier_spacing : maximum distance between piers
     piece        : maximum length of pieces, each of which belongs to one tile
+    walkway      : width of the walkways along the walls of road tunnels, 0 for none
+    lining       : tunnels have raised walkways, niches, ribs and portals
+    equipment    : lined road tunnels also have lamps, signs, jet fans and cable trays
     """
 
     deck: float = 0.8
@@ -44,6 +47,16 @@ class StructureOptions:
     margin: float = 0.25
     pier_spacing: float = 25.0
     piece: float = 80.0
+    walkway: float = 0.0
+    lining: bool = False
+    equipment: bool = False
+
+    @classmethod
+    def of_relief(cls, relief: str) -> StructureOptions:
+        """The options of a scene with this relief, one of `geoscene.options.RELIEFS`."""
+        if relief == "off":
+            return cls()
+        return cls(walkway=0.75, lining=True, equipment=relief == "full")
 
 
 @dataclass(frozen=True, slots=True)

@@ -335,7 +335,7 @@ def test_an_object_that_fails_in_a_tile_is_dropped_alone(plan, monkeypatch, laye
     table = getattr(plan, layer)
     tile, rows = max(plan.rows[layer].items(), key=lambda item: len(item[1]))
     victim, whole = str(table.osm_id[rows[-1]]), getattr(geoscene.tiles, make)
-    before, copies_before, _ = geoscene.tiles.make_ground(plan, tile)
+    before = geoscene.tiles.make_ground(plan, tile)
 
     def failing(some, **options):
         if victim in some.osm_id:
@@ -343,14 +343,15 @@ def test_an_object_that_fails_in_a_tile_is_dropped_alone(plan, monkeypatch, laye
         return whole(some, **options)
 
     monkeypatch.setattr(geoscene.tiles, make, failing)
-    after, copies_after, problems = geoscene.tiles.make_ground(plan, tile)
-    lost = {(p.osm_id, p.kind, p.action, p.reason, p.detail) for p in problems}
+    after = geoscene.tiles.make_ground(plan, tile)
+    lost = {(p.osm_id, p.kind, p.action, p.reason, p.detail) for p in after.problems}
     assert lost == {(victim, kind, "dropped", "unexpected-error", "ZeroDivisionError")}
     gone = table.feature[rows[table.osm_id[rows] == victim]]
     if layer == "barriers":
-        assert set(before.feature) - set(after.feature) == set(gone)
+        assert set(before.mesh.feature) - set(after.mesh.feature) == set(gone)
     else:
-        assert len(copies_after) == len(copies_before) - np.isin(copies_before.feature, gone).sum()
+        lost = np.isin(before.instances.feature, gone).sum()
+        assert len(after.instances) == len(before.instances) - lost
 
 
 def test_map_without_features_is_refused(tmp_path):

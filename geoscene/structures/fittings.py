@@ -1,0 +1,63 @@
+"""Bodies that stand or hang in tunnels: ribs, portals and equipment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geoscene.intersections import close_faces
+from geoscene.mesh import Mesh, concatenate
+from geoscene.structures.equipment import fans, lamps, signs, trays
+from geoscene.structures.lining import portals, ribs
+from geoscene.structures.table import Structures
+from geoscene.structures.tubes import has_walkway
+from geoscene.typing import Bools
+from geoscene.watertight import grid_cells, weld
+
+
+@dataclass(frozen=True, slots=True)
+class Fittings:
+    """Bodies in a tunnel piece, and how many there are of each kind."""
+
+    mesh: Mesh
+    counts: dict[str, int]
+
+
+def tunnel_fittings(table: Structures, k: int, *, tube: Mesh, equipment: bool) -> Fittings:
+    """Ribs and portals of tunnel piece ``k``, with ``equipment`` also lamps, signs, jet fans and cable trays.
+
+    tube : the piece's own solid; what would cross it, or something before it in this order, is left out
+    """
+    makers = {"portals": portals, "ribs": ribs}
+    if equipment and has_walkway(table, k):
+        makers |= {"lamps": lamps, "signs": signs, "fans": fans, "cable_trays": trays}
+    bodies, kinds = list[Mesh](), list[str]()
+    for kind, make in makers.items():
+        made = make(table, k)
+        bodies += made
+        kinds += [kind] * len(made)
+    clear = _clear(tube, bodies)
+    kept = [kind for kind, free in zip(kinds, clear.tolist(), strict=True) if free]
+    return Fittings(
+        concatenate([mesh for mesh, free in zip(bodies, clear.tolist(), strict=True) if free]),
+        {kind: kept.count(kind) for kind in makers if kind in kept},
+    )
+
+
+def _clear(tube: Mesh, bodies: list[Mesh]) -> Bools:
+    """Whether each of the bodies crosses neither the tube nor a body before it that is clear itself."""
+    clear = np.ones(len(bodies), np.bool_)
+    if not bodies:
+        return clear
+    body = np.repeat(np.arange(-1, len(bodies)), [len(tube), *(len(mesh) for mesh in bodies)])
+    mesh = concatenate([tube, *bodies])
+    corners = mesh.vertices[mesh.faces].reshape(-1, 3)
+    ids, first = weld(corners, np.zeros(len(corners), np.int64))
+    pairs, _ = close_faces(
+        grid_cells(corners[first]), ids.reshape(-1, 3), owner=np.zeros(len(mesh), np.int64)
+    )
+    met = np.unique(np.sort(body[pairs], axis=1), axis=0)
+    for one, other in met[met[:, 0] != met[:, 1]].tolist():
+        clear[other] &= one >= 0 and not clear[one]
+    return clear
