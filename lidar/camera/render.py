@@ -18,6 +18,7 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.physics.fresnel import mirrored
 from lidar.raycast import Hits
+from lidar.raycast.hits import own_faces
 from lidar.rig.camera_model import pixel_rays, project, unproject
 from lidar.rig.specs import CameraSpec
 from lidar.world.surfaces import Surfaces
@@ -379,7 +380,8 @@ def _shaded(
         if options.shadows:
             towards = np.broadcast_to(light.direction, (k, 3))
             time = None if view.time is None else view.time[which]
-            lit[which] = ~world.caster.occluded(start[:k], towards, time=time)
+            on = own_faces(hits.take(which))
+            lit[which] = ~world.caster.occluded(start[:k], towards, time=time, on=on)
         else:
             lit[which] = True
     out = np.empty((n, 3), np.float32)

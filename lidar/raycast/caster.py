@@ -231,7 +231,7 @@ class Caster:
 
     def _first_hits(self, rays: Rays, on: NDArray[np.int32] | None, *, normals: bool, threads: int) -> Hits:
         """The first hits of checked rays."""
-        if on is None:
+        if on is None or not self.refiners:
             hits = self.scene.cast(rays, normals=normals, threads=threads)
             for refiner in self.refiners:
                 refiner.refine(rays, hits, threads=threads)
@@ -247,7 +247,7 @@ class Caster:
 
     def _any_hit(self, rays: Rays, on: NDArray[np.int32] | None, *, threads: int) -> NDArray[np.bool_]:
         """Whether checked rays hit anything."""
-        if on is not None:
+        if on is not None and self.refiners:
             hits, at = self._left(rays, on, normals=False)
             blocked = hits.face >= 0
             for row, part in _parts(rays, at):

@@ -29,3 +29,8 @@ class Hits(Columns):
     instance: NDArray[np.int32]
     cosine: NDArray[np.float32]
     normal: NDArray[np.float64]
+
+
+def own_faces(hits: Hits) -> NDArray[np.int32]:
+    """Faces (n,) of hits on the caster's own mesh, -1 for others: where rays start that go on from there."""
+    return np.where(hits.instance < 0, hits.face, np.int32(-1))

@@ -21,6 +21,7 @@ from lidar.relief.march import (
     PANEL,
     PARTS,
     ROOM,
+    SILL,
     WALL,
     in_room,
     layer_of,
@@ -28,6 +29,8 @@ from lidar.relief.march import (
     opening_table,
     within,
 )
+
+_ADDED = np.arange(SILL, SILL + PARTS, dtype=np.uint8)
 
 _FOOT, _TANGENT, _START, _WIDTH, _HEIGHT, _GROUND, _COLUMNS, _ROWS = 0, 3, 5, 7, 8, 9, 10, 11
 
@@ -64,6 +67,7 @@ class WallTables(NamedTuple):
     """Facades for compiled code, of one or of several tiles.
 
     wall  : (m,) int32, facade of each face of the mesh and of each additional face; -1 for other faces
+    part  : (m,) uint8, of each face: `lidar.relief.march.SILL` to `ROOM`; `WALL` for those of the mesh
     frame : (k, 12) foot, tangent, start, size of a cell, height of the ground floor, columns and rows of the
             grid; scene metres
     first : (k,) int64, first cell
@@ -75,6 +79,7 @@ class WallTables(NamedTuple):
     """
 
     wall: NDArray[np.int32]
+    part: NDArray[np.uint8]
     frame: Float
     first: NDArray[np.int64]
     own: NDArray[np.int32]
@@ -97,6 +102,7 @@ def tables_of(relief: WallRelief, pairs: Pairs, *, origin: Float, bits: NDArray[
     own[relief.wall[of_wall]] = of_wall
     return WallTables(
         wall=np.concatenate([relief.wall, np.repeat(pairs.wall, PARTS)]).astype(np.int32),
+        part=np.concatenate([np.full(m, WALL, np.uint8), np.tile(_ADDED, len(pairs.wall))]),
         frame=np.column_stack([f.foot + origin, f.tangent, f.start, f.cell, f.ground, f.grid]).astype(
             np.float64
         ),
@@ -115,11 +121,12 @@ def joined(tables: Sequence[WallTables], *, faces: Sequence[int], count: int) ->
     faces : number of the first face of each tile
     count : number of faces in all
     """
-    wall = np.full(count, -1, np.int32)
+    wall, part = np.full(count, -1, np.int32), np.full(count, WALL, np.uint8)
     walls = np.cumsum([0, *(len(t.first) for t in tables)])
     kinds = np.cumsum([0, *(len(t.kinds) for t in tables)])
     cells = np.cumsum([0, *(len(t.cells) for t in tables)])
     for table, face, before in zip(tables, faces, walls, strict=False):
+        part[face : face + len(table.part)] = table.part
         wall[face : face + len(table.wall)] = np.where(table.wall >= 0, table.wall + np.int32(before), -1)
 
     def plus(columns: Sequence[NDArray[Any]], offsets: Sequence[int] | NDArray[np.integer]) -> NDArray[Any]:
@@ -128,6 +135,7 @@ def joined(tables: Sequence[WallTables], *, faces: Sequence[int], count: int) ->
 
     return WallTables(
         wall=wall,
+        part=part,
         frame=np.concatenate([t.frame for t in tables]),
         first=plus([t.first for t in tables], cells),
         own=plus([t.own for t in tables], faces).astype(np.int32),
@@ -163,6 +171,11 @@ class WallRefiner:
         at = np.zeros(len(on))
         _leave(self.tables, rays, on, (hits.range, hits.face, hits.instance, hits.cosine, hits.normal), at)
         return at
+
+    def panes(self, hits: Hits) -> NDArray[np.int32]:
+        """The faces (n,) of hits on the infill of openings, -1 for other hits."""
+        own = (hits.face >= 0) & (hits.instance < 0)
+        return np.where(own & (self.tables.part[hits.face] == INFILL), hits.face, np.int32(-1))
 
     def rooms(self, face: NDArray[np.int32], place: Float, direction: Float) -> Hits:
         """What rays hit that have passed the pane of an opening: the closed room behind it.

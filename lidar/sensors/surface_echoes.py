@@ -14,6 +14,7 @@ from lidar.physics.fresnel import mirrored, pane_reflection, surface_reflection
 from lidar.physics.settings import ScannerSettings
 from lidar.random_streams import generator
 from lidar.raycast import Hits
+from lidar.raycast.hits import own_faces
 from lidar.rig.patterns.beams import Firings
 from lidar.rig.scanner import Sensor
 from lidar.sensors.foliage import Foliage
@@ -117,14 +118,14 @@ def _beyond(
     share. The echo appears on the ray's own direction, as far behind the mirror as the surface is in front,
     and is labelled noise.
     """
-    caster = optics.world.caster
+    world = optics.world
     pose = rays.poses.take(rays.index)
     start, direction = pose.place(rays.origin), pose.directions(rays.direction)
     start, travelled = start + skip[:, None] * direction, skip
     glass, water = glossy_codes()
-    found = []
+    found, behind = [], np.full(len(pulse), -1, np.int32)
     for layer in range(_MAX_PANES):
-        hits = caster.cast(start, direction, far=far, time=time, normals=True)
+        hits = _cast(world, start, direction=direction, behind=behind, far=far, time=time)
         surface, material = optics.at(hits)
         if layer:  # the collector has the first surface
             found.append(_along(surface, hits, pulse=pulse, power=power, travelled=travelled, klass=None))
@@ -139,7 +140,9 @@ def _beyond(
         travelled = travelled + hits.range
         place = start + hits.range[:, None] * direction
         if not layer:
-            ghosts = caster.cast(place, mirrored(direction, hits.normal), near=_CLEAR, far=far, time=time)
+            ghosts = world.caster.cast(
+                place, mirrored(direction, hits.normal), near=_CLEAR, far=far, time=time, on=own_faces(hits)
+            )
             found.append(
                 _along(
                     optics.at(ghosts)[0],
@@ -155,9 +158,34 @@ def _beyond(
         power = (power * (1 - mirror) ** 2)[through]
         pulse, travelled = pulse[through], travelled[through] + _CLEAR
         time = None if time is None else time[through]
+        behind = _panes(world, hits.take(through))
         if not through.any():
             break
     return [part.take(part.range <= far) for part in found]
+
+
+def _cast(
+    world: World,
+    start: Float,
+    *,
+    direction: Float,
+    behind: NDArray[np.int32],
+    far: float,
+    time: NDArray[np.float32] | None,
+) -> Hits:
+    """First hits of rays; those that have passed the pane ``behind`` (n,; -1 for none) hit the room there."""
+    hits = world.caster.cast(start, direction, far=far, time=time, normals=True)
+    row = np.flatnonzero(behind >= 0)
+    if len(row) and world.walls is not None:
+        rooms = world.walls.rooms(behind[row], start[row], direction[row])
+        for column, new in zip(hits.columns().values(), rooms.columns().values(), strict=True):
+            column[row] = new
+    return hits
+
+
+def _panes(world: World, hits: Hits) -> NDArray[np.int32]:
+    """Faces (n,) of hits on panes of facades, -1 for other hits."""
+    return np.full(len(hits), -1, np.int32) if world.walls is None else world.walls.panes(hits)
 
 
 def _along(

@@ -30,6 +30,7 @@ class MeshWorld:
 
     mesh: Mesh
     reach = np.inf
+    walls = None
     settings: WorldSettings = PLAIN
 
     def __post_init__(self):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.facades import plane_mesh, random_relief
+from helpers.sensor_worlds import driven
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
@@ -13,8 +14,12 @@ from geoscene.mesh import Mesh, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_tile
+from lidar.geometry.mounts import Mount
+from lidar.physics.settings import ScannerSettings
 from lidar.raycast import Hits
 from lidar.relief import FRAME, INFILL, PARTS, SILL
+from lidar.rig.scanner import load_sensor
+from lidar.sensors.scan import scan
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 
@@ -135,3 +140,21 @@ def test_a_miss_stays_a_miss(scene):
     one = np.full(1, -1, np.int32)
     miss = Hits(np.full(1, np.inf), one, one, np.zeros(1, np.float32), np.empty((0, 3)))
     assert world.lookup(miss).feature[0] == -1
+
+
+def test_pulses_pass_panes_and_return_from_the_room_behind(scene):
+    world, relief = World.load(scene), wall_of(0)
+    start = (FEET[0][0] + 3.0, FEET[0][1] - 9.0, 0.0)
+    sensor = load_sensor("vlp16", return_mode="dual")
+    options = {"trajectory": driven((0.0, 0.0, 0.0), start=start), "world": world, "frame": 0}
+    plain = scan(sensor, Mount((0.0, 0.0, 3.0)), **options)
+    cloud = scan(sensor, Mount((0.0, 0.0, 3.0)), settings=ScannerSettings(mirrors=True), **options)
+    depth = cloud.xyz[:, 1].astype(float) - 9.0
+    wall = (cloud.feature == 100) & (cloud.klass == Class.BUILDING)
+    behind = wall & (depth > relief.openings.pane_depth.max() + 0.01)
+    assert (plain.xyz[plain.feature == 100, 1] < 9.0 + relief.openings.pane_depth.max() + 1e-5).all()
+    assert behind.sum() > 50
+    assert depth[behind].max() < relief.openings.room.max() + 1e-4
+    x = cloud.xyz[behind, 0].astype(float) + 3.0 - relief.facades.start[0, 0]
+    assert x.min() > -1e-4
+    assert x.max() < relief.facades.grid[0, 0] * relief.facades.cell[0, 0] + 1e-4
