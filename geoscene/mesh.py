@@ -12,8 +12,8 @@ from geoscene.columns import Columns
 from geoscene.errors import GeosceneError
 from geoscene.typing import Float
 
-OTHER, WALL, ROOF, FLOOR = 0, 1, 2, 3
-"""Codes of `Mesh.surface`."""
+OTHER, WALL, ROOF, FLOOR, WINDOW, DOOR = range(6)
+"""Codes of `Mesh.surface`; panes and frames of windows and doors are in meshes with modelled facades only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Mesh:
     feature  : (m,) int32, scene-wide feature number, -1 for none
     klass    : (m,) uint8, code of `geoscene.classes`
     material : (m,) uint8, code of `geoscene.classes.Material`
-    surface  : (m,) uint8, OTHER, WALL, ROOF or FLOOR
+    surface  : (m,) uint8, OTHER, WALL, ROOF, FLOOR, WINDOW or DOOR
     color    : (m, 3) uint8, sRGB
     closed   : (m,) bool, the face belongs to a closed solid, bounded by all closed faces of its feature
     """

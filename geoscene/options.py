@@ -168,5 +168,14 @@ class ExportOptions:
     resolution: float | None = None
     """GeoTIFF: cell size in metres, 0.5 by default."""
 
+    relief: str | None = None
+    """mesh: model windows, doors and other openings of walls as geometry, for a scene built with relief;
+    by default walls are planes."""
+
     height_offset: float | None = None
     """3D Tiles: metres added to all heights, such as the geoid height to make them ellipsoidal."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.relief not in (None, "mesh"):
+            raise InputError(f"`relief` {self.relief}: mesh, or leave it out for plane walls")

@@ -29,7 +29,7 @@ from geoscene.export.tables import target_crs
 from geoscene.export.vertices import Vertices
 from geoscene.files import append, atomic_file, spool
 from geoscene.frames import Frame, utm_crs
-from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh
+from geoscene.mesh import DOOR, FLOOR, ROOF, WALL, WINDOW, Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
@@ -41,6 +41,9 @@ triangles of the ground, or of solids in a CRS other than the scene's, do not co
 LOD = {0: "1.1", 1: "1.3", 2: "2.1"}
 """The scene's level of detail in the terms of Biljecki, Ledoux and Stoter, "An improved LOD specification
 for 3D building models" (2016): blocks; parts of several heights; roofs over indented outlines."""
+
+LOD_OPENINGS = "3.2"
+"""The same for buildings with windows and doors."""
 
 _STREET_FURNITURE = (Class.POLE, Class.TRAFFIC_SIGN, Class.TRAFFIC_LIGHT, Class.BOLLARD, Class.BENCH)
 _TYPES: dict[int, str] = {
@@ -239,8 +242,10 @@ def _tile_objects(
                 number=number,
                 kind=kind,
             )
+            opened = np.isin(mesh.surface[piece.rows], (WINDOW, DOOR)).any()
+            own = LOD_OPENINGS if opened else lod
             entries += _solid_entries(
-                name, kind, attributes=attributes, solids=[{"lod": lod, **solid} for solid in made]
+                name, kind, attributes=attributes, solids=[{"lod": own, **solid} for solid in made]
             )
             solids += 1
         else:
@@ -305,7 +310,13 @@ def _solids(
     names, values = np.unique(
         _surface_kinds(mesh, piece, whole=whole, triangles=triangles), return_inverse=True
     )
-    surfaces = [{"type": str(n)} for n in names]
+    surfaces: list[dict[str, Any]] = [{"type": str(n)} for n in names]
+    openings = [k for k, name in enumerate(names) if name in ("Window", "Door")]
+    if openings:
+        wall = names.tolist().index("WallSurface")
+        surfaces[wall]["children"] = openings
+        for k in openings:
+            surfaces[k]["parent"] = wall
     out = []
     for body in bodies(whole.astype(float), triangles, shell=shell):
         solid: dict[str, Any] = {
@@ -326,8 +337,8 @@ def _surface_kinds(mesh: Mesh, piece: Piece, *, whole: Ints, triangles: Ints) ->
     height = whole[triangles, 2].max(axis=1)
     ground = height - whole[triangles, 2].min() <= 1
     return np.select(
-        [code == ROOF, code == WALL, (code == FLOOR) & ground, code == FLOOR],
-        ["RoofSurface", "WallSurface", "GroundSurface", "OuterCeilingSurface"],
+        [code == ROOF, code == WALL, code == WINDOW, code == DOOR, (code == FLOOR) & ground, code == FLOOR],
+        ["RoofSurface", "WallSurface", "Window", "Door", "GroundSurface", "OuterCeilingSurface"],
         "ClosureSurface",
     )
 

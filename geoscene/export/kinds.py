@@ -39,15 +39,24 @@ def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: 
 
 KINDS: dict[str, Kind] = {
     "cityjson": _kind(
-        "CityJSON 2.0", "cityjson:write_cityjson", suffixes=".city.json .cityjson", options="crs layers"
+        "CityJSON 2.0",
+        "cityjson:write_cityjson",
+        suffixes=".city.json .cityjson",
+        options="crs layers relief",
     ),
-    "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers"),
-    "3dtiles": _kind("3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset"),
+    "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers relief"),
+    "3dtiles": _kind(
+        "3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset relief"
+    ),
     "obj": _kind(
-        "Wavefront OBJ and MTL", "triangles:write_obj", suffixes=".obj", options="layers", beside=".mtl"
+        "Wavefront OBJ and MTL",
+        "triangles:write_obj",
+        suffixes=".obj",
+        options="layers relief",
+        beside=".mtl",
     ),
-    "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers"),
-    "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers"),
+    "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief"),
+    "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers relief"),
     "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
     "geojson": _kind("GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers"),
     "geoparquet": _kind(
@@ -101,6 +110,8 @@ def export_scene(
         names = ", ".join(f"`{key}`" for key in foreign)
         takes = ", ".join(f"`{key}`" for key in sorted(kind.options)) or "none"
         raise InputError(f"{names} does not go with {kind.title}, which takes {takes}")
+    if given.pop("relief", None):
+        scene = scene.with_relief_mesh()
     for path in (out, out.with_suffix(kind.beside)) if kind.beside else (out,):
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists; set `overwrite` to replace it")

@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 import shapely
 
-from geoscene.errors import BUILD_AGAIN, GeosceneError, SceneFormatError, reading
+from geoscene.buildings.facades.solids import relief_mesh
+from geoscene.errors import BUILD_AGAIN, GeosceneError, InputError, SceneFormatError, reading
 from geoscene.files import digest, digest_of, write_atomically
 from geoscene.frames import Frame
 from geoscene.mesh import Mesh
@@ -123,12 +124,14 @@ class Scene:
     manifest : the document that the build wrote
     frame    : the scene frame
     stored   : the directory in object storage, if it is there
+    modelled : tiles are read with their facades as geometry
     """
 
     path: Path
     manifest: dict[str, Any]
     frame: Frame
     stored: Stored | None = None
+    modelled: bool = False
 
     @property
     def files(self) -> SceneFiles:
@@ -254,11 +257,22 @@ class Scene:
         Raises SceneFormatError if it is missing or damaged.
         """
         tile = read_tile(self.files.tile(i, j))
+        if self.modelled and tile.relief is not None:
+            tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None)
         if self.forests is None or not forests:
             return tile
         box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
         low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
         return with_forests(tile, self.forests, box=(*low, *high))
+
+    def with_relief_mesh(self) -> Scene:
+        """The scene whose tiles have openings of walls as geometry; solids stay closed.
+
+        Raises InputError if the scene was built without relief.
+        """
+        if self.manifest.get("options", {}).get("relief", "off") == "off":
+            raise InputError(f"{self.location}: has no relief; build it with `relief` plain or full")
+        return replace(self, modelled=True)
 
     def tiles(self, *, forests: bool = True) -> Iterator[Tile]:
         """All tiles, one at a time."""

@@ -39,6 +39,7 @@ class Openings(Columns):
     trim, frame_material, infill : (t,) uint8, materials of the sill, of the frame with its bars, and of the
               infill (glass, wood, metal); panel and reveal have the material of the wall
     trim_color, frame_color, infill_color, room_color : (t, 3) uint8, sRGB
+    door     : (t,) bool, a door or a gate
     """
 
     panel: Float
@@ -58,6 +59,7 @@ class Openings(Columns):
     frame_color: NDArray[np.uint8]
     infill_color: NDArray[np.uint8]
     room_color: NDArray[np.uint8]
+    door: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

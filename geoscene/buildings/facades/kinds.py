@@ -98,10 +98,9 @@ def _openings(chosen: Chosen, styles: Styles) -> Openings:
         panel[own] = panels(opening[own], k, margin=styles.margin[own])
         depth[own], behind[own] = depths(k, styles)[own], _BEHIND[k]
     deep = window & styles.deep
-    silled = window & ~deep & (styles.panel > 0)
-    reach = np.minimum(_SILL, styles.margin)
+    silled = window & ~deep & (styles.panel > 0) & (styles.margin > _SILL)
     sill = (
-        np.column_stack([opening[:, 0] - reach, opening[:, 1] - _SILL, opening[:, 2] + reach, opening[:, 1]])
+        np.column_stack([opening[:, 0] - _SILL, opening[:, 1] - _SILL, opening[:, 2] + _SILL, opening[:, 1]])
         * silled[:, None]
     )
     width = opening[:, 2] - opening[:, 0]
@@ -143,4 +142,5 @@ def _openings(chosen: Chosen, styles: Styles) -> Openings:
         frame_color=styles.colors[:, 0].copy(),
         infill_color=infill_color.astype(np.uint8),
         room_color=rooms.astype(np.uint8),
+        door=door | gate,
     )

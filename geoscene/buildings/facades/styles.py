@@ -212,7 +212,7 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         [
             _paints(paint, draw[9]),
             _paints(np.where(metal, "metal", "dark"), draw[10]),
-            _paints(np.where(metal, "blind", "shutter"), draw[11]),
+            _paints(np.where(metal | (draw[17] < 0.6), "blind", "shutter"), draw[11]),
             np.clip(buildings.wall_color * 0.6 + 90.0, 0, 255).astype(np.uint8),
         ],
         axis=1,

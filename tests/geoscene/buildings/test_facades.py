@@ -11,11 +11,13 @@ from shapely import affinity
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.buildings.facades import read_setting, wall_relief
+from geoscene.buildings.facades.solids import relief_mesh
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.frames import Frame
-from geoscene.mesh import WALL
+from geoscene.mesh import DOOR, WALL, WINDOW
 from geoscene.sources.data import Area, OsmData, Point
+from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(8.7, 49.4)
 GLASS = materials()["glass"].code
@@ -198,3 +200,58 @@ def test_each_face_of_a_straight_wall_is_in_it():
     assert np.sort(walls.size[:, 0]) == pytest.approx([10, 10, 20, 20], abs=1e-3)
     moved = replace(mesh, vertices=mesh.vertices + np.array([5000.0, -3000.0, 100.0]))
     assert len(find_walls(moved)[0]) == 4
+
+
+def recesses(relief):
+    """Volume behind the planes of the walls and its tolerance, by the areas of the parts of each opening."""
+    o = relief.openings
+
+    def area(box):
+        return (box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])
+
+    inner = np.stack([o.opening[:, k] + sign * o.frame for k, sign in enumerate((1, 1, -1, -1))], axis=1)
+    wide, tall = inner[:, 2] - inner[:, 0], inner[:, 3] - inner[:, 1]
+    across, up = (o.bars[:, k] * o.bar for k in (0, 1))
+    panes = (wide - across) * (tall - up)
+    volume = (area(o.panel) - area(o.sill)) * o.panel_depth
+    volume += area(o.opening) * (o.reveal_depth - o.panel_depth) + panes * (o.pane_depth - o.reveal_depth)
+    cells = relief.cells[relief.cells >= 0]
+    return volume[cells].sum(), 1e-4 * relief.facades.size.prod(axis=1).sum()  # vertices are on a 0.1 mm grid
+
+
+@given(
+    blocks(),
+    st.floats(4, 14),
+    st.sampled_from(["yes", "house", "apartments", "office", "retail", "church", "parking", "garage"]),
+    st.sampled_from(["flat", "gabled", "hipped", "skillion", "mansard"]),
+    st.sampled_from(["brick", "glass", "stone", "wood"]),
+    st.integers(1, 10**9),
+)
+@settings(max_examples=15, deadline=None)
+def test_modelled_facades_are_closed_solids_less_their_recesses(shape, height, use, roof, material, number):
+    tags = {"height": f"{height:.1f}", "roof__shape": roof, "building__material": material}
+    _, mesh, layout = facades_of(house(number, shape, building=use, **tags), street=[(-60, -40), (60, -40)])
+    modelled = relief_mesh(mesh, layout.relief)
+    before, after = validate_mesh(mesh), validate_mesh(modelled)
+    assert after.feature.tolist() == before.feature.tolist()
+    assert [after.fault(k) for k in range(len(after))] == [""] * len(before)
+    lost, (volume, tolerance) = before.volume.sum() - after.volume.sum(), recesses(layout.relief)
+    assert lost == pytest.approx(volume, abs=tolerance + 1e-6)
+
+
+def test_windows_and_doors_of_a_modelled_facade_are_marked():
+    shape = shapely.box(0, 0, 20, 10)
+    _, mesh, layout = facades_of(house(1, shape, building="house", height="6"), street=[(-30, -8), (40, -8)])
+    modelled = relief_mesh(mesh, layout.relief)
+    area = {code: (modelled.surface == code).sum() for code in (WALL, WINDOW, DOOR)}
+    assert all(area.values())
+    assert set(modelled.material[modelled.surface == WINDOW].tolist()) > {GLASS}
+    door = modelled.vertices[modelled.faces[modelled.surface == DOOR]]
+    assert door[:, :, 2].min() < 0.3
+    assert np.abs(door[:, :, 1]).max() < 1.0  # at the wall to the street
+
+
+def test_a_mesh_without_openings_is_unchanged():
+    _, mesh, layout = facades_of(house(1, shapely.box(0, 0, 20, 10), building="shed", height="3"))
+    assert not len(layout.relief.facades)
+    assert relief_mesh(mesh, layout.relief) is mesh
