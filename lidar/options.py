@@ -648,10 +648,10 @@ class TradeoffOptions:
     """Options of a comparison of settings."""
 
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
-    """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample, blur,
-    shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach, forests, trees,
-    furniture, barriers, scene, traffic; georeferencing, files (formats), voxel (of maps) and frame
-    (projections); all by default. Cheap ones are also tried together. lidar settings
+    """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample,
+    edge_rays, blur, shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach,
+    forests, trees, furniture, barriers, scene, traffic; georeferencing, files (formats), voxel (of maps) and
+    frame (projections); all by default. Cheap ones are also tried together. lidar settings
     explains them."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.camera import shade
+from lidar.camera.edges import edge_pixels
 from lidar.camera.facades import Facades, facades_of
 from lidar.camera.light import Light, daylight
 from lidar.errors import InputError
@@ -26,6 +27,12 @@ from lidar.world.world import World
 
 _BAND = 1 << 16
 """Rays per batch: small enough for their columns to stay in the processor's cache."""
+
+_EDGES = 1 << 14
+"""Pixels at edges per batch."""
+
+_Pixels = slice | NDArray[np.int64]
+"""Numbers of pixels; a slice has a start and a stop."""
 
 _SHARED = 1 << 23
 """Rays of a camera, supersampling included, up to which frames share them; they take 24 bytes each."""
@@ -49,6 +56,7 @@ class RenderOptions:
     shadows     : cast shadows
     detail      : draw windows, joints and grain on surfaces of uniform colour
     supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
+    edge_rays   : the same at edges, as `lidar.camera.edges` finds them, where it is more than ``supersample``
     visibility  : metres at which haze has taken 98 % of a contrast (Koschmieder); inf for clear air
     cloud       : share of the sky that clouds cover
     exposure    : stops added to the automatic exposure
@@ -62,6 +70,7 @@ class RenderOptions:
     shadows: bool = True
     detail: bool = True
     supersample: int = 1
+    edge_rays: int = 2
     visibility: float = 20_000.0
     cloud: float = 0.0
     exposure: float = 0.0
@@ -71,7 +80,8 @@ class RenderOptions:
 
     def __post_init__(self) -> None:
         """Raise InputError for values out of range."""
-        sound = 1 <= self.supersample <= 16 and self.visibility > 0 and 0 <= self.cloud <= 1
+        sound = 1 <= self.supersample <= 16 and 1 <= self.edge_rays <= 16
+        sound = sound and self.visibility > 0 and 0 <= self.cloud <= 1
         if not (sound and self.full_well > 0 and self.threads):
             raise InputError(f"camera options out of range: {self}")
 
@@ -155,52 +165,96 @@ def render(
         raise InputError(f"camera {camera.name}: `full_well` adds noise and needs `random`")
     h, w = camera.height, camera.width
     coloured = "rgb" in camera.images
-    rgb = np.empty((h, w, 3), np.uint8)
-    depth, klass = np.empty((h, w), np.float32), np.empty((h, w), np.uint8)
-    feature = np.empty((h, w), np.int32)
     light = light_of(sun, cloud=options.cloud, snow=world.settings.snow)
+    exposure = light.exposure * 2.0**options.exposure
     walls = facades_of(world)
     k = options.supersample
-    fine = _finer(camera, k)
-    electrons = None
-    if random is not None and np.isfinite(options.full_well):
-        electrons = random.standard_normal((h, w, 3), np.float32)
-    middle = samples // 2
     look = functools.partial(_view, poses=poses, world=world, times=times, options=options)
+    colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, options=options)
 
-    def band(edges: tuple[int, int]) -> None:
+    def band(edges: tuple[int, int], image: _Image, *, sample: int) -> None:
+        """Labels, depth and colour of the rows of an image."""
         first, last = edges
-        view = look(camera, sample=middle, first=first, last=last)
-        surfaces, distance = view.surfaces, view.hits.range
-        if coloured:
-            total = np.zeros(((last - first) * w, 3), np.float32)
-            for sample in range(samples):
-                seen = view
-                if k > 1 or sample != middle:
-                    seen = look(fine, sample=sample, first=first * k, last=last * k, rows=h)
-                part = radiance(
-                    world, seen, light=light, walls=walls, blur=0.0, angle=1 / fine.fx, options=options
-                )
-                total += part if k == 1 else _binned(part, k, width=w)
-            exposure = light.exposure * 2.0**options.exposure / samples
-            if electrons is not None:
-                total = _noisy(total, exposure, normal=electrons[first:last].reshape(-1, 3), options=options)
-            shade.develop(total, exposure, shade.transfer_table(), rgb[first:last].reshape(-1, 3))
-        near = np.where(distance <= camera.far, distance, np.inf)
-        depth[first:last] = near.reshape(-1, w)
-        sky = np.where(view.seen, np.uint8(Class.SKY), np.uint8(Class.UNLABELED))
-        klass[first:last] = np.where(np.isfinite(distance), surfaces.klass, sky).reshape(-1, w)
-        feature[first:last] = surfaces.feature.reshape(-1, w)
+        here = slice(first * w, last * w)
+        view = look(camera, here, sample=sample)
+        image.label(here, view)
+        if coloured and k == 1:
+            image.light[here] = colour(view, angle=1 / camera.fx)
+        elif coloured:
+            fine = _finer(camera, k)
+            seen = look(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
+            image.light[here] = _binned(colour(seen, angle=1 / fine.fx), k, width=w)
+
+    def refine(pixels: NDArray[np.int64], image: _Image, *, sample: int) -> None:
+        """Colour of single pixels of an image, from more rays."""
+        n = options.edge_rays
+        fine = _finer(camera, n)
+        seen = look(fine, _finer_pixels(pixels, n, width=w), sample=sample, rows=h)
+        part = colour(seen, angle=1 / fine.fx)
+        image.light[pixels] = part.reshape(len(pixels), n * n, 3).mean(axis=1, dtype=np.float32)
 
     step = max(1, _BAND // (w * k * k))
     bands = [(a, min(a + step, h)) for a in range(0, h, step)]
-    if options.threads == 1:
-        for edges in bands:
-            band(edges)
-    else:
-        with ThreadPoolExecutor(options.threads) as pool:
-            list(pool.map(band, bands))
-    return Frame(rgb if coloured else None, depth, klass, feature)
+    total = np.zeros((h * w if coloured else 0, 3), np.float32)
+    with ThreadPoolExecutor(options.threads) as pool:
+        run = map if options.threads == 1 else pool.map
+        for sample in range(samples) if coloured else [samples // 2]:
+            image = _Image.of(h * w, coloured=coloured)
+            list(run(functools.partial(band, image=image, sample=sample), bands))
+            if coloured and options.edge_rays > k:
+                bytes_ = np.empty((h * w, 3), np.uint8)
+                shade.develop(image.light, exposure, shade.transfer_table(), bytes_)
+                edge = edge_pixels(
+                    bytes_.reshape(h, w, 3), image.feature.reshape(h, w), klass=image.klass.reshape(h, w)
+                )
+                parts = np.split(edge, range(_EDGES, len(edge), _EDGES))
+                list(run(functools.partial(refine, image=image, sample=sample), parts))
+            total += image.light
+            if sample == samples // 2:
+                middle = image
+    rgb = np.empty((h * w, 3), np.uint8)
+    if coloured:
+        exposure /= samples
+        if random is not None and np.isfinite(options.full_well):
+            electrons = random.standard_normal((h, w, 3), np.float32).reshape(-1, 3)
+            total = _noisy(total, exposure, normal=electrons, options=options)
+        shade.develop(total, exposure, shade.transfer_table(), rgb)
+    depth = np.where(middle.range <= camera.far, middle.range, np.float32(np.inf))
+    return Frame(
+        rgb.reshape(h, w, 3) if coloured else None,
+        depth.reshape(h, w),
+        middle.klass.reshape(h, w),
+        middle.feature.reshape(h, w),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """Pixels (n,) of one sample of an exposure, filled in parts.
+
+    light   : (n, 3) float32, linear; (0, 3) without colour
+    range   : (n,) float64, ray parameter of the hit
+    klass, feature : as in `Frame`
+    """
+
+    light: NDArray[np.float32]
+    range: Float
+    klass: NDArray[np.uint8]
+    feature: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, n: int, *, coloured: bool) -> _Image:
+        """An image of n pixels."""
+        light = np.empty((n if coloured else 0, 3), np.float32)
+        return cls(light, np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
+
+    def label(self, here: slice, view: View) -> None:
+        """Set depth, class and feature of some pixels."""
+        distance = view.hits.range
+        sky = np.where(view.seen, np.uint8(Class.SKY), np.uint8(Class.UNLABELED))
+        self.range[here] = distance
+        self.klass[here] = np.where(np.isfinite(distance), view.surfaces.klass, sky)
+        self.feature[here] = view.surfaces.feature
 
 
 def light_of(sun: ArrayLike, *, cloud: float, snow: float) -> Light:
@@ -233,30 +287,39 @@ def _binned(fine: NDArray[np.float32], k: int, *, width: int) -> NDArray[np.floa
     return mean.reshape(-1, 3)
 
 
+def _finer_pixels(pixels: NDArray[np.int64], k: int, *, width: int) -> NDArray[np.int64]:
+    """The k by k pixels (n * k * k,) of `_finer` of each of some pixels (n,), one after the other."""
+    row, column = np.divmod(pixels, width)
+    part = np.arange(k)
+    rows = (row * k)[:, None, None] + part[:, None]
+    columns = (column * k)[:, None, None] + part
+    return (rows * (width * k) + columns).reshape(-1)
+
+
 def _view(
     camera: CameraSpec,
-    poses: Poses,
+    pixels: _Pixels,
     *,
+    poses: Poses,
     world: World,
     sample: int,
-    first: int,
-    last: int,
     times: Float | None,
     options: RenderOptions,
     rows: int | None = None,
 ) -> View:
-    """Hits and surfaces of the rows first to last of a camera in one sample of the exposure.
+    """Hits and surfaces of pixels of a camera in one sample of the exposure.
 
-    rows : rows of the shutter, where the camera is a finer one
+    pixels : numbers of pixels, row by row from the top
+    rows   : rows of the shutter, where the camera is a finer one
     """
-    w = camera.width
-    rays = _scaled_rays(camera, first, last=last)
+    rays = _scaled_rays(camera, pixels)
     moments = (rows or camera.height) if camera.row_ns else 1
     if moments == 1:
         row = np.full(len(rays), sample, np.int32)
     else:
-        line = np.arange(first, last) * moments // camera.height
-        row = np.repeat((sample * moments + line).astype(np.int32), w)
+        number = np.arange(pixels.start, pixels.stop) if isinstance(pixels, slice) else pixels
+        line = number // camera.width * moments // camera.height
+        row = (sample * moments + line).astype(np.int32)
     direction, seen = np.empty_like(rays), np.empty(len(rays), np.bool_)
     shade.aim(rays, row, poses.rotation, poses.scale, direction, seen)
     time = None if times is None else np.asarray(times, float)[row]
@@ -282,13 +345,13 @@ def _pinhole_rays(camera: CameraSpec) -> Float:
     return rays / rays[:, 2:]
 
 
-def _scaled_rays(camera: CameraSpec, first: int, *, last: int) -> Float:
-    """Directions of the rows first to last whose ray parameter is the depth as defined in `Frame`."""
+def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
+    """Directions of pixels whose ray parameter is the depth as defined in `Frame`."""
     w, fisheye = camera.width, camera.model == "fisheye"
     if w * camera.height <= _SHARED:
-        return (pixel_rays(camera) if fisheye else _pinhole_rays(camera))[first * w : last * w]
-    pixels = np.stack(np.meshgrid(np.arange(w), np.arange(first, last)), axis=-1).reshape(-1, 2)
-    rays = unproject(camera, pixels)
+        return (pixel_rays(camera) if fisheye else _pinhole_rays(camera))[pixels]
+    number = np.arange(pixels.start, pixels.stop) if isinstance(pixels, slice) else pixels
+    rays = unproject(camera, np.stack([number % w, number // w], axis=-1))
     return rays if fisheye else rays / rays[:, 2:]
 
 
@@ -451,11 +514,10 @@ def optical_flow(
     end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
     view = _view(
         camera,
-        poses,
+        slice(0, camera.width * camera.height),
+        poses=poses,
         world=world,
         sample=0,
-        first=0,
-        last=camera.height,
         times=start,
         options=RenderOptions(),
     )

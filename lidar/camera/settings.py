@@ -14,13 +14,14 @@ from lidar.rig.specs import CameraSpec
 
 @dataclass(frozen=True, slots=True)
 class CameraSettings:
-    """Settings of images. The defaults are a camera without noise and one ray per pixel.
+    """Settings of images. The defaults are a camera without noise, and one ray per pixel but four at edges.
 
     precision    : of the depths of pixels, of `lidar.raycast.PRECISIONS`
     retrace      : trace pixels that miss a second time, as rays towards a vertex may pass between faces
     shadows      : the sun casts shadows
     detail       : windows, joints and grain are drawn on surfaces of uniform colour
     supersample  : rays along each side of a pixel, for colour: 1 to 16
+    edge_rays    : the same for pixels at edges (`lidar.camera.edges`), where it is more than ``supersample``
     blur         : samples of the exposure (the camera's ``exposure_ns``) that are averaged: motion blur
     haze         : distance in metres at which haze removes 98 % of contrast; inf for clear air
     cloud        : share of the sky that clouds cover, 0 to 1; overcast light casts no shadows
@@ -32,6 +33,7 @@ class CameraSettings:
     shadows: bool = True
     detail: bool = True
     supersample: int = 1
+    edge_rays: int = 2
     blur: int = 5
     haze: float = 20_000.0
     cloud: float = 0.0
@@ -44,6 +46,8 @@ class CameraSettings:
             faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
         if not 1 <= self.supersample <= 16:
             faults.append(f"supersample={self.supersample}: give 1 to 16")
+        if not 1 <= self.edge_rays <= 16:
+            faults.append(f"edge_rays={self.edge_rays}: give 1 to 16")
         if not 1 <= self.blur <= 64:
             faults.append(f"blur={self.blur}: give 1 to 64")
         if not self.haze > 0:
@@ -65,6 +69,7 @@ class CameraSettings:
             shadows=self.shadows,
             detail=self.detail,
             supersample=self.supersample,
+            edge_rays=self.edge_rays,
             visibility=self.haze,
             cloud=self.cloud,
             exposure=camera.exposure_ev,

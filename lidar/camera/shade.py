@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.typing import Float
-from lidar.camera import texture
+from lidar.camera import ground_texture, texture
 from lidar.camera.facades import PAINT, windows
+from lidar.camera.ground_texture import HIGHEST, LOWEST, ground
 from lidar.camera.texture import detail, grain, hashed, noise
 
 Single = NDArray[np.float32]
 
-_BUILDING = int(Class.BUILDING)
+_BUILDING, _MARKING = int(Class.BUILDING), int(Class.LANE_MARKING)
+_ASPHALT = ground_texture.ASPHALT
 
 compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 
@@ -37,17 +39,22 @@ _MIRROR = {"water": 0.02, "glass": 0.08, "car_paint": 0.04, "metal": 0.15, "rail
 
 
 @functools.cache
-def material_tables() -> tuple[NDArray[np.uint8], Float, NDArray[np.uint8], Float]:
-    """Detail kind, specular reflectance at normal incidence, colour, factor of soaked albedo, by material."""
+def material_tables() -> tuple[NDArray[np.uint8], NDArray[np.uint8], Float, NDArray[np.uint8], Float]:
+    """Kind of detail, kind of ground, specular reflectance at normal incidence, colour, factor when soaked.
+
+    All are by material code, (256,) or (256, 3); the last is a factor of the albedo.
+    """
     kind, mirror, plain = np.zeros(256, np.uint8), np.zeros(256), np.zeros((256, 3), np.uint8)
-    soaked = np.ones(256)
+    soaked, floor = np.ones(256), np.zeros(256, np.uint8)
     kinds = {name: kind for kind, names in _KINDS.items() for name in names}
+    floors = {name: kind for kind, names in ground_texture.MATERIALS.items() for name in names}
     for name, material in materials().items():
         kind[material.code] = kinds.get(name, texture.PLAIN)
+        floor[material.code] = floors.get(name, ground_texture.BARE)
         mirror[material.code] = _MIRROR.get(name, 0.0)
         plain[material.code] = material.color
         soaked[material.code] = material.wet
-    return kind, mirror, plain, soaked
+    return kind, floor, mirror, plain, soaked
 
 
 @functools.cache
@@ -56,6 +63,9 @@ def linear_table() -> Float:
     s = np.arange(256) / 255
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
+
+_LEVEL = 0.7
+"""Least vertical part of the normal of ground that is textured as such; steeper ground has other detail."""
 
 _SNOW = np.array([0.80, 0.83, 0.87])
 """Albedo of snow, red, green and blue; 0.75 to 0.9 when fresh, typical value."""
@@ -230,7 +240,7 @@ def shade(
     walls: tuple[Float, Float, Float, Float],
     lit: NDArray[np.bool_],
     light: tuple[Float, Float, Float, Float, Float],
-    tables: tuple[NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
+    tables: tuple[NDArray[np.uint8], NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
     settings: tuple[float, float, float, bool],
     covers: tuple[float, float, float, float],
     out: Single,
@@ -251,7 +261,7 @@ def shade(
     """
     tangent, along, height, style = walls
     sun, beam, ambient, sky, horizon = light
-    kinds, mirrors, plain, soaked, linear = tables
+    kinds, floors, mirrors, plain, soaked, linear = tables
     blur, angle, extinction, detailed = settings
     wetness, pools, snow, patches = covers
     glow = np.empty(3)
@@ -293,7 +303,15 @@ def shade(
             flat = math.sqrt(nx * nx + ny * ny)
             u = (y * nx - x * ny) / flat
 
-        factor = detail(kind, upright, x, y, z, u, footprint) if detailed else 1.0
+        factor = 1.0
+        if detailed and nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kind != texture.LIQUID:
+            flat = math.sqrt(d[0] * d[0] + d[1] * d[1])
+            hx, hy = (d[0] / flat, d[1] / flat) if flat > 1e-9 else (1.0, 0.0)
+            painted = klass[i] == _MARKING
+            floor = _ASPHALT if painted else floors[m]
+            factor = ground(floor, painted, x, y, hx, hy, size, size / max(cosine, 0.02))
+        elif detailed:
+            factor = detail(kind, upright, x, y, z, u, footprint)
         for c in range(3):
             albedo[c] = linear[color[i, c]] * factor
         if detailed and klass[i] == _BUILDING:

@@ -114,16 +114,20 @@ def pixels(
 ) -> Pixels:
     """Blocks of a frame, of its coarse camera: ``BLOCK / resolution`` pixels wide."""
     spec, size = coarse(shot.camera.spec, resolution), BLOCK // resolution
-    frames = []
+    # Whether a pixel is at an edge depends on its neighbours.
+    beside = int(settings.edge_rays > settings.supersample)
+    rgb, depth, klass = [], [], []
     for left, top in (blocks // resolution).tolist():
-        window = replace(spec, width=size, height=size, cx=spec.cx - left, cy=spec.cy - top)
-        frames.append(_rendered(shot, window, world=world, settings=settings, top=top))
-    black = np.zeros((size, size, 3), np.uint8)
-    return Pixels(
-        np.stack([black if f.rgb is None else f.rgb for f in frames]),
-        np.stack([f.depth for f in frames]),
-        np.stack([f.klass for f in frames]),
-    )
+        x, y = max(left - beside, 0), max(top - beside, 0)
+        width = min(left + size + beside, spec.width) - x
+        height = min(top + size + beside, spec.height) - y
+        window = replace(spec, width=width, height=height, cx=spec.cx - x, cy=spec.cy - y)
+        frame = _rendered(shot, window, world=world, settings=settings, top=y)
+        own = np.s_[top - y : top - y + size, left - x : left - x + size]
+        rgb.append(np.zeros((size, size, 3), np.uint8) if frame.rgb is None else frame.rgb[own])
+        depth.append(frame.depth[own])
+        klass.append(frame.klass[own])
+    return Pixels(np.stack(rgb), np.stack(depth), np.stack(klass))
 
 
 def _rendered(shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSettings, top: int = 0) -> Frame:

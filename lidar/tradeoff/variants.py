@@ -28,6 +28,7 @@ SCANNER_VALUES: dict[str, tuple[Any, ...]] = {
 
 CAMERA_VALUES: dict[str, tuple[Any, ...]] = {
     "supersample": (1, 2, 3, 4),
+    "edge_rays": (1, 2, 3),
     "blur": (1, 5, 9, 17),
     "shadows": (True, False),
     "detail": (True, False),

@@ -9,6 +9,7 @@ from helpers.sensor_worlds import MeshWorld, box, plate, world
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import ROOF, WALL, Mesh, concatenate
+from lidar.camera.edges import edge_pixels
 from lidar.camera.facades import FLOORS, facades_of
 from lidar.camera.png import encode_png
 from lidar.camera.render import RenderOptions, exposure_times, optical_flow, render
@@ -21,7 +22,7 @@ from lidar.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 
 CAMERA = CameraSpec("c", Mount(), 160, 120, 100.0, 100.0, 79.5, 59.5)
-FLAT = RenderOptions(detail=False, visibility=np.inf)
+FLAT = RenderOptions(detail=False, visibility=np.inf, edge_rays=1)
 NOON = (0.0, -1.0, 1.0)  # half way up in the south
 
 
@@ -249,6 +250,36 @@ def test_supersampling_softens_edges_and_keeps_labels():
     assert abs(a.mean() - b.mean()) < 1.5
     # A step taken in two halves has half the energy.
     assert (np.diff(b, axis=1) ** 2).mean() < 0.8 * (np.diff(a, axis=1) ** 2).mean()
+
+
+def test_rays_at_edges_alone_come_close_to_rays_everywhere():
+    town, poses = street(), looking(yaw=0.2)
+
+    def shot(**rays):
+        options = replace(FLAT, **rays)
+        return render(CAMERA, poses, world=town, sun=NOON, options=options).rgb.astype(float)
+
+    one, few, all_ = shot(), shot(edge_rays=2), shot(supersample=2)
+    changed = (one != few).any(axis=2)
+    assert 0 < changed.mean() < 0.25
+    np.testing.assert_array_equal(few[changed], all_[changed])
+    assert ((few - all_) ** 2).mean() < 0.1 * ((one - all_) ** 2).mean()
+    np.testing.assert_array_equal(shot(supersample=2, edge_rays=2), all_)
+
+
+def test_an_edge_lies_between_objects_of_other_colour_or_strong_contrast_on_one():
+    rgb = np.full((1, 6, 3), 100, np.uint8)
+    rgb[0, 3:] += 20
+    rgb[0, 5] += 60
+    one, klass = np.zeros((1, 6), np.int32), np.full((1, 6), int(Class.ROAD), np.uint8)
+    assert edge_pixels(rgb, one, klass=klass).tolist() == [4, 5]
+    two = one.copy()
+    two[0, 3:] = 1
+    assert edge_pixels(rgb, two, klass=klass).tolist() == [2, 3, 4, 5]
+    assert edge_pixels(np.full_like(rgb, 100), two, klass=klass).tolist() == []
+    outside = np.where(np.arange(6) >= 5, int(Class.UNLABELED), klass).astype(np.uint8)
+    nowhere = np.where(np.arange(6) >= 5, -1, one).astype(np.int32)
+    assert edge_pixels(rgb, nowhere, klass=outside).tolist() == []
 
 
 def test_a_rolling_shutter_slants_an_upright_edge():
@@ -482,7 +513,7 @@ def test_night_is_dark_but_not_empty():
 
 
 def test_options_out_of_range_are_refused():
-    for bad in ({"supersample": 0}, {"visibility": 0.0}, {"threads": 0}):
+    for bad in ({"supersample": 0}, {"edge_rays": 17}, {"visibility": 0.0}, {"threads": 0}):
         with pytest.raises(InputError):
             RenderOptions(**bad)
 

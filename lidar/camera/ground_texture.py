@@ -1,0 +1,277 @@
+"""Procedural texture of level ground: patches, cracks, stains, joints and stones. Compiled, per pixel.
+
+As in `lidar.camera.texture`, everything is a hash of places in the scene. What a pixel covers on the ground
+is long and thin, so each feature is filtered along and across the line of sight, and fades to its mean where
+it is finer than a pixel. The mean of each texture is 1: it changes no surface's mean albedo.
+"""
+
+# mypy: disallow-untyped-decorators=False
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from geoscene.classes import Class
+from lidar.camera.texture import compiled, hashed, joints, noise, pulses
+
+BARE, ASPHALT, CONCRETE, PAVING, SETTS, LOOSE, GREEN = range(7)
+"""Kinds of ground: without texture; asphalt; concrete; paving stones; setts; gravel, sand and soil; grass."""
+
+MATERIALS = {
+    ASPHALT: ("asphalt", "asphalt_fresh"),
+    CONCRETE: ("concrete",),
+    PAVING: ("paving", "brick"),
+    SETTS: ("stone",),
+    LOOSE: ("gravel", "soil", "sand", "ballast"),
+    GREEN: ("grass", "dry_grass"),
+}
+
+LOWEST, HIGHEST = int(Class.ROAD), int(Class.BUILDING_PAD)
+"""Classes from and up to which level surfaces are ground; road markings are among them."""
+
+_PAINT_KEPT = 0.35
+"""Share of the texture of the road that shows on its paint."""
+
+# For each kind: amplitude and size in metres of three octaves of noise. Standard deviations are a third of
+# the amplitudes. All numbers here are assumed.
+_OCTAVES = np.array(
+    [
+        [[0.0, 1.0], [0.0, 1.0], [0.0, 1.0]],
+        [[0.18, 2.6], [0.28, 0.33], [0.40, 0.055]],
+        [[0.10, 2.1], [0.14, 0.35], [0.20, 0.05]],
+        [[0.10, 2.3], [0.14, 0.30], [0.18, 0.05]],
+        [[0.10, 2.7], [0.12, 0.40], [0.30, 0.045]],
+        [[0.25, 1.9], [0.30, 0.26], [0.65, 0.07]],
+        [[0.30, 1.9], [0.42, 0.37], [0.60, 0.085]],
+    ]
+)
+
+# Spots, of two sizes for each kind: side in metres of the squares of which a share has one, that share, least
+# and greatest radius in metres, factors of the albedo of dark and of light ones, and the share of dark ones:
+# oil, tar and chewing gum; paint, pebbles and worn places; tufts and bare earth.
+_SPOTS = np.array(
+    [
+        [[1.0, 0.0, 0.1, 0.1, 1.0, 1.0, 1.0], [1.0, 0.0, 0.1, 0.1, 1.0, 1.0, 1.0]],
+        [[0.45, 0.55, 0.012, 0.05, 0.40, 2.0, 0.65], [1.40, 0.60, 0.06, 0.24, 0.50, 1.45, 0.7]],
+        [[0.40, 0.65, 0.012, 0.04, 0.45, 1.25, 0.8], [1.70, 0.50, 0.06, 0.24, 0.70, 1.15, 0.8]],
+        [[0.40, 0.65, 0.012, 0.04, 0.45, 1.25, 0.8], [1.70, 0.50, 0.06, 0.24, 0.70, 1.15, 0.8]],
+        [[0.50, 0.30, 0.012, 0.04, 0.50, 1.30, 0.8], [1.70, 0.40, 0.06, 0.26, 0.65, 1.20, 0.8]],
+        [[0.30, 0.70, 0.015, 0.05, 0.50, 1.60, 0.5], [1.30, 0.50, 0.08, 0.30, 0.70, 1.30, 0.5]],
+        [[0.35, 0.70, 0.020, 0.07, 0.50, 1.60, 0.6], [1.40, 0.60, 0.09, 0.35, 0.60, 1.40, 0.6]],
+    ]
+)
+
+_PATCH = 7.3
+"""Side in metres of the squares of which `_PATCHED` have a patch of other asphalt with a sealed edge."""
+_PATCHED = 0.40
+_PATCH_LONG, _PATCH_WIDE = (0.7, 1.9), (0.35, 0.9)
+_PATCH_DARK, _PATCH_LIGHT = 0.66, 1.28
+_SEAL, _SEALED = 0.025, 0.55
+
+_CRACK_DARK = 0.40
+_CRACK = 0.030
+"""Greatest width of a crack in metres, sealed with bitumen or not."""
+_CRACK_SHARE = np.array([0.0, 0.0062, 0.0033, 0.0, 0.0, 0.0, 0.0])
+"""Share of the ground that lies in cracks, by kind: means over 400 by 400 m."""
+_CRACK_FROM = np.array([2.0, 0.00, 0.25, 2.0, 2.0, 2.0, 2.0])
+"""Level of the noise above which ground is cracked, by kind; 1 is its maximum."""
+
+_SLAB_CONCRETE, _SLAB_PAVING = 2.4, 0.6
+_SETT_LONG, _SETT_WIDE, _SETT_JOINT = 0.17, 0.11, 0.014
+_JOINT_DARK, _SETT_DARK = 0.45, 0.55
+
+
+@compiled
+def _octave(
+    x: float, y: float, hx: float, hy: float, size: float, across: float, along: float, k: int
+) -> float:
+    """Noise of one size, averaged over the footprint of a pixel by up to five samples along it."""
+    fade = 2.0 - 2.0 * across / size
+    if fade <= 0.0:
+        return 0.0
+    n = min(int(1.6 * along / size) + 1, 5)
+    fade = min(fade, 1.0, 2.0 - along / (n * size))
+    if fade <= 0.0:
+        return 0.0
+    total = 0.0
+    for i in range(n):
+        step = ((i + 0.5) / n - 0.5) * along
+        total += noise((x + step * hx) / size, (y + step * hy) / size, k)
+    return fade * total / n
+
+
+@compiled
+def _within(d: float, half: float, width: float) -> float:
+    """Share of a footprint of some width about d that lies between -half and half."""
+    low, high = max(d - 0.5 * width, -half), min(d + 0.5 * width, half)
+    return max(high - low, 0.0) / width
+
+
+@compiled
+def _spots(
+    x: float, y: float, hx: float, hy: float, across: float, along: float, kind: int, which: int
+) -> float:
+    """Factor of the spots of one size; its mean is 1."""
+    cell, chance, least, most = (
+        _SPOTS[kind, which, 0],
+        _SPOTS[kind, which, 1],
+        _SPOTS[kind, which, 2],
+        _SPOTS[kind, which, 3],
+    )
+    dark, light, share = _SPOTS[kind, which, 4], _SPOTS[kind, which, 5], _SPOTS[kind, which, 6]
+    # The mean share of ground under spots, of radii evenly distributed from the least to the greatest.
+    covered = chance * math.pi * (least * least + least * most + most * most) / (3.0 * cell * cell)
+    mean = 1.0 + covered * (share * dark + (1.0 - share) * light - 1.0)
+    fade = min(2.0 - 2.0 * across / most, 2.0 - 2.0 * along / cell, 1.0)
+    if fade <= 0.0:
+        return 1.0
+    i, j = math.floor(x / cell), math.floor(y / cell)
+    tone = 1.0
+    if hashed(i, j, 60 + which) < chance:
+        r = least + (most - least) * hashed(i, j, 62 + which)
+        free = 0.5 - 1.3 * r / cell
+        dx = x - (i + 0.5 + free * (2.0 * hashed(i, j, 64 + which) - 1.0)) * cell
+        dy = y - (j + 0.5 + free * (2.0 * hashed(i, j, 66 + which) - 1.0)) * cell
+        d = math.sqrt(dx * dx + dy * dy)
+        if d < 1.3 * r + along:
+            if which:
+                # Stains have no round outline; the mean of their area is that of the circle.
+                r *= 1.0 + 0.3 * noise(x / (0.7 * r), y / (0.7 * r), 68)
+            nx, ny = (dx / d, dy / d) if d > 1e-9 else (1.0, 0.0)
+            forward, aside = abs(nx * hx + ny * hy), abs(nx * hy - ny * hx)
+            width = max(forward * along + aside * across, 1e-3)
+            other = max(aside * along + forward * across, 1e-3)
+            cover = _within(d, r, width) * min(2.0 * r / other, 1.0)
+            own = dark if hashed(i, j, 69 + which) < share else light
+            tone = 1.0 + cover * (own - 1.0)
+    factor = 1.0 + fade * (tone / mean - 1.0)
+    return float(factor)
+
+
+@compiled
+def _patch(x: float, y: float, hx: float, hy: float, across: float, along: float) -> float:
+    """Factor of rectangular patches of darker or lighter asphalt with sealed edges; its mean is about 1."""
+    long, wide = 0.5 * (_PATCH_LONG[0] + _PATCH_LONG[1]), 0.5 * (_PATCH_WIDE[0] + _PATCH_WIDE[1])
+    inside = _PATCHED * 4.0 * long * wide / (_PATCH * _PATCH)
+    edges = _PATCHED * 8.0 * _SEAL * (long + wide) / (_PATCH * _PATCH)
+    mean = 1.0 + inside * (0.5 * (_PATCH_DARK + _PATCH_LIGHT) - 1.0) + edges * (_SEALED - 1.0)
+    i, j = math.floor(x / _PATCH), math.floor(y / _PATCH)
+    tone = 1.0
+    if hashed(i, j, 70) < _PATCHED:
+        a = _PATCH_LONG[0] + (_PATCH_LONG[1] - _PATCH_LONG[0]) * hashed(i, j, 71)
+        b = _PATCH_WIDE[0] + (_PATCH_WIDE[1] - _PATCH_WIDE[0]) * hashed(i, j, 72)
+        free = 0.5 - math.sqrt(a * a + b * b) / _PATCH
+        dx = x - (i + 0.5 + free * (2.0 * hashed(i, j, 73) - 1.0)) * _PATCH
+        dy = y - (j + 0.5 + free * (2.0 * hashed(i, j, 74) - 1.0)) * _PATCH
+        turn = math.pi * hashed(i, j, 75)
+        c, s = math.cos(turn), math.sin(turn)
+        u, v = c * dx + s * dy, c * dy - s * dx
+        p, q = abs(c * hx + s * hy), abs(c * hy - s * hx)
+        wide_u, wide_v = max(p * along + q * across, 1e-3), max(q * along + p * across, 1e-3)
+        if abs(u) < a + _SEAL + 0.5 * wide_u and abs(v) < b + _SEAL + 0.5 * wide_v:
+            outer = _within(u, a + _SEAL, wide_u) * _within(v, b + _SEAL, wide_v)
+            inner = _within(u, a - _SEAL, wide_u) * _within(v, b - _SEAL, wide_v)
+            factor = _PATCH_DARK if hashed(i, j, 76) < 0.5 else _PATCH_LIGHT
+            tone = 1.0 + inner * (factor - 1.0) + (outer - inner) * (_SEALED - 1.0)
+    return tone / mean
+
+
+@compiled
+def _slope(x: float, y: float, k: int) -> tuple[float, float, float]:
+    """`lidar.camera.texture.noise` and its derivatives."""
+    i, j = math.floor(x), math.floor(y)
+    s, t = x - i, y - j
+    u, v = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
+    du, dv = 6.0 * s * (1.0 - s), 6.0 * t * (1.0 - t)
+    p, q, r, w = hashed(i, j, k), hashed(i + 1, j, k), hashed(i, j + 1, k), hashed(i + 1, j + 1, k)
+    low, high = p + u * (q - p), r + u * (w - r)
+    return (
+        2.0 * (low + v * (high - low)) - 1.0,
+        2.0 * du * ((q - p) + v * ((w - r) - (q - p))),
+        2.0 * dv * (high - low),
+    )
+
+
+@compiled
+def cracked(x: float, y: float, hx: float, hy: float, across: float, along: float, kind: int) -> float:
+    """Share of a footprint in cracks: the zeros of a noise, where another one says that ground is worn."""
+    if across > 2.0 * _CRACK:
+        return 0.0
+    worn = noise(x / 9.0, y / 9.0, 80) + 0.4 * noise(x / 2.7, y / 2.7, 81) - _CRACK_FROM[kind]
+    if worn <= 0.0:
+        return 0.0
+    f, fx, fy = _slope(x / 2.3, y / 2.3, 82)
+    g, gx, gy = _slope(x / 0.55, y / 0.55, 83)
+    f += 0.35 * g
+    fx, fy = fx / 2.3 + 0.35 * gx / 0.55, fy / 2.3 + 0.35 * gy / 0.55
+    steep = max(math.sqrt(fx * fx + fy * fy), 0.3)
+    d = abs(f) / steep
+    wide = _CRACK * min(2.5 * worn, 1.0)
+    if d > wide + along:
+        return 0.0
+    nx, ny = fx / steep, fy / steep
+    width = max(abs(nx * hx + ny * hy) * along + abs(nx * hy - ny * hx) * across, 1e-3)
+    return _within(d, 0.5 * wide, width)
+
+
+@compiled
+def _slabs(x: float, y: float, side: float, footprint: float) -> float:
+    """Factor of square slabs of several tones with dark joints; its mean is 1."""
+    joint = 0.014
+    tone = 1.0
+    if footprint < side:
+        tone += 0.2 * (1.0 - footprint / side) * (hashed(math.floor(x / side), math.floor(y / side), 5) - 0.5)
+    share = 2.0 * joint / side - (joint / side) ** 2
+    return tone * (1.0 - _JOINT_DARK * joints(x, y, side, joint, footprint)) / (1.0 - _JOINT_DARK * share)
+
+
+@compiled
+def _setts(x: float, y: float, footprint: float) -> float:
+    """Factor of setts in shifted rows, each of its own tone, with dark joints; its mean is 1."""
+    row = math.floor(y / _SETT_WIDE)
+    shifted = x + _SETT_LONG * hashed(row, 0, 84)
+    tone = 1.0
+    if footprint < _SETT_WIDE:
+        stone = hashed(math.floor(shifted / _SETT_LONG), row, 85) - 0.5
+        tone += 0.6 * (1.0 - footprint / _SETT_WIDE) * stone
+    a, b = _SETT_JOINT / _SETT_LONG, _SETT_JOINT / _SETT_WIDE
+    share = a + b - a * b
+    if footprint > _SETT_WIDE:
+        return tone
+    u = pulses(shifted + 0.5 * _SETT_LONG, _SETT_LONG, _SETT_JOINT, footprint)
+    v = pulses(y + 0.5 * _SETT_WIDE, _SETT_WIDE, _SETT_JOINT, footprint)
+    return tone * (1.0 - _SETT_DARK * (u + v - u * v)) / (1.0 - _SETT_DARK * share)
+
+
+@compiled
+def ground(
+    kind: int, painted: bool, x: float, y: float, hx: float, hy: float, across: float, along: float
+) -> float:
+    """Factor around 1, with mean 1, on the albedo of level ground at scene point (x, y).
+
+    painted : on the paint of a road, which wears with what is below it
+    hx, hy  : horizontal unit vector along the line of sight
+    across, along : width and length in metres of what a pixel covers
+    """
+    if kind == BARE:
+        return 1.0
+    tone = 1.0
+    for k in range(3):
+        amplitude, size = _OCTAVES[kind, k, 0], _OCTAVES[kind, k, 1]
+        tone += amplitude * _octave(x, y, hx, hy, size, across, along, 50 + 8 * k + kind)
+    tone *= _spots(x, y, hx, hy, across, along, kind, 0)
+    tone *= _spots(x, y, hx, hy, across, along, kind, 1)
+    footprint = math.sqrt(across * along)
+    if kind == ASPHALT:
+        tone *= _patch(x, y, hx, hy, across, along)
+    elif kind == CONCRETE:
+        tone *= _slabs(x, y, _SLAB_CONCRETE, footprint)
+    elif kind == PAVING:
+        tone *= _slabs(x, y, _SLAB_PAVING, footprint)
+    elif kind == SETTS:
+        tone *= _setts(x, y, footprint)
+    if _CRACK_SHARE[kind] > 0.0:
+        share = cracked(x, y, hx, hy, across, along, kind)
+        tone *= (1.0 - (1.0 - _CRACK_DARK) * share) / (1.0 - (1.0 - _CRACK_DARK) * _CRACK_SHARE[kind])
+    return 1.0 + _PAINT_KEPT * (tone - 1.0) if painted else tone
