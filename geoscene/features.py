@@ -25,8 +25,13 @@ def _columns(table: Any, names: str, **computed: NDArray[Any]) -> dict[str, NDAr
     return {name: computed[name] if name in computed else getattr(table, name) for name in names.split()}
 
 
-def building_layers(buildings: Buildings, base: NDArray[np.float64]) -> list[Layer]:
-    """Layers ``buildings`` and ``building_parts``; ``base`` (n,) is z of each building's base in metres."""
+def building_layers(
+    buildings: Buildings, base: NDArray[np.float64], *, parapet: NDArray[np.float64] | None = None
+) -> list[Layer]:
+    """Layers ``buildings`` and ``building_parts``; ``base`` (n,) is z of each building's base in metres.
+
+    parapet : (n,) metres, guessed heights of the parapets of all rows; no column by default
+    """
     columns = _columns(
         buildings,
         "osm_id use name base height height_source height_sigma min_height min_height_source levels"
@@ -35,6 +40,9 @@ def building_layers(buildings: Buildings, base: NDArray[np.float64]) -> list[Lay
         wall_material=material_names(buildings.wall_material),
         roof_material=material_names(buildings.roof_material),
     )
+    if parapet is not None:
+        columns["parapet"] = parapet
+        columns["parapet_source"] = np.where(parapet > 0, "guess", "")
     layers = []
     for name, rows in (
         ("buildings", slice(0, buildings.count)),

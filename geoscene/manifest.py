@@ -171,15 +171,19 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
 def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
     """What the scene has for its relief, by kind and source."""
     furniture = plan.furniture
-    parts = Counter[str]()
+    parts, roofs = Counter[str](), Counter[str]()
     for report in reports:
         parts.update(report.guessed)
+        roofs.update(report.roofs)
+    if plan.rooftops is not None:
+        roofs["parapet"] = int((plan.rooftops.parapet > 0).sum())
     return {
         "habits": _tally(plan.trees.habit),
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
         "parts_guessed": dict(sorted(parts.items())),
+        "roofs_guessed": dict(sorted(roofs.items())),
     }
 
 

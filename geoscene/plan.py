@@ -47,6 +47,7 @@ from geoscene.objects.furniture import (
     mapped_furniture,
     read_furniture,
 )
+from geoscene.objects.rooftops import Rooftops, plan_rooftops
 from geoscene.objects.sidewalks import with_details, with_guesses
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import Taken, guess_furniture
@@ -117,6 +118,7 @@ class Plan:
     use       : what of the scene is written
     relief    : of surfaces, of `geoscene.options.RELIEFS`
     facades   : what the openings of walls depend on; None without relief
+    rooftops  : what stands on roofs; None without full relief
     layers    : feature tables in the order of feature numbers; those of objects and surfaces far from a route
                 are not complete
     ranges    : range [start, stop) of the feature numbers of each table
@@ -146,6 +148,7 @@ class Plan:
     use: Use
     relief: str
     facades: Setting | None
+    rooftops: Rooftops | None
     layers: list[Layer]
     ranges: dict[str, tuple[int, int]]
     chosen: list[tuple[int, int]]
@@ -224,8 +227,11 @@ def make_plan(
     )
     buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures))
 
+    rooftops = None
+    if options.relief == "full":
+        rooftops = plan_rooftops(buildings, centre=_checked_centre(osm))
     layers = [
-        *building_layers(buildings, base),
+        *building_layers(buildings, base, parapet=None if rooftops is None else rooftops.parapet),
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
@@ -262,6 +268,7 @@ def make_plan(
         use=USES[options.use],
         relief=options.relief,
         facades=facades,
+        rooftops=rooftops,
         layers=layers,
         ranges=local.ranges,
         area=area,

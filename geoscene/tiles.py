@@ -27,6 +27,7 @@ from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.forests import forest_tree_count
 from geoscene.objects.furniture import furniture_instances
+from geoscene.objects.rooftops import roof_objects
 from geoscene.objects.vegetation import tree_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
@@ -52,21 +53,19 @@ _SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "
 class TileReport:
     """Contents of a tile.
 
-        solids     : number of closed solids, buildings included
-        watertight : number of solids that passed the check
-        buildings  : number of building solids
-        faces      : number of faces
-        instances  : number of instances of shapes, those of forests included
-        forest_trees : number of trees of forests
-        area       : plan area of the ground in square metres
-        water      : plan area of the water on it
-        digest     : digest of the tile's file
-        problems   : buildings that were simplified, and features that were dropped
-    <<<<<<< HEAD
-        facades    : openings of walls by what they are; empty without relief
-    =======
-        guessed    : number of guessed parts by kind, those of buildings aside
-    >>>>>>> 09cdab2 (Give tunnels a lining, walkways, niches and equipment in scenes with relief)
+    solids     : number of closed solids, buildings included
+    watertight : number of solids that passed the check
+    buildings  : number of building solids
+    faces      : number of faces
+    instances  : number of instances of shapes, those of forests included
+    forest_trees : number of trees of forests
+    area       : plan area of the ground in square metres
+    water      : plan area of the water on it
+    digest     : digest of the tile's file
+    problems   : buildings that were simplified, and features that were dropped
+    facades    : openings of walls by what they are; empty without relief
+    guessed    : number of guessed parts by kind, those of buildings aside
+    roofs      : what stands on roofs by shape; empty without full relief
     """
 
     i: int
@@ -83,10 +82,11 @@ class TileReport:
     problems: tuple[Problem, ...]
     facades: dict[str, int] = field(default_factory=dict)
     guessed: dict[str, int] = field(default_factory=dict)
+    roofs: dict[str, int] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """The report as a JSON object, without empty tables of relief."""
-        relief = ("facades", "guessed")
+        relief = ("facades", "guessed", "roofs")
         return {name: value for name, value in asdict(self).items() if name not in relief or value}
 
 
@@ -107,7 +107,12 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
 
     def solids(rows: Ints) -> tuple[Mesh, list[Problem]]:
         chosen = take_buildings(plan.buildings, rows, parts=parts[np.isin(of_parts, rows)])
-        mesh, found = build_solids(chosen, base=plan.base[rows], foot=plan.foot[rows], lod=lod)
+        parapet = None
+        if plan.rooftops is not None:
+            parapet = plan.rooftops.parapet[np.concatenate([rows, parts[np.isin(of_parts, rows)]])]
+        mesh, found = build_solids(
+            chosen, base=plan.base[rows], foot=plan.foot[rows], lod=lod, parapet=parapet
+        )
         return replace(mesh, feature=rows[mesh.feature].astype(np.int32)), found
 
     def failed(row: int, error: Exception) -> None:
@@ -195,7 +200,9 @@ def build_tile(
         file, report = former
         old, guessed = read_tile(file), report.guessed
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
-        origin, rest, copies = old.origin, old.mesh.take(~is_building), old.instances
+        origin, rest = old.origin, old.mesh.take(~is_building)
+        of = old.instances.feature
+        copies = old.instances.take((of < 0) | (of >= plan.buildings.count))  # without those on roofs
     else:
         around = make_ground(plan, tile)
         ground, copies, guessed = around.mesh, around.instances, dict(sorted(around.guessed.items()))
@@ -205,6 +212,8 @@ def build_tile(
         # Without unused vertices, as when the ground is taken from a former scene.
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
+    on_roofs, roofs = _roof_objects(plan, solids, lod=lod, problems=problems)
+    copies = Instances.concatenate([copies, on_roofs.shifted(-origin)])
     mesh = concatenate([solids.shifted(-origin), rest])
     if not plan.use.colors:
         mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
@@ -233,7 +242,31 @@ def build_tile(
         tuple(problems),
         counts,
         guessed,
+        roofs,
     )
+
+
+def _roof_objects(
+    plan: Plan, solids: Mesh, *, lod: int, problems: list[Problem]
+) -> tuple[Instances, dict[str, int]]:
+    """What stands on the roofs of a tile's buildings, scene metres, and its number by shape."""
+    none = Instances.empty()
+    if plan.rooftops is None or lod < 2:
+        return none, {}
+    rooftops = plan.rooftops
+
+    def failed(row: int, error: Exception) -> None:
+        problems.append(unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
+
+    made = make_without_failures(
+        lambda rows: roof_objects(solids.take(np.isin(solids.feature, rows)), rooftops),
+        np.unique(solids.feature).astype(np.int64),
+        failed=failed,
+    )
+    counts: Counter[str] = Counter()
+    for _, some in made:
+        counts.update(some)
+    return Instances.concatenate([none, *(copies for copies, _ in made)]), dict(sorted(counts.items()))
 
 
 def _plan_area(mesh: Mesh) -> float:

@@ -11,10 +11,14 @@ from numpy.typing import NDArray
 from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
+from geoscene.buildings.table import GRID
 from geoscene.columns import Columns
 from geoscene.mesh import FLOOR, ROOF, WALL
 from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import edge_uses, weld
+
+PARAPET = 0.25
+"""Metres, thickness of a parapet: a brick and coping."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,3 +118,34 @@ def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Trian
     floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
     shells = close(top, floor, underside=to_grid(low))
     return Triangles(shells.corners, piece[shells.piece], shells.surface)
+
+
+def parapets(polygons: Polygons, piece: Ints, *, low: Float, high: Float, rise: Float) -> Triangles:
+    """As `prisms`, with parapets along the edges of the flat tops, `PARAPET` wide and ``rise`` (n,) high.
+
+    A polygon so narrow that no roof is left between its parapets becomes a prism.
+    """
+    inner = shapely.set_precision(shapely.buffer(polygons, -PARAPET, join_style="mitre"), GRID)
+    rim = shapely.difference(polygons, inner)
+    fits = (
+        (shapely.area(inner) > 0.3 * shapely.area(polygons)) & shapely.is_valid(rim) & shapely.is_valid(inner)
+    )
+    plain = np.flatnonzero(~fits)
+    shells = [prisms(polygons[plain], piece[plain], low=low[plain], high=high[plain])]
+    rows = np.flatnonzero(fits)
+    low, high, top = (to_grid(z[rows]) for z in (low, high, high + rise))
+    roof, of_roof = triangulate(inner[rows])
+    cap, of_cap = triangulate(rim[rows])
+    base, of_base = triangulate(polygons[rows])
+    edge, of_edge = boundary(lift(roof, high[of_roof]), of_roof)
+    a, b = edge[:, 0], edge[:, 1]
+    a1, b1 = a.copy(), b.copy()
+    a1[:, 2] = b1[:, 2] = top[of_edge]
+    inside = np.concatenate([np.stack([b, a, a1], axis=1), np.stack([b, a1, b1], axis=1)])
+    corners = np.concatenate([lift(roof, high[of_roof]), lift(cap, top[of_cap]), inside])
+    owner = np.concatenate([of_roof, of_cap, of_edge, of_edge])
+    upper = Triangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
+    floor = Triangles(lift(base, low[of_base]), of_base, np.full(len(base), FLOOR, np.uint8))
+    made = close(upper, floor, underside=low)
+    shells.append(Triangles(made.corners, piece[rows][made.piece], made.surface))
+    return Triangles.concatenate(shells)

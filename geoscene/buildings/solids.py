@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, clean, groups
 from geoscene.buildings.roofs import RoofSpec, roof_shell
-from geoscene.buildings.shells import Triangles, prisms
+from geoscene.buildings.shells import Triangles, parapets, prisms
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class
@@ -46,10 +46,16 @@ class _Pieces(Columns):
     low: Float
     high: Float
     flat: Bools
+    parapet: Float
 
 
 def build_solids(
-    buildings: Buildings, *, base: Float, foot: Float | None = None, lod: int = 2
+    buildings: Buildings,
+    *,
+    base: Float,
+    foot: Float | None = None,
+    lod: int = 2,
+    parapet: Float | None = None,
 ) -> tuple[Mesh, list[Problem]]:
     """One body without faults (`check_solids`) per building, and what was simplified or dropped.
 
@@ -63,6 +69,8 @@ def build_solids(
            its building's base
     foot : z in metres of the lower end of each building's walls, in the same order; parts that stand on the
            ground reach down to it. The base by default.
+    parapet : (n,) metres of the parapet above the flat roof of each row of the table, where no part of its
+           building as high is beside it; none by default, and on a building that is no solid with them
 
     Raises InputError for another level of detail or a base of the wrong length.
     """
@@ -74,14 +82,20 @@ def build_solids(
             raise InputError(f"{len(z)} {what} for {buildings.count} buildings")
     foot = base if foot is None else np.asarray(foot, float)
     pieces = _pieces(buildings, base, foot=foot, lod=lod)
+    if parapet is not None and lod == 2:
+        pieces = replace(pieces, parapet=_parapets(pieces, parapet))
     problems: list[Problem] = []
 
     done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
-    for attempt in ("", "aligned-parts", "overlapping-roofs", "flat-roof", "cleaned-footprint"):
+    for attempt in ("", "no-parapet", "aligned-parts", "overlapping-roofs", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
         if attempt in ("overlapping-roofs", "flat-roof") and pieces.flat.all():
             continue
+        if attempt == "no-parapet":
+            if not pieces.parapet.any():
+                continue
+            pieces = replace(pieces, parapet=np.zeros(len(pieces.row)))
         if attempt == "aligned-parts":
             pieces = _aligned(pieces)
         elif attempt in ("flat-roof", "cleaned-footprint"):
@@ -125,7 +139,18 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
     grounded = low <= 0
     underside[grounded] = np.minimum(underside, foot[building])[grounded]
     polygon = _straightened(polygon, building)
-    return _Pieces(polygon, row, building, base[building], underside, base[building] + high, flat)
+    return _Pieces(
+        polygon, row, building, base[building], underside, base[building] + high, flat, np.zeros(len(row))
+    )
+
+
+def _parapets(pieces: _Pieces, parapet: Float) -> Float:
+    """Heights (n,) of parapets: 0 beside a piece of the building that is about as high or higher."""
+    rise = np.where(pieces.flat, parapet[pieces.row], 0.0)
+    i, j = shapely.STRtree(pieces.polygon).query(pieces.polygon, predicate="dwithin", distance=0.1)
+    beside = (i != j) & (pieces.building[i] == pieces.building[j]) & (pieces.high[j] > pieces.high[i] - 1.0)
+    rise[i[beside & (pieces.low[j] < pieces.high[i] + 1.0)]] = 0.0
+    return rise
 
 
 def _straightened(polygons: Polygons, building: Ints) -> Polygons:
@@ -255,7 +280,11 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Prob
     """The closed shell of each piece, and the replaced roofs."""
     notes = []
     flat = np.flatnonzero(pieces.flat)
-    made = [prisms(pieces.polygon[flat], flat.astype(np.int64), low=pieces.low[flat], high=pieces.high[flat])]
+    bare, walled = flat[pieces.parapet[flat] <= 0], flat[pieces.parapet[flat] > 0]
+    made = [prisms(pieces.polygon[bare], bare.astype(np.int64), low=pieces.low[bare], high=pieces.high[bare])]
+    if len(walled):
+        low, high, rise = pieces.low[walled], pieces.high[walled], pieces.parapet[walled]
+        made.append(parapets(pieces.polygon[walled], walled.astype(np.int64), low=low, high=high, rise=rise))
     for k in np.flatnonzero(~pieces.flat):
         row = pieces.row[k]
         spec = RoofSpec(

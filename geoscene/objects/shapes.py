@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.classes import Class, materials
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.crowns import leaf_area_densities, tree_shapes
+from geoscene.objects.roof_shapes import roof_shapes
 from geoscene.objects.solids import circle, lathe, prism, rectangle, solid
 from geoscene.objects.street_shapes import street_shapes
 from geoscene.typing import Float
@@ -56,7 +57,7 @@ def shapes(*, relief: bool = False) -> dict[str, Mesh]:
     relief : also those of scenes with relief, after the others
     """
     if relief:
-        return shapes() | tree_shapes() | street_shapes()
+        return shapes() | tree_shapes() | street_shapes() | roof_shapes()
     return {
         "trunk": solid(prism(circle(1.0, 6), 0.0, top=1.0, taper=0.7), klass=Class.TRUNK, material="bark"),
         "crown_broadleaved": solid(lathe(_BALL), klass=Class.TREE_CROWN, material="foliage"),
