@@ -214,13 +214,15 @@ def build_tile(
         copies = copies.shifted(-origin)
     on_roofs, roofs = _roof_objects(plan, solids, lod=lod, problems=problems)
     copies = Instances.concatenate([copies, on_roofs.shifted(-origin)])
-    mesh = concatenate([solids.shifted(-origin), rest])
+    layout = None
+    if plan.facades is not None:
+        guess = plan.relief == "full"
+        layout = wall_relief(solids, plan.facades, base=plan.base, height=plan.height, guess=guess)
+    attached = [layout.parts.shifted(-origin)] if layout else []
+    mesh = concatenate([solids.shifted(-origin), *attached, rest])
     if not plan.use.colors:
         mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
-    relief, counts = None, dict[str, int]()
-    if plan.facades is not None:
-        layout = wall_relief(solids, plan.facades, base=plan.base, height=plan.height)
-        relief, counts = layout.relief.placed(-origin, faces=len(mesh)), layout.counts
+    relief = layout.relief.placed(-origin, faces=len(mesh)) if layout else None
     digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief))
     forest_trees = 0
     if plan.forests is not None:
@@ -240,7 +242,7 @@ def build_tile(
         _plan_area(rest.take(~rest.closed & (rest.klass == Class.WATER))),
         digest,
         tuple(problems),
-        counts,
+        layout.counts if layout and layout.counts["walls"] else {},
         guessed,
         roofs,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from geoscene.buildings.facades.grids import Elevations, nth
 from geoscene.buildings.facades.kinds import BLANK, depths, panels
@@ -20,6 +21,29 @@ _EDGE = 0.05
 """Metres, at least, from a panel to the edge of its wall, besides the depth of the opening."""
 
 
+def obstacles(at: Elevations, wall: Ints, *, shape: NDArray[np.object_]) -> tuple[Ints, Float]:
+    """Which shapes (p,) in plan before walls (n,) buildings intersect.
+
+    Returns also the lower and upper height (p, 2) of the building or part above the base of the wall's.
+    """
+    table = at.setting.buildings
+    which, found = at.setting.solid.query(shape, predicate="intersects")
+    other = at.setting.rows[found]
+    stands = _bases(at, table.outline[other].astype(np.int64)) - at.grids.zero[wall[which]]
+    return which, np.stack([stands + table.min_height[other], stands + table.height[other]], axis=1)
+
+
+def _bases(at: Elevations, building: Ints) -> Float:
+    """Height z (n,) of the bases of buildings, also of those out of reach of a route."""
+    known = at.base[building]
+    lacking = np.unique(building[np.isnan(known)])
+    if not len(lacking):
+        return known
+    found = np.full(len(at.base), np.nan)
+    found[lacking] = base_heights(at.setting.buildings.footprint[lacking], at.height)
+    return np.where(np.isnan(known), found[building], known)
+
+
 class Fit:
     """Tests whether openings can be where they are wanted."""
 
@@ -29,7 +53,7 @@ class Fit:
 
     def _obstacles(self) -> tuple[Ints, Float]:
         """Columns (p,), sorted, and the lower and upper height (p, 2) of what stands before them."""
-        walls, cells, table = self._at.walls, self._at.cells, self._at.setting.buildings
+        walls, cells = self._at.walls, self._at.cells
         first = np.unique(cells.upright, return_index=True)[1]
         of, middle = cells.wall[first], cells.middle[first]
         half = 0.45 * self._at.grids.cell[of, 0]
@@ -38,22 +62,9 @@ class Fit:
             walls.points(of, u, out=out) for u, out in ((low, OUT), (low, FREE), (high, FREE), (high, OUT))
         ]
         rims = shapely.linestrings(np.stack(corners, axis=1)) if len(of) else np.empty(0, object)
-        column, found = self._at.setting.solid.query(rims, predicate="intersects")
-        other = self._at.setting.rows[found]
-        stands = self._bases(table.outline[other].astype(np.int64)) - self._at.grids.zero[of[column]]
-        span = np.stack([stands + table.min_height[other], stands + table.height[other]], axis=1)
+        column, span = obstacles(self._at, of, shape=rims)
         order = np.argsort(column, kind="stable")
         return column[order], span[order]
-
-    def _bases(self, building: Ints) -> Float:
-        """Z (n,) of the bases of buildings, also of those out of reach of a route."""
-        known = self._at.base[building]
-        lacking = np.unique(building[np.isnan(known)])
-        if not len(lacking):
-            return known
-        found = np.full(len(self._at.base), np.nan)
-        found[lacking] = base_heights(self._at.setting.buildings.footprint[lacking], self._at.height)
-        return np.where(np.isnan(known), found[building], known)
 
     def __call__(self, cell: Ints, box: Float, *, depth: Float, above: float) -> Bools:
         """Whether openings (n,) in cells fit.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.buildings.facades.attached import attach, without_touching
 from geoscene.buildings.facades.description import Facades, WallRelief
 from geoscene.buildings.facades.doors import facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.fit import Sheet
@@ -29,26 +30,32 @@ _SIGN = 0.7
 class Layout:
     """The relief of a tile's walls, and what was counted.
 
-    counts : walls with openings, openings by what they are, entrances mapped and left out
+    parts  : solids that stand out of the walls, in scene metres
+    counts : walls with openings, openings and parts by what they are, entrances mapped and left out
     """
 
     relief: WallRelief
+    parts: Mesh
     counts: dict[str, int]
 
 
-def wall_relief(mesh: Mesh, setting: Setting, *, base: Float, height: Height | None) -> Layout:
+def wall_relief(
+    mesh: Mesh, setting: Setting, *, base: Float, height: Height | None, guess: bool = False
+) -> Layout:
     """The relief of the walls of a mesh of buildings.
 
     mesh   : in scene metres, features are rows of the table of buildings
     base   : (count,) z of each building's base, NaN where it is not known
     height : z of the ground at x, y; None if it is 0 everywhere
+    guess  : also parts that stand out of walls and are not mapped
     """
     walls, of_face = find_walls(mesh)
     at, some = Elevations.of(walls, setting, base=base, height=height)
     number = np.full(len(walls), -1, np.int32)
     number[some] = np.arange(len(some))
     walls, grids, cells = at.walls, at.grids, at.cells
-    chosen, counts = _choose(at)
+    chosen, parts, counts = _choose(at, guess=guess)
+    parts, touching = without_touching(parts, mesh)
     openings, index = make_openings(chosen, at.styles, wall=cells.wall)
     kept = np.zeros(len(walls), np.bool_)
     kept[cells.wall[index >= 0]] = True
@@ -69,23 +76,25 @@ def wall_relief(mesh: Mesh, setting: Setting, *, base: Float, height: Height | N
         grids.count.astype(np.int32),
         (np.cumsum(sizes) - sizes).astype(np.int32),
     )
-    counts = {"walls": len(walls), **counts}
-    return Layout(WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32)), counts)
+    counts = {"walls": len(walls), **counts, "parts_left_out": touching}
+    relief = WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32))
+    return Layout(relief, parts, counts)
 
 
-def _choose(at: Elevations) -> tuple[Chosen, dict[str, int]]:
-    """What each cell holds, and how many openings there are by what they are."""
+def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Mesh, dict[str, int]]:
+    """What each cell holds, what stands out of walls, and how many there are of each."""
     sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
     facing = facing_street(at)
     _put_windows(sheet, at)
     _put_shops(sheet, at, facing=facing)
     mapped = put_mapped_doors(sheet, at)
     put_guessed_doors(sheet, at, facing=facing)
+    parts, attached = attach(sheet, at, facing=facing, guess=guess)
     place = nth(_sizes(at.walls.feature))[wall] * 65536 + cells.storey * 256 + cells.column
     draw = uniform_at(styles.seed[wall], place, count=2, seed=1)
     closed = (sheet.kind == WINDOW) & (draw[0] < styles.closed[wall])
-    counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped
-    return Chosen(sheet.kind, sheet.place, closed, draw[1], cells.height), counts
+    counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped | attached
+    return Chosen(sheet.kind, sheet.place, closed, draw[1], cells.height), parts, counts
 
 
 def _put_windows(sheet: Sheet, at: Elevations) -> None:

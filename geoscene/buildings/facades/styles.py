@@ -115,6 +115,7 @@ class Styles(Columns):
     shop     : (n,) bool, the ground floor has shop fronts to the street
     deep     : (n,) bool, openings without glass
     balcony  : (n,) bool
+    balcony_tagged : (n,) bool, the map says so
     cornice  : (n,) bool
     trim     : (n,) uint8, material of sills and surrounds, the wall's own where 0
     frames   : (n,) uint8, material of frames
@@ -141,6 +142,7 @@ class Styles(Columns):
     shop: Bools
     deep: Bools
     balcony: Bools
+    balcony_tagged: Bools
     cornice: Bools
     trim: NDArray[np.uint8]
     frames: NDArray[np.uint8]
@@ -218,6 +220,7 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         axis=1,
     )
     shop_tag = np.array(["shop" in t for t in given], np.bool_)
+    balcony = np.array([_yes_or_no(t.get("balcony", t.get("building:balcony", ""))) for t in given], "U3")
     return Styles(
         type=type_,
         seed=seed,
@@ -238,7 +241,8 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         gate=_pairs("gate", type_),
         shop=shop_tag | (draw[14] < _shares("shop", type_)),
         deep=type_ == TYPES.index("parking"),
-        balcony=draw[15] < _shares("balcony", type_),
+        balcony=np.where(balcony != "", balcony == "yes", draw[15] < _shares("balcony", type_)),
+        balcony_tagged=balcony != "",
         cornice=draw[16] < _shares("cornice", type_),
         trim=np.where(panel > 0, materials()["stone"].code, 0).astype(np.uint8),
         frames=np.where(metal, materials()["metal"].code, materials()["wood"].code).astype(np.uint8),
@@ -309,6 +313,11 @@ def _pairs(name: str, type_: Ints) -> Float:
 
 def _shares(name: str, type_: Ints) -> Float:
     return np.array([usual_facades()[t][name] for t in TYPES], float)[type_]
+
+
+def _yes_or_no(text: str) -> str:
+    """``yes`` or ``no`` for a tagged value, "" for none."""
+    return "" if not text else "no" if text in ("no", "none", "0") else "yes"
 
 
 def _paints(names: NDArray[np.str_], draw: Float) -> NDArray[np.uint8]:

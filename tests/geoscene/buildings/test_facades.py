@@ -15,7 +15,7 @@ from geoscene.buildings.facades.solids import relief_mesh
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.frames import Frame
-from geoscene.mesh import DOOR, WALL, WINDOW
+from geoscene.mesh import DOOR, WALL, WINDOW, concatenate
 from geoscene.sources.data import Area, OsmData, Point
 from geoscene.watertight import validate_mesh
 
@@ -38,14 +38,15 @@ def entrance(xy, kind="yes"):
     return Point("node/1", {"entrance": kind}, lon, lat)
 
 
-def facades_of(*areas, points=(), street=None, height=None):
+def facades_of(*areas, points=(), street=None, height=None, guess=False):
     """Table, mesh and layout of a map, whose only street is a line of scene coordinates."""
     osm = OsmData((8.6, 49.3, 8.8, 49.5), [], list(areas), list(points), [])
     table, _ = read_buildings(osm, FRAME)
     mesh, _ = build_solids(table, base=np.zeros(table.count))
     lines = np.array([] if street is None else [shapely.LineString(street)], object)
     setting = read_setting(osm, FRAME, buildings=table, streets=lines)
-    return table, mesh, wall_relief(mesh, setting, base=np.zeros(table.count), height=height)
+    layout = wall_relief(mesh, setting, base=np.zeros(table.count), height=height, guess=guess)
+    return table, mesh, layout
 
 
 def panels_of(relief, *, part="panel"):
@@ -255,3 +256,43 @@ def test_a_mesh_without_openings_is_unchanged():
     _, mesh, layout = facades_of(house(1, shapely.box(0, 0, 20, 10), building="shed", height="3"))
     assert not len(layout.relief.facades)
     assert relief_mesh(mesh, layout.relief) is mesh
+
+
+@given(
+    blocks(),
+    st.sampled_from(["apartments", "retail", "hotel", "yes"]),
+    st.integers(10, 25),
+    st.integers(1, 10**9),
+)
+@settings(max_examples=20, deadline=None)
+def test_what_stands_out_of_facades_is_closed_and_clear_of_its_walls_and_of_neighbours(
+    shape, use, height, number
+):
+    beside = shapely.box(40.0, -30.0, 42.0, 30.0)
+    table, mesh, layout = facades_of(
+        house(number, shape, building=use, height=str(height)),
+        house(number + 1, beside, building="shed", height="30"),
+        street=[(-60, -40), (60, -40)],
+        guess=True,
+    )
+    verdict = validate_mesh(concatenate([mesh, layout.parts]))
+    assert verdict.ok.all()
+    corners = shapely.points(layout.parts.vertices[:, :2])
+    assert shapely.distance(table.footprint[1], corners).min(initial=9.0) > 0.5
+    assert (layout.parts.vertices[:, 2] > 0).all()
+
+
+def test_balconies_stand_where_they_are_mapped_and_windows_behind_them_reach_the_floor():
+    shape = shapely.box(0, 0, 30, 12)
+    tags = {"building": "apartments", "building__levels": "5"}
+    none = facades_of(house(1, shape, **tags))[2]
+    assert not len(none.parts)
+    _, _, layout = facades_of(house(1, shape, balcony="yes", **tags))
+    assert layout.counts["balconies"] >= 4
+    assert len(layout.parts)
+    floors = [box[1] for _, r, _, box, _ in panels_of(layout.relief, part="opening") if r > 0]
+    storey = layout.relief.facades.cell[0, 1]
+    ground = layout.relief.facades.ground[0]
+    low = [y for y in floors if (y - ground) % storey < 0.3]
+    assert len(low) == layout.counts["balconies"]
+    assert facades_of(house(1, shape, balcony="no", **tags), guess=True)[2].counts["balconies"] == 0
