@@ -42,7 +42,7 @@ else:  # types that help shows; converters make the values, whose classes take a
 
 OUTPUT = Group("Output", sort_key=3)
 
-COLORS = ("class", "height", "intensity", "sensor")
+COLORS = ("class", "height", "intensity", "sensor", "image")
 """What red, green and blue of a map can show."""
 
 TILE_FORMATS = ("laz", "las", "copc")
@@ -695,7 +695,8 @@ class MapOptions:
     """Keep only the return nearest to the centre of each cube with this side in metres; all by default."""
 
     color: str = "class"
-    """What colours show: class, height, intensity or sensor."""
+    """What colours show: class, height, intensity, sensor, or image (what cameras saw of each point; those
+    that none saw are left out)."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
     """Names of the scanners to use; all by default."""
@@ -974,7 +975,7 @@ class EvaluateOptions:
     the way are left out."""
 
     sensor: str = ""
-    """Sensor whose poses the estimate holds; by default they are the vehicle's."""
+    """Sensor whose poses the estimate holds, by default the vehicle; camera that tracks of MOT are of."""
 
     map_error: Annotated[bool, Parameter(negative=())] = False
     """Map the dataset's clouds with the aligned estimate, and measure the distances to the scene's true

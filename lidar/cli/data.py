@@ -38,6 +38,8 @@ def map_(
 
     lidar map drive -o map.ply --voxel 0.1 --color height
 
+    lidar map drive -o colored.laz --color image
+
     lidar map drive -o empty.laz --without vehicles,pedestrian
 
     lidar map drive -o junction.laz --bbox 24.941,60.165,24.943,60.166 --time 0,10 --echo last
@@ -100,6 +102,7 @@ def map_(
 
 _LEFT_OUT = {
     "noise": "noise (--noise keeps them)",
+    "image": "points that no camera saw",
     "moving": "moving road users (--moving keeps them)",
     "poses": "times without poses",
     "time": "other times",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -82,14 +83,14 @@ def _evaluate_objects(
     from lidar.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
     from lidar.rig.catalog import columns  # noqa: PLC0415
 
-    if options != EvaluateOptions():
+    if replace(options, sensor="") != EvaluateOptions():
         raise InputError(f"{estimate}: detections and tracks take no options of trajectories; leave them out")
     if out is None:
-        found = evaluate_objects(estimate, against)
+        found = evaluate_objects(estimate, against, sensor=options.sensor)
     else:
         note_new_folder(out)
         with report_folder(out, overwrite=report.overwrite) as folder:
-            found = evaluate_objects(estimate, against)
+            found = evaluate_objects(estimate, against, sensor=options.sensor)
             write_object_report(found, folder)
     if report.json:
         print_json(found.to_json())

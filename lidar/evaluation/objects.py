@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ import numpy as np
 from lidar.dataset.export.kitti import OBJECTS
 from lidar.dataset.export.kitti_drive import KittiDrive, read_drive
 from lidar.dataset.export.kitti_objects import object_lines
+from lidar.dataset.export.mot import Line, sequence
 from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.recorded import color_images
 from lidar.errors import DatasetError, InputError
 from lidar.evaluation.detect import RESULTS
 from lidar.evaluation.kitti_detection import AveragePrecision, evaluate_kitti, labels_of, read_labels
@@ -82,8 +84,10 @@ def _number(word: str) -> bool:
     return True
 
 
-def evaluate_objects(estimate: Path, against: Path) -> ObjectScores:
+def evaluate_objects(estimate: Path, against: Path, *, sensor: str = "") -> ObjectScores:
     """Compare detections or tracks with the road users of a dataset.
+
+    sensor : camera of MOT's tracks; the first one with images and boxes by default
 
     Raises InputError for what cannot be compared, and FormatError and DatasetError for damaged files.
     """
@@ -95,10 +99,16 @@ def evaluate_objects(estimate: Path, against: Path) -> ObjectScores:
             true_boxes(dataset, samples), read_results(path, samples), vehicle=samples.vehicle
         )
         return ObjectScores(str(estimate), str(against), "nuscenes detections", score.samples, score)
+    if kind == "tracks":
+        found, layout = read_tracks(estimate)
+        if layout == "mot":
+            return _mot_tracks(estimate, found, dataset=dataset, sensor=sensor)
+    if sensor:
+        raise InputError(f"`sensor` {sensor}: only of trajectories and of tracks of MOT; leave it out")
     drive = _drive(dataset)
     if kind == "kitti":
         return _detections(estimate, drive, against=against)
-    return _tracks(estimate, drive, against=against)
+    return _kitti_tracks(estimate, found, drive=drive)
 
 
 def _drive(dataset: Dataset) -> KittiDrive:
@@ -130,20 +140,51 @@ def _detections(folder: Path, drive: KittiDrive, *, against: Path) -> ObjectScor
     return ObjectScores(str(folder), str(against), "kitti detections", len(frames), evaluate_kitti(frames))
 
 
-def _tracks(path: Path, drive: KittiDrive, *, against: Path) -> ObjectScores:
-    found, layout = read_tracks(path)
-    if found and max(found) >= len(drive):
-        raise InputError(f"{path}: has frame {max(found)}, but the drive has {len(drive)} frames")
+def _kitti_tracks(path: Path, found: Mapping[int, Tracks], *, drive: KittiDrive) -> ObjectScores:
     true = {}
     for row, lines in enumerate(true_lines(drive)):
-        numbers = np.array(list(lines), np.int64)
-        true[row] = Tracks(numbers, labels_of(list(lines.values()), name=against))
+        labels = labels_of(list(lines.values()), name=drive.dataset.path)
+        true[row] = Tracks(np.array(list(lines), np.int64), labels)
+    _check_frames(path, found, count=len(drive))
     scores = []
-    for kind in CLASSES if layout == "kitti" else ("object",):
-        for measure in LIMITS if layout == "kitti" else ("2d",):
+    for kind in CLASSES:
+        for measure in LIMITS:
             steps = steps_of(true, found, frames=range(len(drive)), kind=kind, measure=measure)
             scores.append(score_tracks(steps, kind=kind, measure=measure))
-    return ObjectScores(str(path), str(against), f"{layout} tracks", len(drive), scores)
+    return ObjectScores(str(path), str(drive.dataset.path), "kitti tracks", len(drive), scores)
+
+
+def _mot_tracks(path: Path, found: Mapping[int, Tracks], *, dataset: Dataset, sensor: str) -> ObjectScores:
+    cameras = dataset.sensors("camera")
+    if sensor and sensor not in cameras:
+        raise InputError(f"`sensor` {sensor}: no camera of {dataset.path}; there are {', '.join(cameras)}")
+    known = [name for name in cameras if dataset.paths.sensor_boxes(name).exists()]
+    stream = color_images(dataset, sensor or known[0]) if known else None
+    if stream is None or stream.name not in known:
+        raise DatasetError(f"{dataset.path}: has no images with boxes of road users; drive with `traffic`")
+    rows: dict[int, list[Line]] = {}
+    for line in sequence(dataset, stream):
+        rows.setdefault(line.image, []).append(line)
+    true = {
+        image: Tracks(
+            np.array([line.track for line in lines], np.int64),
+            labels_of(
+                ["object 0 0 0 {} {} {} {} 1 1 1 0 0 0 0".format(*one.box) for one in lines], name=path
+            ),
+        )
+        for image, lines in rows.items()
+    }
+    count = len(stream.files)
+    _check_frames(path, found, count=count)
+    steps = steps_of(true, found, frames=range(count), kind="object", measure="2d")
+    scores = [score_tracks(steps, kind="object", measure="2d")]
+    return ObjectScores(str(path), str(dataset.path), f"mot tracks of {stream.name}", count, scores)
+
+
+def _check_frames(path: Path, found: Mapping[int, Tracks], *, count: int) -> None:
+    if found and not 0 <= min(found) <= max(found) < count:
+        beyond = max(found) if max(found) >= count else min(found)
+        raise InputError(f"{path}: has frame {beyond} (from 0), but the drive has {count} frames")
 
 
 def _kitti_tables(scores: list[AveragePrecision]) -> list[tuple[str, list[str], Rows]]:

@@ -23,6 +23,7 @@ from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.maps.colors import distinct, ramp
 from lidar.maps.compare import Comparison, Distances
+from lidar.maps.image_colors import ImageColors
 from lidar.maps.outliers import Outliers
 from lidar.maps.poses import PoseErrors, measured_trajectory, pose_errors, write_poses
 from lidar.maps.rasters import Rasters
@@ -112,7 +113,8 @@ def aggregate(
     names = _scanners(dataset, options)
     trajectory = measured_trajectory(dataset, options.poses, refine=options.refine, progress=progress)
     selection = Selection(dataset, options, trajectory=trajectory)
-    source = Source(dataset, names, selection=selection, trajectory=trajectory)
+    colors = ImageColors(dataset) if options.color == "image" else None
+    source = Source(dataset, names, selection=selection, trajectory=trajectory, colors=colors)
     read = _Read()
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
@@ -194,10 +196,12 @@ class _Read:
             for reason, unwanted in selection.unwanted(table, name=name, frame=frame, row=row):
                 self.left_out[reason] += int(np.count_nonzero(keep & unwanted))
                 keep &= ~unwanted
-            yield table if keep.all() else {column: values[keep] for column, values in table.items()}
+            yield {column: values[keep] for column, values in table.items() if column != "imaged"}
 
 
 def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
+    if color == "image":
+        return table
     if color == "class":
         rgb = class_codes().color[table["label"]]
     elif color == "height":

@@ -81,6 +81,8 @@ class Selection:
             yield "origin", ~np.isin(self._origin(table, name, frame=frame, row=row), self._origins)
         elif not options.noise:
             yield "noise", label == Class.NOISE
+        if "imaged" in table:
+            yield "image", ~table["imaged"]
         if not options.moving:
             yield "moving", np.isin(table["instance"], self._moving(name, frame))
 

@@ -15,6 +15,7 @@ from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
+from lidar.maps.image_colors import ImageColors
 from lidar.maps.selection import Selection
 from lidar.rig.patterns.beams import frame_ns
 from lidar.time_scales import gps_seconds
@@ -41,6 +42,7 @@ class Source:
     names      : of the scanners
     selection  : whose frames are read; all of them without it
     trajectory : that places the points, from clouds in the sensor frame; by default the true one
+    colors     : of images; tables then have red, green, blue and ``imaged``, whether a camera saw the point
 
     Raises DatasetError for a dataset without such clouds, and InputError if none is of the time asked for.
     """
@@ -52,16 +54,18 @@ class Source:
         *,
         selection: Selection,
         trajectory: Trajectory | None = None,
+        colors: ImageColors | None = None,
     ) -> None:
         self.dataset = dataset
         self.geo = Georeference(dataset.frame, dataset.crs)
-        self._trajectory = trajectory
+        self._trajectory, self._colors = trajectory, colors
         self._lidars = dataset.sensors("lidar")
         self._names = list(names)
         self._found: Counter[str] = Counter()
         order = list(self._lidars)
         self._files: list[tuple[int, str, int, Path]] = []
-        forms = _readable(("world", "sensor") if trajectory is None else ("sensor",))
+        placed = trajectory is None and colors is None
+        forms = _readable(("world", "sensor") if placed else ("sensor",))
         for name in names:
             period = int(frame_ns(self._lidars[name]["rate_hz"]))
             form = next((f for f in forms if any(dataset.files(name, f))), None)
@@ -71,9 +75,10 @@ class Source:
                     self._files.append((frame, name, order.index(name), path))
         if not self._found:
             which = f"clouds of {', '.join(names) or 'any scanner'}"
-            if trajectory is not None:
+            if not placed:
+                what = "poses" if colors is None else "color"
                 raise DatasetError(
-                    f"{dataset.path}: no {which} in the sensor frame in it, which `poses` places;"
+                    f"{dataset.path}: no {which} in the sensor frame in it, which `{what}` takes;"
                     " drive with `formats` pcd"
                 )
             raise DatasetError(f"{dataset.path}: no {which} in it")
@@ -97,13 +102,14 @@ class Source:
 
     def tables(self, every: int = 1) -> Iterator[tuple[int, str, int, Table]]:
         """Frame number, scanner, first row and table of every n-th file; several tables for large files."""
+        wanted = COLUMNS if self._colors is None else (*COLUMNS, "red", "green", "blue", "imaged")
         for frame, name, index, path in self._files[::every]:
             row = 0
             for table in self._of_file(path, name, frame=frame):
                 count = rows(table)
                 table["source"] = np.full(count, index, np.uint16)
                 table["frame"] = np.full(count, frame, np.uint32)
-                yield frame, name, row, {column: table[column] for column in COLUMNS}
+                yield frame, name, row, {column: table[column] for column in wanted}
                 row += count
 
     def _of_file(self, path: Path, name: str, *, frame: int) -> Iterator[Table]:
@@ -122,7 +128,13 @@ class Source:
             vehicle_from_sensor=np.array(self._lidars[name]["vehicle_from_sensor"]),
         )
         one = np.ones(len(placed), np.uint8)
-        return {
+        colored: Table = {}
+        if self._colors is not None:
+            mount = np.array(self._lidars[name]["vehicle_from_sensor"], float)
+            start = self.start_ns(name, frame)
+            rgb, imaged = self._colors.of(table, name, frame=frame, start_ns=start, mount=mount)
+            colored = {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2], "imaged": imaged}
+        return colored | {
             **dict(zip("xyz", self.geo.points(placed).T, strict=True)),
             "intensity": table["intensity"],
             "gps_time": gps_seconds(self.dataset.start, time_ns),

@@ -85,6 +85,14 @@ EXPORTERS = {
     row.name: row
     for row in (
         Exporter(
+            "bev",
+            "bev",
+            "images from above of each sweep as GeoTIFF: height, intensity, number of returns",
+            mark="bev.json",
+            names=r"bev\.json|[^/]+/\d{6,}\.tif",
+            hint="open a file of {path} with QGIS or rasterio",
+        ),
+        Exporter(
             "coco",
             "coco",
             "images with COCO's boxes, masks and panoptic segments",
@@ -113,6 +121,15 @@ EXPORTERS = {
             hint="open it with kitti360scripts: KITTI360_DATASET={quoted}",
         ),
         Exporter(
+            "kitti-depth",
+            "kitti_depth",
+            "KITTI's depth completion: images, the scanner's depth in them, and the dense true depth",
+            mark="depth.json",
+            names=r"depth\.json|train/[^/]+/(intrinsics/[^/]+\.txt|[^/]+/data/\d{10}\.png"
+            r"|proj_depth/(velodyne_raw|groundtruth)/[^/]+/\d{10}\.png)",
+            hint="depth in metres is the PNG's value / 256, 0 without data: {path}/train",
+        ),
+        Exporter(
             "kitti-raw",
             "kitti_raw",
             "a drive of KITTI's raw recordings, with OXTS files of the true motion",
@@ -120,6 +137,14 @@ EXPORTERS = {
             names=r"dataformat\.txt|\d{4}_\d\d_\d\d/(calib_\w+\.txt|\d{4}_\d\d_\d\d_drive_0001_sync/\w+"
             r"/(timestamps\w*\.txt|data/\d{10}\.(bin|png|txt)))",
             hint="open it with pykitti.raw('{path}', '{date:%Y_%m_%d}', '0001')",
+        ),
+        Exporter(
+            "kitti-tracking",
+            "kitti_tracking",
+            "a sequence of KITTI's tracking benchmark: images, clouds and tracks of road users",
+            mark="training/label_02/0000.txt",
+            names=r"training/((label_02|calib)/0000\.txt|image_0[0-3]/0000/\d{6}\.png|velodyne/0000/\d{6}\.bin)",
+            hint="the true tracks are {path}/training/label_02/0000.txt",
         ),
         Exporter(
             "mcap",
@@ -130,6 +155,14 @@ EXPORTERS = {
             hint="open {path}/drive.mcap with Foxglove and import the layout foxglove.json",
         ),
         Exporter(
+            "mot",
+            "mot",
+            "images and tracks of road users in them, as MOTChallenge has them",
+            mark="seqmaps/all.txt",
+            names=r"seqmaps/all\.txt|train/[^/]+/(seqinfo\.ini|gt/gt\.txt|img1/\d{6}\.png)",
+            hint="the true tracks of a camera are {path}/train/CAMERA/gt/gt.txt",
+        ),
+        Exporter(
             "nuscenes",
             "nuscenes",
             "samples and sweeps with all tables of nuScenes, two key frames per second",
@@ -137,6 +170,14 @@ EXPORTERS = {
             names=r"v1\.0-mini/[a-z_]+\.json|maps/drivable\.png|lidarseg/v1\.0-mini/[0-9a-f]{32}_lidarseg\.bin"
             r"|(samples|sweeps)/[^/]+/.+__\d+\.(pcd\.bin|png)",
             hint="open it with NuScenes('v1.0-mini', '{path}')",
+        ),
+        Exporter(
+            "range-images",
+            "range_images",
+            "each sweep as an image of its pulses, with labels, from which its points come back",
+            mark="range_images.json",
+            names=r"range_images\.json|[^/]+/(geometry\.json|(range|instance)/\d{6,}\.npy|(png|label)/\d{6,}\.png)",
+            hint="a point is at range * (cos e cos a, cos e sin a, sin e): {path}/SCANNER/geometry.json",
         ),
         Exporter(
             "ros2",
