@@ -1,5 +1,9 @@
-"""Surfaces behind the planes of faces, met by formula: openings of facades."""
+"""Surfaces behind the planes of faces, met by formula: openings of facades, rough ground."""
 
+from lidar.relief.ground import GroundRefiner as GroundRefiner
+from lidar.relief.ground import GroundTables as GroundTables
+from lidar.relief.ground import ground_tables as ground_tables
+from lidar.relief.ground import joined_ground as joined_ground
 from lidar.relief.march import FRAME as FRAME
 from lidar.relief.march import INFILL as INFILL
 from lidar.relief.march import PARTS as PARTS

@@ -15,6 +15,7 @@ from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inlined
 from lidar.raycast.rays import share
+from lidar.relief.lines import direction_of, origin_of
 from lidar.relief.march import (
     INFILL,
     OUT,
@@ -197,37 +198,6 @@ class WallRefiner:
 
 
 @inlined
-def _direction(rays: Any, i: int) -> Any:
-    """A ray's direction in the caster's axes."""
-    x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
-    if len(rays.pose) == 0:
-        return x, y, z
-    m, p = rays.matrix, rays.pose[i]
-    return (
-        m[p, 0, 0] * x + m[p, 0, 1] * y + m[p, 0, 2] * z,
-        m[p, 1, 0] * x + m[p, 1, 1] * y + m[p, 1, 2] * z,
-        m[p, 2, 0] * x + m[p, 2, 1] * y + m[p, 2, 2] * z,
-    )
-
-
-@inlined
-def _origin(rays: Any, i: int) -> Any:
-    """A ray's origin in the caster's axes."""
-    x, y, z = 0.0, 0.0, 0.0
-    if len(rays.offsets) > 0:
-        o = i if len(rays.offsets) > 1 else 0
-        x, y, z = rays.offsets[o, 0], rays.offsets[o, 1], rays.offsets[o, 2]
-    if len(rays.pose) == 0:
-        return x, y, z
-    m, p, at = rays.matrix, rays.pose[i], rays.position
-    return (
-        at[p, 0] + m[p, 0, 0] * x + m[p, 0, 1] * y + m[p, 0, 2] * z,
-        at[p, 1] + m[p, 1, 0] * x + m[p, 1, 1] * y + m[p, 1, 2] * z,
-        at[p, 2] + m[p, 2, 0] * x + m[p, 2, 1] * y + m[p, 2, 2] * z,
-    )
-
-
-@inlined
 def _on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
     """A ray relative to the first cell of a wall: origin without its depth, direction."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]
@@ -284,8 +254,8 @@ def _refine_one(tables: Any, rays: Any, i: int, columns: Any) -> None:
     if w < 0:
         return
     frame, kinds = tables.frame, tables.kinds
-    direction = _direction(rays, i)
-    ox, oy, dx, dy, dz = _on_wall(frame, w, _origin(rays, i), direction)
+    direction = direction_of(rays, i)
+    ox, oy, dx, dy, dz = _on_wall(frame, w, origin_of(rays, i), direction)
     if not dz > 0.0:
         return
     t = distance[i]
@@ -342,7 +312,7 @@ def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
     if w < 0:
         return 0.0
     frame, kinds, near = tables.frame, tables.kinds, rays.near
-    origin, direction = _origin(rays, i), _direction(rays, i)
+    origin, direction = origin_of(rays, i), direction_of(rays, i)
     ox, oy, dx, dy, dz = _on_wall(frame, w, origin, direction)
     depth = _depth(frame, w, origin)
     number, left, bottom = _cell(frame, w, ox + near * dx, oy + near * dy)

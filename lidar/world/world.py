@@ -17,7 +17,15 @@ from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 from lidar.raycast.refine import Refiner
-from lidar.relief import WallRefiner, WallTables, joined
+from lidar.relief import (
+    GroundRefiner,
+    GroundTables,
+    WallRefiner,
+    WallTables,
+    ground_tables,
+    joined,
+    joined_ground,
+)
 from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import CELL, Shelter, shelter_of
@@ -59,12 +67,14 @@ class _Tile:
 
     surfaces : of the faces of the mesh, then of those that ``walls`` adds
     walls    : openings of its walls, None for none
+    ground   : roughness of its ground, None for none
     centre   : (m, 3) of the faces of the mesh, scene metres; then zeros
     """
 
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
     walls: WallTables | None
+    ground: GroundTables | None
     shape: NDArray[np.int32]
     transform: Float
     feature: NDArray[np.int32]
@@ -111,6 +121,8 @@ class World:
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
         self._walls: WallRefiner | None = None
+        relief = scene.manifest.get("options", {}).get("relief", "off")
+        self._rough = relief != "off" and settings.relief != "off"
         self._concatenate_tables()
 
     @classmethod
@@ -247,7 +259,11 @@ class World:
         if loaded:
             count = len(self._surfaces)
             self._walls = WallRefiner(joined(list(loaded.values()), faces=list(loaded), count=count))
-        return [self._walls] if self._walls else []
+        refiners: list[Refiner] = [self._walls] if self._walls else []
+        rough = {self._first[rank]: tile.ground for rank, tile in self._tiles.items() if tile.ground}
+        if rough:
+            refiners.append(GroundRefiner(joined_ground(rough, count=len(self._surfaces))))
+        return refiners
 
     def _read(self, rank: int) -> _Tile:
         tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._meshes)
@@ -268,6 +284,7 @@ class World:
             {_PARTS * rank + k: part for k, part in enumerate(parts)},
             surfaces,
             walls,
+            ground_tables(mesh, origin=tile.origin) if self._rough else None,
             copies.shape,
             transform,
             copies.feature,

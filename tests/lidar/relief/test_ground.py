@@ -1,0 +1,157 @@
+"""Rough ground: the stated spectra, and rays that end on the surface, however flat they come."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.classes import Class, materials
+from geoscene.mesh import Mesh
+from lidar.raycast import Caster
+from lidar.relief import GroundRefiner, ground_tables
+from lidar.relief.ground import heights
+from lidar.relief.roughness import KINDS, N0, roughness
+
+SIDE = 200.0
+KIND_OF = {"asphalt": ("asphalt", Class.ROAD), "paving": ("paving", Class.SIDEWALK)}
+KIND_OF |= {
+    "sett": ("stone", Class.ROAD),
+    "ballast": ("ballast", Class.RAIL),
+    "grass": ("grass", Class.GRASS),
+}
+SLOPE = np.array([0.08, -0.05])
+
+
+def ground(kind, slope=SLOPE):
+    """A sloping square of a kind of ground about the origin, and its plane's height function."""
+    material, klass = KIND_OF[kind]
+    xy = SIDE / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+    mesh = Mesh.of(
+        np.column_stack([xy, xy @ slope]),
+        [[0, 1, 2], [0, 2, 3]],
+        klass=klass,
+        material=materials()[material].code,
+    )
+    caster = Caster(mesh.vertices, mesh.faces, origin=np.zeros(3))
+    caster.refiners = [GroundRefiner(ground_tables(mesh, origin=np.zeros(3)))]
+    return caster
+
+
+def above(kind, points, slope=SLOPE):
+    """Metres (n,) of points above the rough surface, vertically."""
+    return points[:, 2] - points[:, :2] @ slope - heights(kind, points[:, :2])
+
+
+def looks(rng, count, *, lowest_deg, highest_deg):
+    """Unit rays from 2 m above the ground near the origin, this much below the horizon."""
+    start = np.column_stack([rng.uniform(-5, 5, (count, 2)), np.zeros(count)])
+    start[:, 2] = start[:, :2] @ SLOPE + 2.0
+    turn, down = rng.uniform(0, 2 * np.pi, count), np.radians(rng.uniform(lowest_deg, highest_deg, count))
+    way = np.column_stack([np.cos(down) * np.cos(turn), np.cos(down) * np.sin(turn), -np.sin(down)])
+    way[:, 2] += way[:, :2] @ SLOPE
+    return start, way / np.linalg.norm(way, axis=1, keepdims=True)
+
+
+def density_along_lines(kind, *, lines=400, step=0.02, count=1024):
+    """One-sided power spectral density of heights along random straight lines (Welch 1967)."""
+    rng = np.random.default_rng(3)
+    total = np.zeros(count // 2 + 1)
+    window = np.hanning(count)
+    for _ in range(lines):
+        start, turn = rng.uniform(0, 500, 2), rng.uniform(0, 2 * np.pi)
+        xy = start + np.arange(count)[:, None] * step * np.array([np.cos(turn), np.sin(turn)])
+        z = heights(kind, xy)
+        total += np.abs(np.fft.rfft((z - z.mean()) * window)) ** 2
+    return np.fft.rfftfreq(count, step), 2 * step * total / lines / (window**2).sum()
+
+
+@pytest.mark.parametrize(("kind", "stated"), [("asphalt", 16e-6), ("concrete", 16e-6)])
+def test_roads_have_the_spectrum_of_iso_8608(kind, stated):
+    n, density = density_along_lines(kind)
+    for low, high in ((0.3, 0.6), (0.6, 1.5), (1.5, 4.0)):
+        band = (n >= low) & (n < high)
+        measured = np.exp(np.mean(np.log(density[band] * (n[band] / N0) ** 2)))
+        assert measured == pytest.approx(stated, rel=0.25)  # a class spans a factor of 4
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rough_ground_lies_at_or_below_its_plane_within_its_depth_and_slope(kind):
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-1e4, 1e4, (100_000, 2))
+    z = heights(kind, xy)
+    *_, depth, slope = roughness().kinds[list(KINDS).index(kind)]
+    assert (z <= 0).all()
+    assert (z >= -depth).all()
+    moved = xy + 1e-4 * rng.normal(size=xy.shape)
+    change = np.abs(heights(kind, moved) - z) / np.linalg.norm(moved - xy, axis=1)
+    assert change.max() <= slope * (1 + 1e-6)
+    assert z.std() > 5e-4
+
+
+@pytest.mark.parametrize("kind", KIND_OF)
+@pytest.mark.parametrize(("lowest", "highest"), [(20.0, 89.0), (2.0, 5.0), (1.2, 1.5)])
+@pytest.mark.parametrize("normals", [True, False])
+def test_rays_end_on_the_surface_and_pass_nothing_of_it_before(kind, lowest, highest, normals):
+    start, way = looks(np.random.default_rng(7), 3000, lowest_deg=lowest, highest_deg=highest)
+    hits = ground(kind).cast(start, way, normals=normals)
+    there = np.isfinite(hits.range)
+    assert there.all()
+    points = start + hits.range[:, None] * way
+    assert np.abs(above(kind, points)).max() < 1e-6
+    # On the way down through the roughness, rays are above the surface but for dips of half a millimetre.
+    plane = Caster.cast(bare(kind), start, way).range
+    for share in np.linspace(0.0, 0.999, 60):
+        before = start + (plane + share * (hits.range - plane))[:, None] * way
+        assert (above(kind, before) > -1e-4).all()
+    if normals:
+        np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=1), 1.0)
+        assert (hits.normal[:, 2] > 0).all()
+
+
+def bare(kind):
+    caster = ground(kind)
+    caster.refiners = []
+    return caster
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(KIND_OF)))
+def test_hits_do_not_depend_on_other_rays_or_threads(seed, kind):
+    start, way = looks(np.random.default_rng(seed), 5, lowest_deg=1.5, highest_deg=60)
+    caster = ground(kind)
+    together = caster.cast(start, way, threads=2)
+    alone = [caster.cast(start[[k]], way[[k]]).range[0] for k in range(5)]
+    np.testing.assert_array_equal(together.range, alone)
+
+
+def test_a_hit_beyond_the_end_of_the_ray_is_a_miss():
+    start, way = looks(np.random.default_rng(2), 500, lowest_deg=5, highest_deg=30)
+    plane, rough = bare("grass").cast(start, way).range, ground("grass").cast(start, way).range
+    end = float(np.median((plane + rough) / 2))
+    cut = ground("grass").cast(start, way, far=end).range
+    np.testing.assert_array_equal(cut, np.where(rough <= end, rough, np.inf))
+
+
+@pytest.mark.parametrize("kind", KIND_OF)
+def test_light_leaves_a_point_on_rough_ground_upwards_and_hits_the_surface_sideways(kind):
+    start, way = looks(np.random.default_rng(9), 2000, lowest_deg=30, highest_deg=80)
+    caster = ground(kind)
+    hits = caster.cast(start, way, normals=True)
+    place = start + hits.range[:, None] * way + 1e-3 * hits.normal
+    up = np.tile([0.0, 0.0, 1.0], (len(place), 1))
+    assert not caster.occluded(place, up, on=hits.face).any()
+    down = caster.cast(place, -up, on=hits.face)
+    assert (down.face >= 0).all()
+    assert np.abs(above(kind, place - down.range[:, None] * up)).max() < 1e-6
+
+
+def test_kerbs_walls_and_water_have_no_roughness():
+    codes = materials()
+    xyz = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0], [0, 0, 1]])
+    mesh = Mesh.of(
+        xyz,
+        [[0, 1, 2], [0, 1, 3], [0, 1, 2], [0, 1, 2]],
+        klass=np.array([Class.KERB, Class.ROAD, Class.WATER, Class.ROAD]),
+        material=np.array([codes[name].code for name in ("concrete", "asphalt", "water", "asphalt")]),
+    )
+    assert (ground_tables(mesh, origin=np.zeros(3)).kind >= 0).tolist() == [False, False, False, True]
