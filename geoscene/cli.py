@@ -28,7 +28,7 @@ from geoscene.console import (
 )
 from geoscene.console import main as run
 from geoscene.errors import GeosceneError, InputError
-from geoscene.options import BuildOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
+from geoscene.options import BuildOptions, CloudOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
 from geoscene.progress import Progress
 from geoscene.uses import USES
 
@@ -49,7 +49,8 @@ app.register_install_completion_command()
 
 _SOURCE = Group("Source of the map (one of)", sort_key=1)
 _SCENE = Group("Scene", sort_key=2)
-_OUTPUT = Group("Output", sort_key=3)
+_CLOUD = Group("Point clouds", sort_key=3)
+_OUTPUT = Group("Output", sort_key=4)
 
 Out = Annotated[Path, Parameter(name=["--out", "-o"], group=_OUTPUT)]
 Reporting = Annotated[Report, Parameter(group=_OUTPUT)]
@@ -102,6 +103,7 @@ def build(
     *,
     source: Annotated[MapSource, Parameter(group=_SOURCE)] = MapSource(),
     options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
+    clouds: Annotated[CloudOptions, Parameter(group=_CLOUD)] = CloudOptions(),
     out: Out,
     workers: Annotated[int | None, Parameter(group=_OUTPUT, converter=whole)] = None,
     scheduler: Annotated[str, Parameter(group=_OUTPUT, metavar="ADDRESS")] = "",
@@ -117,6 +119,8 @@ def build(
 
     geoscene build --osm city.osm.pbf --source overture=buildings.parquet -o scene
 
+    geoscene build --osm city.osm.pbf --cloud survey.laz -o scene
+
     geoscene build --place "Norfolk, VA" -o norfolk
 
     geoscene build --point 36.8853,-76.3059 --radius 800 -o odu
@@ -131,6 +135,7 @@ def build(
         Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers build the tiles instead;
         they need the output folder under the same path.
     """
+    from geoscene.clouds.survey import with_clouds  # noqa: PLC0415
     from geoscene.cluster import connected  # noqa: PLC0415
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
@@ -154,12 +159,16 @@ def build(
         progress("reading the map", 0, total=0)
         data = _read_map(source)
         options = _with_elevation(source, data, options=options, progress=progress)
+        many = workers or os.cpu_count() or 1
+        data, options = with_clouds(
+            data, options, cloud=clouds, cache_dir=_cache_of(source), workers=many, progress=progress
+        )
         scene = build_scene(
             data,
             folder,
             options=options,
             overwrite=report.overwrite,
-            workers=workers or os.cpu_count() or 1,
+            workers=many,
             cluster=cluster,
             progress=progress,
         )

@@ -20,6 +20,7 @@ from geoscene.typing import Float
 
 _GEOGRAPHIC = "EPSG:4326"
 _LOCAL = "Local transverse Mercator at"
+_MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
 
 
 def _local_wkt(lon_deg: float, lat_deg: float) -> str:
@@ -213,3 +214,25 @@ class Frame:
         if not known:
             raise FrameError("a coordinate frame whose origin is nowhere on Earth")
         return frame
+
+
+def extent_of(
+    frame: Frame, bounds: tuple[float, float, float, float], *, footprints: Any
+) -> tuple[float, float, float, float]:
+    """Rectangle of a scene's ground in whole metres: contains the bounds of the map and all buildings.
+
+    bounds     : west, south, east, north in degrees
+    footprints : (n,) polygons of buildings, scene metres
+    """
+    west, south, east, north = bounds
+    step = max((east - west) / 8, (north - south) / 8, 1e-6)
+    x, y = frame.from_geographic(*rim_of(bounds, step=step))
+    boxes = shapely.bounds(footprints).reshape(-1, 4)
+    xs = np.concatenate([x, boxes[:, 0] - 2, boxes[:, 2] + 2])
+    ys = np.concatenate([y, boxes[:, 1] - 2, boxes[:, 3] + 2])
+    low = np.floor([xs.min(), ys.min()])
+    high = np.ceil([xs.max(), ys.max()])
+    thin = high - low < 2 * _MARGIN
+    low[thin] -= _MARGIN
+    high[thin] += _MARGIN
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -80,6 +80,7 @@ def scene_manifest(
         "leaf_area_density": leaf_area_density(relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
+        **({} if osm.cloud is None else {"cloud": osm.cloud}),
         "problems": summarise(problems),
         "limits": [
             limit.to_json()

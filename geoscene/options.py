@@ -104,6 +104,47 @@ class BuildOptions:
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
+class CloudOptions:
+    """Point clouds in which the ground, buildings and trees of a map are measured."""
+
+    cloud: Annotated[tuple[str, ...], SEVERAL] = ()
+    """Point clouds (.las, .laz, .copc.laz, .ply), airborne or mobile: heights of the ground, heights and
+    roofs of buildings, and trees are measured in them. --dem fills the ground beyond."""
+
+    cloud_crs: str = ""
+    """CRS of the point clouds, such as EPSG:32618; by default the one that the files state."""
+
+    cloud_unit: str = ""
+    """Unit of the point clouds' heights: m, ft or us-ft; by default that of their vertical CRS, or metres
+    where the horizontal CRS is in metres."""
+
+    cloud_align: bool = False
+    """Move the point clouds by the horizontal shift between their buildings and those of the map; it is
+    reported in any case."""
+
+    prefer: str = "cloud"
+    """Which heights and roofs of buildings are used where both are known: cloud, or tags."""
+
+    cloud_licence: str = ""
+    """Licence of the point clouds, for the scene's list of sources; unknown by default."""
+
+    cloud_attribution: str = ""
+    """Attribution of the point clouds, which the scene, its pages and exports show."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        if self.prefer not in ("cloud", "tags"):
+            raise InputError(f"`prefer` {self.prefer}: cloud or tags")
+        given = [name for name in _OF_CLOUDS if getattr(self, name)]
+        if given and not self.cloud:
+            raise InputError(f"`{given[0]}`: has no effect without `cloud`; leave it out")
+
+
+_OF_CLOUDS = ("cloud_crs", "cloud_unit", "cloud_align", "cloud_licence", "cloud_attribution")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
 class TradeoffOptions:
     """Options of a comparison of builds."""
 

@@ -22,7 +22,7 @@ from geoscene.features import (
     structure_layer,
     tree_layer,
 )
-from geoscene.frames import Frame, rim_of, wrapped
+from geoscene.frames import Frame, extent_of, wrapped
 from geoscene.ground import (
     GroundPlan,
     Layers,
@@ -88,7 +88,6 @@ LARGEST_KM2 = 10_500.0
 _TOLERANCE = 0.01  # of the distance between heights: maximum error of bare ground on the terrain's grid
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
-_MARGIN = 10.0  # metres of ground added on both sides of maps narrower than twice that
 _ARM = 10.0  # metres, maximum horizontal extent of lamps and signals from their position
 _MOVED = 40.0  # metres, more than trees and furniture are moved by and keep from other features
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
@@ -181,7 +180,7 @@ def make_plan(
     progress("buildings", 0, total=0)
     built = osm if "buildings" in options.only else replace(osm, areas=[], relations=[])
     buildings = _collect(problems, read_buildings(built, frame))
-    extent = _extent(frame, osm.bounds, buildings=buildings)
+    extent = extent_of(frame, osm.bounds, footprints=buildings.footprint[: buildings.count])
     terrain = Terrain(frame)
     if options.dem:
         gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
@@ -515,22 +514,6 @@ def _plan_ground(
         coarse=terrain.lines,
         relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
     )
-
-
-def _extent(frame: Frame, bounds: Bounds, *, buildings: Buildings) -> Bounds:
-    """Rectangle of the ground in whole metres: contains the bounds of the map and all buildings."""
-    west, south, east, north = bounds
-    step = max((east - west) / 8, (north - south) / 8, 1e-6)
-    x, y = frame.from_geographic(*rim_of(bounds, step=step))
-    boxes = shapely.bounds(buildings.footprint[: buildings.count])
-    xs = np.concatenate([x, boxes[:, 0] - 2, boxes[:, 2] + 2])
-    ys = np.concatenate([y, boxes[:, 1] - 2, boxes[:, 3] + 2])
-    low = np.floor([xs.min(), ys.min()])
-    high = np.ceil([xs.max(), ys.max()])
-    thin = high - low < 2 * _MARGIN
-    low[thin] -= _MARGIN
-    high[thin] += _MARGIN
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
 
 def _surfaces(

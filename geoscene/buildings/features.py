@@ -253,7 +253,7 @@ def _table(
 def _ranks(rows: Sequence[Row], heights: Heights) -> Ints:
     """How well each row is described (n,): 2 if the height of its building is known, 1 if only its name."""
     outline = [r.outline for r in rows]
-    known = np.isin(heights.source, ("tag", "est_height", "levels", "parts"))
+    known = np.isin(heights.source, ("cloud", "tag", "est_height", "levels", "parts"))
     known |= known[outline]
     named = np.array(["name" in rows[k].tags for k in outline], np.bool_)
     return np.where(known, 2, named).astype(np.int64)

@@ -49,6 +49,12 @@ _TYPICAL_OTHER = (9.5, 0.33)
 """Fitted by least squares of logarithms to building=yes with heights in Heidelberg, Monaco, Moscow, Berlin,
 Baltimore, New York and Helsinki, each city with the same weight; standard deviation of the residuals 0.62."""
 
+CLOUD_ROOF = "cloud:roof"
+"""Tag of a roof that was measured in a point cloud."""
+
+CLOUD_SIGMA = "cloud:height_sigma"
+"""Tag of a height that was measured in a point cloud: its standard deviation in metres."""
+
 SIGMA_TAG, SIGMA_EST, SIGMA_STOREYS = 0.5, 0.2, 0.15
 """Assumed standard deviations: metres for a tagged height, shares of it for est_height and storeys."""
 
@@ -81,12 +87,12 @@ class Tagged:
     """Tagged heights of one building or part, metres; NaN if not tagged.
 
     height   : top above base, roof included
-    source   : tag, est_height, levels or ""
+    source   : cloud, tag, est_height, levels or ""
     sigma    : metres
     minimum  : underside above base
     minimum_source : tag, levels or ""
     roof     : height of the roof
-    roof_source : tag, levels or ""
+    roof_source : cloud, tag, levels or ""
     levels   : storeys above ground, without those in the roof
     ignored  : tags whose values cannot be used, with the reasons
     """
@@ -114,7 +120,7 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     levels = read.first("building:levels", "levels", parse=parse_number, low=0, high=_MOST_LEVELS)
     roof_levels = read.first("roof:levels", parse=parse_number, low=0, high=_MOST_ROOF_LEVELS)
     roof = read.first("roof:height", "building:roof:height", parse=parse_length, low=0, high=_HIGHEST_ROOF)
-    roof_source = "tag" if np.isfinite(roof) else ""
+    roof_source = ("cloud" if CLOUD_ROOF in tags else "tag") if np.isfinite(roof) else ""
     height, source, sigma = _tagged_height(read)
 
     step = options.level_height
@@ -147,6 +153,8 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
 def _tagged_height(read: Quantities) -> tuple[float, str, float]:
     """Height in metres, source and standard deviation from a tagged height; NaN and "" if there is none."""
     height = read.first("height", "building:height", parse=parse_length, low=THINNEST, high=HIGHEST)
+    if np.isfinite(height) and CLOUD_SIGMA in read.tags:
+        return height, "cloud", read.first(CLOUD_SIGMA, parse=parse_number)
     if np.isfinite(height):
         return height, "tag", SIGMA_TAG
     height = read.first("est_height", parse=parse_length, low=THINNEST, high=HIGHEST)

@@ -109,7 +109,7 @@ def resolve_heights(rows: Sequence[Row], *, options: BuildingOptions) -> tuple[H
         if h.roof_source[k] == "tag":
             detail = f"roof of {h.roof[k]:g} m on {room:g} m"
             problems.append(Problem(rows[k].osm_id, "building", "repaired", "roof-over-height", detail))
-        h.roof[k] = room if h.roof_source[k] in ("tag", "levels") else 0.5 * room
+        h.roof[k] = room if h.roof_source[k] in ("cloud", "tag", "levels") else 0.5 * room
     return h, problems
 
 
@@ -130,7 +130,7 @@ def _resolve_roofs(rows: Sequence[Row], *, h: Heights, options: BuildingOptions)
     """Set missing roof heights, in place."""
     for k, row in enumerate(rows):
         if row.roof.shape == "flat":
-            h.roof[k], h.roof_source[k] = 0.0, "assumed" if row.roof.assumed else "tag"
+            h.roof[k], h.roof_source[k] = 0.0, "assumed" if row.roof.assumed else h.roof_source[k] or "tag"
         elif not np.isfinite(h.roof[k]):
             by_storeys = h.source[k] == "levels"
             walls = h.high[k] if by_storeys else np.inf
@@ -173,11 +173,12 @@ def _resolve_remainders(rows: Sequence[Row], is_part: Bools, *, outline: Ints, h
     """Set the heights of the remainders of outlines, in place.
 
     The outline's tags apply, unless a part on the ground is as high: the tags then describe that part, and
-    the remainder is as high as the lowest part on the ground.
+    the remainder is as high as the lowest part on the ground. Heights measured in a cloud are
+    the remainder's.
     """
     of = np.argsort(outline, kind="stable")
     begin, end = (np.searchsorted(outline[of], outline, side=side) for side in ("left", "right"))
-    for k in np.flatnonzero([r.is_remainder for r in rows]):
+    for k in np.flatnonzero([r.is_remainder and r.tagged.source != "cloud" for r in rows]):
         family = of[begin[k] : end[k]]
         parts = family[is_part[family] & np.isfinite(h.high[family])]
         grounded = [p for p in parts if p != k and h.low[p] < 0.01]

@@ -59,10 +59,11 @@ class Buildings(Columns):
     roof_direction   : (n,) downslope direction of the roof's face, radians counter-clockwise from x, NaN if
                        not tagged
     roof_across      : (n,) bool, whether the ridge runs across the longer side
-    height_source    : (n,) str: tag, est_height, levels, parts, outline, or inferred-<rule>
+    height_source    : (n,) str: cloud, tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)
-    roof_source      : (n,) str, source of roof_height: tag, levels, angle, default; assumed (unknown: flat)
+    roof_source      : (n,) str, source of roof_height: cloud, tag, levels, angle, default; assumed (unknown:
+                       flat)
     levels           : (n,) storeys above ground as tagged, NaN if not
     use              : (n,) str, the value of building or building:part
     name             : (n,) str

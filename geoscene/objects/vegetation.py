@@ -46,6 +46,12 @@ _CONIFERS = frozenset(
      "thuja", "tsuga"}
 )  # fmt: skip
 
+CLOUD_TREE = "cloud:tree"
+"""Tag of a tree whose height and crown were measured in a point cloud."""
+
+_PLACES = {"node": "node", "cloud": "cloud"}
+"""Sources of places by the kind of the id; others are rows."""
+
 _TALLEST, _WIDEST, _THICKEST = 116.0, 60.0, 36.0
 """Metres of the tallest known tree (Hyperion), the widest crown and the greatest girth."""
 
@@ -60,12 +66,14 @@ class Trees(Columns):
     trunk   : (n,) float64 metres, diameter at breast height
     form    : (n,) str: ``broadleaved``, ``needleleaved`` or ``palm``
     habit   : (n,) str, growth form, of `geoscene.objects.crowns.HABITS`; "" in scenes without relief
-    height_source : (n,) str: ``height``, ``diameter_crown``, ``circumference``, ``default`` or ``sampled``
-    crown_source : (n,) str: ``diameter_crown`` or ``height`` (by its ratio to the height)
+    height_source : (n,) str: ``cloud``, ``height``, ``diameter_crown``, ``circumference``, ``default``
+              or ``sampled``
+    crown_source : (n,) str: ``cloud``, ``diameter_crown`` or ``height`` (by its ratio to the height)
     form_source : (n,) str: ``leaf_type``, ``genus`` or ``default``
     habit_source : (n,) str: ``species`` (botanical names), ``form`` (the usual one of the form) or ""
-    place_source : (n,) str: ``node`` (where it is mapped), ``moved`` (mapped on a carriageway, moved to the
-              nearest clear place), ``row`` (spaced along a tree row) or ``sampled``
+    place_source : (n,) str: ``node`` (where it is mapped), ``cloud`` (where its crown was measured),
+              ``moved`` (on a carriageway, moved to the nearest clear place), ``row`` (spaced
+              along a tree row) or ``sampled``
     moved   : (n,) float64 metres from where it is mapped
     osm_id  : (n,) str: the tree's node, or its row's way; "" for a sampled one
     feature : (n,) int32: as read, consecutive
@@ -137,10 +145,10 @@ def read_trees(
         form,
         habit.astype(np.str_),
         height_source,
-        np.where(mapped, "diameter_crown", "height"),
+        np.where(height_source == "cloud", "cloud", np.where(mapped, "diameter_crown", "height")),
         form_source,
         habit_source.astype(np.str_),
-        np.array(["node" if osm_id.startswith("node/") else "row" for osm_id in ids], np.str_),
+        np.array([_PLACES.get(osm_id.partition("/")[0], "row") for osm_id in ids], np.str_),
         np.zeros(len(ids)),
         np.array(ids, np.str_),
         np.arange(len(ids), dtype=np.int32),
@@ -159,7 +167,7 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     trees = trees.take((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
     sites = Sites.of(plan)
     klass, driven = sites.classes(trees.xy), sites.driven(trees.xy)
-    single = trees.place_source == "node"
+    single = trees.place_source != "row"
     amid = single & driven
     xy, source, lost = trees.xy.copy(), trees.place_source.astype("U7"), np.zeros(len(trees), np.bool_)
     xy[amid], found = sites.nearest_clear(trees.xy[amid])
@@ -243,7 +251,7 @@ def _sizes(tags: Tags, osm_id: str, *, problems: list[Problem]) -> tuple[float, 
     crown = _metres(tags, "diameter_crown", most=_WIDEST, osm_id=osm_id, problems=problems)
     girth = _girth(tags, osm_id, problems=problems)
     height = _metres(tags, "height", most=_TALLEST, osm_id=osm_id, problems=problems)
-    source = "height"
+    source = "cloud" if CLOUD_TREE in tags else "height"
     if not np.isfinite(height):
         if np.isfinite(crown):
             height, source = crown / CROWN[form], "diameter_crown"

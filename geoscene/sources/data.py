@@ -107,6 +107,7 @@ class OsmData:
     kind        : name of the source in `geoscene.sources.registry.SOURCES`
     attribution : of these data, if more specific than the registry's
     added       : credits of other sources from which features were merged in
+    cloud       : what was measured in point clouds, for the report; None without
     """
 
     bounds: Bounds
@@ -120,6 +121,7 @@ class OsmData:
     kind: str = "osm"
     attribution: str = ""
     added: tuple[Credit, ...] = ()
+    cloud: dict[str, Any] | None = None
 
     @property
     def digest(self) -> str:

@@ -1,0 +1,145 @@
+"""The ground in a point cloud: a raster of heights from its ground returns, or from those a filter finds."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.clouds.read import GROUND
+from geoscene.clouds.spool import Points
+from geoscene.typing import Bools, Float
+
+WINDOW = 18.0
+"""Metres of the widest object that the filter takes off the ground, besides mapped buildings, which are
+left out before: the default of Pingel et al. 2013."""
+
+MARGIN = 24.0
+"""Metres around a square that the filter needs."""
+
+_SLOPE = 0.15
+"""Rise over run that an opening may cut: the default of Pingel et al. 2013."""
+
+_OFF = (0.25, 1.25)
+"""Metres, and shares of the local gradient, within which a point belongs to the filtered ground."""
+
+
+class Grid(NamedTuple):
+    """A lattice of cells.
+
+    x, y    : scene metres of the lower left corner
+    columns : cells along x
+    rows    : cells along y
+    cell    : metres of a cell's side
+    """
+
+    x: float
+    y: float
+    columns: int
+    rows: int
+    cell: float
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns); row 0 is the southernmost."""
+        return self.rows, self.columns
+
+    def cells(self, xy: Float) -> NDArray[np.int64]:
+        """Flat index (n,) of the cell of each point (n, 2), which lies in the grid."""
+        column = np.clip(((xy[:, 0] - self.x) / self.cell).astype(np.int64), 0, self.columns - 1)
+        row = np.clip(((xy[:, 1] - self.y) / self.cell).astype(np.int64), 0, self.rows - 1)
+        flat: NDArray[np.int64] = row * self.columns + column
+        return flat
+
+    def centres(self) -> tuple[Float, Float]:
+        """Eastings and northings (rows, columns) of the cells' centres."""
+        x = self.x + (np.arange(self.columns) + 0.5) * self.cell
+        y = self.y + (np.arange(self.rows) + 0.5) * self.cell
+        east, north = np.meshgrid(x, y)
+        return east, north
+
+
+def ground_heights(points: Points, grid: Grid, *, classified: bool, built: Bools) -> Float:
+    """Heights (rows, columns) of the ground at the cells' centres, NaN where no ground return lies.
+
+    A cell's height is the mean of its ground returns, moved along the local slope from their mean place to
+    the centre.
+
+    classified : ground returns are those of class ground, else those that `ground_returns` finds
+    built      : (rows, columns) cells in mapped buildings, without ground
+    """
+    found = np.isin(points.klass, GROUND) if classified else ground_returns(points, grid, built=built)
+    found &= ~built.ravel()[grid.cells(points.xyz[:, :2])]
+    xyz = points.xyz[found]
+    cell = grid.cells(xyz[:, :2])
+    count = np.bincount(cell, minlength=grid.rows * grid.columns).reshape(grid.shape)
+    with np.errstate(invalid="ignore"):
+        x, y, z = (
+            np.bincount(cell, xyz[:, k], minlength=grid.rows * grid.columns).reshape(grid.shape) / count
+            for k in range(3)
+        )
+    east, north = grid.centres()
+    if (count > 0).any():
+        along_y, along_x = np.gradient(bridged(z), grid.cell)
+        z -= np.clip(along_x, -1.0, 1.0) * (x - east) + np.clip(along_y, -1.0, 1.0) * (y - north)
+    return np.asarray(z, float)
+
+
+def ground_returns(points: Points, grid: Grid, *, built: Bools) -> Bools:
+    """Which points (n,) lie on the ground, by a progressive morphological filter (SMRF, Pingel et al. 2013).
+
+    The lowest last returns of the cells are opened with windows of growing width. What an opening lowers by
+    more than the slope allows is no ground; gaps are bridged, and points near the surface left are ground.
+
+    built : (rows, columns) cells in mapped buildings, without ground
+    """
+    from scipy.ndimage import grey_opening  # noqa: PLC0415 - slow to import
+
+    low = np.full(grid.rows * grid.columns, np.inf)
+    last = points.xyz[points.last]
+    np.minimum.at(low, grid.cells(last[:, :2]), last[:, 2])
+    low = low.reshape(grid.shape)
+    low[built | ~np.isfinite(low)] = np.nan
+    if np.isnan(low).all():
+        return np.zeros(len(points), np.bool_)
+    objects = _low_outliers(low, grid.cell)
+    surface = bridged(np.where(objects, np.nan, low))
+    earlier = surface
+    for radius in range(1, int(np.ceil(WINDOW / grid.cell)) + 1):
+        opened = grey_opening(earlier, size=(2 * radius + 1, 2 * radius + 1), mode="nearest")
+        objects |= earlier - opened > _SLOPE * radius * grid.cell
+        earlier = opened
+    ground = bridged(np.where(objects, np.nan, surface))
+    steep = np.hypot(*np.gradient(ground, grid.cell))
+    cell = grid.cells(points.xyz[:, :2])
+    reach = _OFF[0] + _OFF[1] * np.minimum(steep, 2.0) * grid.cell / 2
+    off = np.abs(points.xyz[:, 2] - ground.ravel()[cell])
+    return np.asarray(off <= reach.ravel()[cell], np.bool_)
+
+
+def bridged(heights: Float) -> Float:
+    """Heights without gaps: NaN cells by linear interpolation between the cells around, else the nearest."""
+    from scipy.interpolate import LinearNDInterpolator  # noqa: PLC0415 - slow to import
+    from scipy.ndimage import binary_dilation, distance_transform_edt  # noqa: PLC0415
+
+    gap = np.isnan(heights)
+    if not gap.any() or gap.all():
+        return heights
+    row, column = distance_transform_edt(gap, return_distances=False, return_indices=True)
+    filled = heights[row, column]
+    rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
+    if len(rim) > 3 and np.ptp(rim, axis=0).all():
+        holes = np.nonzero(gap)
+        linear = LinearNDInterpolator(rim, heights[tuple(rim.T)])(np.column_stack(holes))
+        filled[holes] = np.where(np.isnan(linear), filled[holes], linear)
+    return np.asarray(filled, float)
+
+
+def _low_outliers(low: Float, cell: float) -> Bools:
+    """Cells whose lowest return is far below all around: echoes from below the ground."""
+    from scipy.ndimage import grey_closing  # noqa: PLC0415 - slow to import
+
+    surface = bridged(low)
+    closed = grey_closing(surface, size=(3, 3), mode="nearest")
+    return np.asarray(closed - surface > 5.0 * _SLOPE * cell + 0.5, np.bool_)

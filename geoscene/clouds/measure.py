@@ -1,0 +1,284 @@
+"""Measures a cloud square by square, in worker processes: the ground, then roofs and trees above it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from geoscene.buildings import Buildings
+from geoscene.clouds import shift as shifts
+from geoscene.clouds import trees as canopy
+from geoscene.clouds.ground import MARGIN, Grid, ground_heights
+from geoscene.clouds.read import VEGETATION
+from geoscene.clouds.roofs import Roof, fit_roof, roof_points
+from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
+from geoscene.frames import Frame
+from geoscene.ground.terrain import Terrain, base_heights
+from geoscene.processes import run_tasks
+from geoscene.progress import Progress
+from geoscene.typing import Bools, Float
+
+_INSET = 0.5  # metres from a wall within which points are not taken for the roof: georeferencing, walls
+_HIGH = 2.5  # metres above the ground that buildings are told by when the shift is sought
+_LOWEST_ROOF = 1.0  # metres above the building's base
+_NO_ROOF = (2, 3, 4, 5, 7, 9, 11, 17, 18)  # classes of ground, vegetation, noise, water, roads, bridges
+
+
+class Work(NamedTuple):
+    """What all squares are measured with; the shift is added to all points."""
+
+    spool: Spool
+    footprints: Any
+    cell: float
+    shift: tuple[float, float]
+
+
+class GroundOf(NamedTuple):
+    """The ground of a square, the agreement of buildings with the map, and the outliers left out."""
+
+    square: Square
+    heights: Float
+    agreement: Float
+    outliers: int
+
+
+class _Objects(NamedTuple):
+    """Roofs by row of the buildings, and trees, of a square."""
+
+    square: Square
+    roofs: list[tuple[int, Roof | None]]
+    trees: canopy.Found
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """What was measured in a cloud.
+
+    frame     : of the scene
+    buildings : table of the map before the measurement
+    rows      : (k,) rows of buildings that were sought
+    roofs     : of those rows, None where too few points lie on the roof or no shape fits
+    base      : (k,) z of the lowest ground along their outlines
+    trees     : all that were found
+    """
+
+    frame: Frame
+    buildings: Buildings
+    rows: list[int]
+    roofs: list[Roof | None]
+    base: Float
+    trees: canopy.Found
+
+
+def classified(spool: Spool) -> bool:
+    """Whether the ground is told by class: of at least one point in a hundred."""
+    return 100 * spool.ground >= spool.read - spool.outside
+
+
+def box_of(square: Square, margin: float = 0.0) -> tuple[float, float, float, float]:
+    """Bounds (xmin, ymin, xmax, ymax) of a square, scene metres, and of a margin around it."""
+    x, y = square[0] * SIDE, square[1] * SIDE
+    return x - margin, y - margin, x + SIDE + margin, y + SIDE + margin
+
+
+def grid_of(square: Square, cell: float, *, margin: float) -> Grid:
+    """Cells of a square and of a margin around it, in whole cells."""
+    around = int(np.ceil(margin / cell))
+    x, y, _, _ = box_of(square, around * cell)
+    many = round(SIDE / cell) + 2 * around
+    return Grid(x, y, many, many, cell)
+
+
+def burnt(shapes: Any, grid: Grid, *, buffer: float = 0.0) -> Bools:
+    """Cells (rows, columns) whose centres lie in polygons, or within ``buffer`` metres of them."""
+    from rasterio import Affine  # noqa: PLC0415 - slow to import
+    from rasterio.features import rasterize  # noqa: PLC0415
+
+    width, height = grid.columns * grid.cell, grid.rows * grid.cell
+    box = shapely.box(grid.x, grid.y, grid.x + width, grid.y + height).buffer(buffer)
+    near = shapes[shapely.intersects(shapes, box)]
+    near = shapely.get_parts(shapely.buffer(near, buffer) if buffer else near)
+    near = near[~shapely.is_empty(near)]
+    if not len(near):
+        return np.zeros(grid.shape, np.bool_)
+    place = Affine(grid.cell, 0.0, grid.x, 0.0, grid.cell, grid.y)
+    return np.asarray(rasterize(near.tolist(), grid.shape, transform=place, dtype="uint8"), np.bool_)
+
+
+def _points(work: Work, square: Square, *, margin: float) -> tuple[Points, int]:
+    """The points of a square with a margin, without outliers, and the outliers in the square itself."""
+    # a voxel more, so that what lies at the rim has all its neighbours
+    wide = work.spool.around(box_of(square, margin + 3.0), shift=work.shift)
+    kept = without_outliers(wide)
+    xmin, ymin, xmax, ymax = box_of(square)
+    within = [
+        ((p.xyz[:, 0] >= xmin) & (p.xyz[:, 0] < xmax) & (p.xyz[:, 1] >= ymin) & (p.xyz[:, 1] < ymax)).sum()
+        for p in (wide, kept)
+    ]
+    x0, y0, x1, y1 = box_of(square, margin)
+    x, y = kept.xyz[:, 0], kept.xyz[:, 1]
+    return kept.take((x >= x0) & (x < x1) & (y >= y0) & (y < y1)), int(within[0] - within[1])
+
+
+def grounds_of(work: Work, *, workers: int, progress: Progress) -> list[GroundOf]:
+    """The ground of all squares, sorted."""
+    low, high = (
+        np.floor((np.array(some) * SIDE + work.shift) / SIDE).astype(int)
+        for some in (np.min(work.spool.squares, axis=0), np.max(work.spool.squares, axis=0))
+    )
+    squares = [(i, j) for i in range(low[0], high[0] + 2) for j in range(low[1], high[1] + 2)]
+    found = []
+    for done, ground in enumerate(run_tasks(partial(_ground_of, work), squares, workers=workers), 1):
+        found.append(ground)
+        progress("ground of the cloud", done, total=len(squares))
+    return sorted(found, key=lambda ground: ground.square)
+
+
+def _ground_of(work: Work, square: Square) -> GroundOf:
+    """The ground of one square."""
+    points, outliers = _points(work, square, margin=MARGIN)
+    grid = grid_of(square, work.cell, margin=MARGIN)
+    around = int(np.ceil(MARGIN / work.cell))
+    own = slice(around, -around)
+    none = np.zeros((2 * shifts.REACH + 1, 2 * shifts.REACH + 1))
+    if not len(points):
+        return GroundOf(square, np.full((grid.rows - 2 * around,) * 2, np.nan), none, 0)
+    built = burnt(work.footprints, grid, buffer=0.5)
+    heights = ground_heights(points, grid, classified=classified(work.spool), built=built)
+    score = none
+    if np.isfinite(heights).any() and built.any():
+        fine = grid_of(square, shifts.CELL, margin=shifts.MARGIN)
+        low = _nearest(heights)
+        xy = points.xyz[:, :2]
+        above = points.xyz[:, 2] - low.ravel()[grid.cells(xy)]
+        inside = (xy >= (fine.x, fine.y)).all(axis=1)
+        inside &= (xy < (fine.x + fine.columns * fine.cell, fine.y + fine.rows * fine.cell)).all(axis=1)
+        high = np.zeros(fine.shape, np.bool_)
+        tall = inside & (above > _HIGH) & ~np.isin(points.klass, VEGETATION)
+        high.ravel()[fine.cells(xy[tall])] = True
+        score = shifts.agreement(high, burnt(work.footprints, fine))
+    return GroundOf(square, heights[own, own], score, outliers)
+
+
+def _nearest(heights: Float) -> Float:
+    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
+
+    row, column = distance_transform_edt(np.isnan(heights), return_distances=False, return_indices=True)
+    return np.asarray(heights[row, column], float)
+
+
+def measure(
+    work: Work, buildings: Buildings, *, terrain: Terrain, frame: Frame, workers: int, progress: Progress
+) -> Measured:
+    """Roofs of all buildings and parts that are drawn, and all trees."""
+    rows = np.flatnonzero(buildings.drawn & ~shapely.is_empty(buildings.footprint))
+    outlines = _seen_from_above(buildings.footprint[rows], buildings.outline[rows])
+    base = base_heights(buildings.footprint[buildings.outline[rows]], terrain.height)
+    centre = shapely.bounds(outlines).reshape(-1, 2, 2).mean(axis=1)
+    home = np.floor(centre / SIDE).astype(np.int64)
+    tasks = sorted({(int(i), int(j)) for i, j in home} | set(work.spool.squares))
+    mine = {square: [] for square in tasks}  # type: dict[Square, list[int]]
+    for k, (i, j) in enumerate(home.tolist()):
+        mine[i, j].append(k)
+    shape = partial(
+        _objects_of,
+        work,
+        outlines=outlines,
+        whole=buildings.footprint[rows],
+        base=base,
+        names=buildings.osm_id[rows],
+        mine=mine,
+        terrain=terrain,
+    )
+    found: list[_Objects] = []
+    for done, some in enumerate(run_tasks(shape, tasks, workers=workers), 1):
+        found.append(some)
+        progress("buildings and trees of the cloud", done, total=len(tasks))
+    found.sort(key=lambda some: some.square)
+    roofs = dict(pair for some in found for pair in some.roofs)
+    trees = [some.trees for some in found]
+    return Measured(
+        frame,
+        buildings,
+        rows.tolist(),
+        [roofs.get(k) for k in range(len(rows))],
+        base,
+        canopy.Found(
+            *(np.concatenate([getattr(t, name) for t in trees]) for name in ("xy", "height", "crown"))
+        ),
+    )
+
+
+def _seen_from_above(footprints: Any, owner: Any) -> Any:
+    """Footprints (n,) of bodies without the smaller ones of the same building over them, which hide them."""
+    tree = shapely.STRtree(footprints)
+    out = footprints.copy()
+    area = shapely.area(footprints)
+    one, two = tree.query(footprints, predicate="overlaps")
+    three, four = tree.query(footprints, predicate="contains")
+    one, two = np.concatenate([one, three]), np.concatenate([two, four])
+    hides = (owner[one] == owner[two]) & (area[two] < area[one])
+    for k in np.unique(one[hides]).tolist():
+        rest = shapely.difference(footprints[k], shapely.union_all(footprints[two[hides & (one == k)]]))
+        if shapely.area(rest) > 0.1 * area[k]:
+            out[k] = rest
+    return out
+
+
+def _objects_of(
+    work: Work,
+    square: Square,
+    *,
+    outlines: Any,
+    whole: Any,
+    base: Float,
+    names: Any,
+    mine: dict[Square, list[int]],
+    terrain: Terrain,
+) -> _Objects:
+    """Roofs of the buildings whose middle is in a square, and its trees."""
+    own = mine.get(square, [])
+    reach = 0.0
+    if own:
+        boxes = shapely.bounds(outlines[own])
+        xmin, ymin, xmax, ymax = box_of(square)
+        over = np.column_stack(
+            [xmin - boxes[:, 0], ymin - boxes[:, 1], boxes[:, 2] - xmax, boxes[:, 3] - ymax]
+        )
+        reach = max(float(over.max()), 0.0)
+    points, _ = _points(work, square, margin=max(reach, canopy.MARGIN))
+    order = np.argsort(points.xyz[:, 0], kind="stable")
+    points = points.take(order)
+    roofs = []
+    solid = ~np.isin(points.klass, _NO_ROOF)
+    for k in own:
+        xmin, _, xmax, _ = shapely.bounds(outlines[k])
+        a, b = np.searchsorted(points.xyz[:, 0], (xmin, xmax))
+        some = points.xyz[a:b][solid[a:b] & (points.xyz[a:b, 2] > base[k] + _LOWEST_ROOF)]
+        some = some[roof_points(outlines[k], some, inset=_INSET)]
+        roofs.append((k, fit_roof(whole[k], some, seed=str(names[k]))))
+    return _Objects(square, roofs, _trees_of(work, square, points=points, terrain=terrain))
+
+
+def _trees_of(work: Work, square: Square, *, points: Points, terrain: Terrain) -> canopy.Found:
+    """Trees whose crowns have their middle in a square."""
+    x0, y0, x1, y1 = box_of(square, canopy.MARGIN)
+    x, y = points.xyz[:, 0], points.xyz[:, 1]
+    use = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
+    vegetation = np.isin(points.klass, VEGETATION)
+    if work.spool.vegetation:
+        use &= vegetation
+    else:
+        use &= ~np.isin(points.klass, (6, 9, 11, 17))
+    xyz = points.xyz[use]
+    grid = grid_of(square, canopy.CELL, margin=canopy.MARGIN)
+    built = burnt(work.footprints, grid, buffer=1.0)
+    above = xyz[:, 2] - terrain.height(xyz[:, 0], xyz[:, 1])
+    found = canopy.find_trees(xyz, above, grid=grid, excluded=built)
+    xmin, ymin, xmax, ymax = box_of(square)
+    x, y = found.xy.T
+    return found.take((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))

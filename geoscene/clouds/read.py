@@ -1,0 +1,207 @@
+"""Reads point clouds in pieces: LAS, LAZ, COPC and PLY, in any CRS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from geoscene.errors import InputError, SourceNotFoundError, reading
+from geoscene.typing import Bools, Float
+
+AT_ONCE = 1_000_000
+"""Points that are read at once."""
+
+GROUND, VEGETATION, NOISE = (2, 11), (3, 4, 5), (7, 18)
+"""Classes of the ASPRS: ground and road surfaces; low, medium and high vegetation; low and high noise."""
+
+_UNITS = {"m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
+_REMEDY = "give a LAS, LAZ, COPC or PLY file"
+_SUFFIXES = (".las", ".laz", ".ply")
+
+_PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+    "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+    "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+class Chunk(NamedTuple):
+    """Points of a file.
+
+    xyz   : (n, 3) float64 in the file's CRS; z in its unit
+    klass : (n,) uint8 class of the ASPRS, 0 where the file has none
+    last  : (n,) bool, the last return of its pulse; True where the file does not tell
+    """
+
+    xyz: Float
+    klass: NDArray[np.uint8]
+    last: Bools
+
+
+@dataclass(frozen=True, slots=True)
+class CloudFile:
+    """A point cloud on disk.
+
+    crs       : horizontal CRS
+    to_metres : metres per unit of z
+    vertical  : ``orthometric`` or ``ellipsoidal``
+    datum     : the vertical datum in words, and how it is known
+    count     : points
+    """
+
+    path: Path
+    crs: CRS
+    to_metres: float
+    vertical: str
+    datum: str
+    count: int
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The points in the order of the file; withheld ones and those of class noise have class 7."""
+        with reading(self.path, InputError, remedy=_REMEDY):
+            yield from (_las_chunks if self.path.suffix.lower() != ".ply" else _ply_chunks)(self.path)
+
+
+def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> CloudFile:
+    """The header of a cloud.
+
+    crs  : of the coordinates, where the file states none or a wrong one
+    unit : of heights, ``m``, ``ft`` or ``us-ft``; by default that of the vertical CRS, else metres where
+           the horizontal CRS is in metres or degrees
+
+    Raises SourceNotFoundError for a missing file, InputError for one that cannot be read, without CRS, with
+    a CRS that is unknown, local or geocentric, or whose unit of heights is not known.
+    """
+    if not path.exists():
+        raise SourceNotFoundError(f"{path}: no such point cloud")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{path}: not one of {', '.join(_SUFFIXES)}; {_REMEDY}")
+    if unit and unit not in _UNITS:
+        raise InputError(f"`cloud_unit` {unit}: give m, ft or us-ft")
+    with reading(path, InputError, remedy=_REMEDY):
+        stated, count = (_ply_header if path.suffix.lower() == ".ply" else _las_header)(path)
+    if not count:
+        raise InputError(f"{path}: holds no points")
+    if crs:
+        try:
+            stated = CRS.from_user_input(crs)
+        except CRSError as error:
+            raise InputError(f"`cloud_crs` {crs}: unknown to pyproj; give EPSG:<number>") from error
+    if stated is None:
+        raise InputError(f"{path}: states no CRS; give it, as with `cloud_crs` EPSG:32618")
+    upright = stated.sub_crs_list[1] if stated.is_compound else None
+    plane = stated.sub_crs_list[0] if stated.is_compound else stated.to_2d()
+    if plane.is_geocentric or not (plane.is_geographic or plane.is_projected):
+        raise InputError(f"{path}: CRS {stated.name} is neither projected nor geographic; give `cloud_crs`")
+    ellipsoidal = upright is None and len(stated.axis_info) == 3
+    if unit:
+        factor = _UNITS[unit]
+    elif upright is not None or ellipsoidal:
+        axis = (upright or stated).axis_info[-1]
+        factor = float(axis.unit_conversion_factor)
+    elif plane.is_geographic or plane.axis_info[0].unit_conversion_factor == 1.0:
+        factor = 1.0
+    else:
+        name = plane.axis_info[0].unit_name
+        raise InputError(
+            f"{path}: {plane.name} is in {name}, and no vertical CRS states the unit of heights; say which,"
+            " with `cloud_unit` m, ft or us-ft"
+        )
+    datum = upright.name if upright is not None else f"ellipsoid of {stated.name}" if ellipsoidal else ""
+    return CloudFile(
+        path,
+        plane,
+        factor,
+        "ellipsoidal" if ellipsoidal else "orthometric",
+        datum or "not stated, taken for heights above a geoid",
+        count,
+    )
+
+
+def _las_header(path: Path) -> tuple[CRS | None, int]:
+    import laspy  # noqa: PLC0415  (0.4 s)
+
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as source:
+        return source.header.parse_crs(), int(source.header.point_count)
+
+
+def _las_chunks(path: Path) -> Iterator[Chunk]:
+    import laspy  # noqa: PLC0415
+
+    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as source:
+        for points in source.chunk_iterator(AT_ONCE):
+            klass = np.asarray(points.classification, np.uint8)
+            klass[np.asarray(points.withheld, bool)] = NOISE[0]
+            count, number = (np.asarray(points[name]) for name in ("number_of_returns", "return_number"))
+            xyz = np.column_stack([points.x, points.y, points.z]).astype(np.float64, copy=False)
+            yield Chunk(xyz, klass, number >= count)
+
+
+class _Ply(NamedTuple):
+    """Layout of the vertices of a PLY file: where they begin, how many, their record; ASCII if text."""
+
+    start: int
+    vertices: int
+    record: np.dtype[Any]
+    text: bool
+    comments: tuple[str, ...]
+
+
+def _ply_layout(file: IO[bytes]) -> _Ply:
+    """The layout of a PLY file, whose vertices come first; raises ValueError for another one."""
+    words: list[list[str]] = []
+    while not words or words[-1] != ["end_header"]:
+        line = file.readline(4096)
+        if not line or (not words and line.strip() != b"ply"):
+            raise ValueError("no PLY header")
+        words.append(line.decode("ascii", "replace").split())
+    kind = next(w[1] for w in words if w[:1] == ["format"])
+    order = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}[kind]
+    element = [k for k, w in enumerate(words) if w[:1] == ["element"]]
+    if not element or words[element[0]][1] != "vertex":
+        raise ValueError("the first element is not vertex")
+    end = element[1] if len(element) > 1 else len(words)
+    fields = [w for w in words[element[0] : end] if w[:1] == ["property"]]
+    record = np.dtype([(w[2], order + _PLY_TYPES[w[1]]) for w in fields])
+    if not {"x", "y", "z"} <= set(record.names or ()):
+        raise ValueError("vertices have no x, y and z")
+    comments = tuple(" ".join(w[1:]) for w in words if w[:1] == ["comment"])
+    return _Ply(file.tell(), int(words[element[0]][2]), record, kind == "ascii", comments)
+
+
+def _ply_header(path: Path) -> tuple[CRS | None, int]:
+    """CRS of a comment ``crs NAME``, and the number of points."""
+    with path.open("rb") as file:
+        layout = _ply_layout(file)
+    for comment in layout.comments:
+        if comment.startswith("crs "):
+            try:
+                return CRS.from_user_input(comment.removeprefix("crs ")), layout.vertices
+            except CRSError:
+                return None, layout.vertices
+    return None, layout.vertices
+
+
+def _ply_chunks(path: Path) -> Iterator[Chunk]:
+    with path.open("rb") as file:
+        layout = _ply_layout(file)
+        for first in range(0, layout.vertices, AT_ONCE):
+            many = min(AT_ONCE, layout.vertices - first)
+            if layout.text:
+                rows = np.loadtxt(file, layout.record, max_rows=many, ndmin=1)
+            else:
+                rows = np.frombuffer(file.read(many * layout.record.itemsize), layout.record)
+            if len(rows) < many:
+                raise ValueError(f"ends after {first + len(rows)} of {layout.vertices} points")
+            names = layout.record.names or ()
+            known = next((n for n in ("classification", "scalar_Classification") if n in names), "")
+            klass = rows[known].astype(np.uint8) if known else np.zeros(many, np.uint8)
+            xyz = np.column_stack([rows[axis].astype(np.float64) for axis in "xyz"])
+            yield Chunk(xyz, klass, np.ones(many, np.bool_))

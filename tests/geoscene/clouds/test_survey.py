@@ -1,0 +1,184 @@
+"""A village measured in a cloud: heights, roofs, trees and ground, by any number of processes."""
+
+import json
+
+import numpy as np
+import pytest
+import shapely
+from helpers.clouds import write_las
+
+from geoscene.clouds.apply import check_unit
+from geoscene.clouds.survey import with_clouds
+from geoscene.errors import InputError
+from geoscene.files import digest_of
+from geoscene.frames import Frame
+from geoscene.ground.terrain import open_terrain
+from geoscene.options import BuildOptions, CloudOptions
+from geoscene.pipeline import build
+from geoscene.sources.data import Area, OsmData, Point
+
+CENTRE = (9.5, 47.1)
+FRAME = Frame.at(*CENTRE)
+NO_NODES = np.empty(0, np.int64)
+SLOPE = 0.05
+HOUSES = {  # id: middle, size along x and y, eaves above the base, rise, shape
+    "way/1": ((-30.0, -20.0), (14.0, 9.0), 6.0, 3.0, "gabled"),
+    "way/2": ((25.0, -25.0), (16.0, 10.0), 8.0, 0.0, "flat"),
+    "way/3": ((-20.0, 30.0), (15.0, 9.0), 5.0, 2.5, "hipped"),
+    "way/4": ((30.0, 30.0), (12.0, 8.0), 4.0, 1.5, "gabled"),  # without points on it
+}
+TREES = [((0.0, 5.0), 11.0, 6.0), ((45.0, 5.0), 8.0, 5.0)]  # middle, height, crown diameter
+
+
+def ground(x):
+    return 400 + SLOPE * x
+
+
+def base(name):
+    (x, _), (width, _), *_ = HOUSES[name]
+    return ground(x - width / 2)
+
+
+def village_cloud(*, seed=1, shift=(0.0, 0.0), noise=0.02):
+    """Points (n, 3) of the village, scene metres, by the equations of its surfaces."""
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-60, 60, (90_000, 2))
+    z, gone = ground(xy[:, 0]), np.zeros(len(xy), bool)
+    for name, (middle, (width, depth), eaves, rise, shape) in HOUSES.items():
+        u, v = (xy - middle).T
+        inside = (np.abs(u) < width / 2) & (np.abs(v) < depth / 2)
+        side, end = 1 - np.abs(v) / (depth / 2), (width / 2 - np.abs(u)) / (depth / 2)
+        share = {"flat": 0 * u, "gabled": side, "hipped": np.minimum(side, end)}[shape]
+        z = np.where(inside, base(name) + eaves + rise * share, z)
+        gone |= inside & (name == "way/4")
+    for middle, height, crown in TREES:
+        off = np.hypot(*(xy - middle).T) / (crown / 2)
+        leaves = (off < 1) & (rng.random(len(xy)) < 0.8)
+        top = 0.6 * height + 0.4 * height * np.sqrt(np.clip(1 - off**2, 0, 1))
+        z = np.where(leaves, ground(xy[:, 0]) + top * rng.uniform(0.75, 1.0, len(xy)) ** 0.3, z)
+    xyz = np.column_stack([xy + shift, z + rng.normal(0, noise, len(xy))])
+    return xyz[~gone]
+
+
+def village_map(*, tags=None):
+    def ring(middle, size):
+        corners = np.array(middle) + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * np.array(size) / 2
+        return shapely.Polygon(np.column_stack(FRAME.to_geographic(*corners.T)))
+
+    areas = [
+        Area(name, {"building": "yes", **((tags or {}).get(name, {}))}, ring(middle, size), NO_NODES)
+        for name, (middle, size, *_) in HOUSES.items()
+    ]
+    lon, lat = FRAME.to_geographic(*TREES[0][0])
+    west, south = FRAME.to_geographic(-50, -50)
+    east, north = FRAME.to_geographic(50, 50)
+    middle = (float(west + east) / 2, float(south + north) / 2)
+    bounds = (middle[0] - 0.0007, middle[1] - 0.00045, middle[0] + 0.0007, middle[1] + 0.00045)
+    tree = Point("node/1", {"natural": "tree"}, float(lon), float(lat))
+    return OsmData(bounds, [], areas, [tree], [], source="village")
+
+
+@pytest.fixture(scope="module")
+def cloud_file(tmp_path_factory):
+    return las_of(village_cloud(), tmp_path_factory.mktemp("cloud") / "village.laz")
+
+
+def las_of(xyz, path):
+    east, north = FRAME.to_crs(xyz[:, 0], xyz[:, 1], crs="EPSG:32632")
+    return write_las(path, np.column_stack([east, north, xyz[:, 2]]), crs="EPSG:32632")
+
+
+def measured(osm, path, cache, *, workers=1, **options):
+    cloud = CloudOptions(cloud=(str(path),), **options)
+    return with_clouds(osm, BuildOptions(), cloud=cloud, cache_dir=cache, workers=workers)
+
+
+def tags_of(osm):
+    return {area.osm_id: area.tags for area in osm.areas}
+
+
+def test_heights_roofs_trees_and_ground_of_a_village_are_measured(cloud_file, tmp_path):
+    osm, options = measured(village_map(), cloud_file, tmp_path, cloud_licence="CC-BY-4.0")
+    tags = tags_of(osm)
+    for name in ("way/1", "way/2", "way/3"):
+        _, _, eaves, rise, shape = HOUSES[name]
+        assert float(tags[name]["height"]) == pytest.approx(eaves + rise, abs=0.1)
+        assert tags[name]["roof:shape"] == shape
+        assert float(tags[name]["roof:height"]) == pytest.approx(rise, abs=0.1)
+    assert "height" not in tags["way/4"]
+    assert osm.cloud["buildings"]["too_few_points"] == 1
+    assert osm.cloud["trees"]["mapped_measured"] == 1
+    assert osm.cloud["trees"]["added"] == 1
+    heights = sorted(float(point.tags["height"]) for point in osm.points)
+    assert heights == pytest.approx([8.0, 11.0], abs=0.5)
+    assert options.dem
+
+    scene = build(osm, tmp_path / "scene", options=options)
+    assert scene.manifest["heights"] == {"cloud": 3, "inferred-neighbours": 1}
+    assert scene.manifest["cloud"]["files"][0]["digest"] == digest_of(cloud_file)
+    row = next(row for row in scene.manifest["sources"] if row["kind"] == "cloud")
+    assert row["licence"] == "CC-BY-4.0"
+    assert scene.manifest["counts"]["trees"] == 2
+    terrain = open_terrain(options.dem, FRAME, bounds=(-45, -45, 45, 45))
+    x, y = np.random.default_rng(0).uniform(-45, 45, (2, 2000))
+    assert np.percentile(np.abs(terrain.height(x, y) - ground(x)), 95) < 0.05
+
+
+def test_the_result_does_not_depend_on_the_number_of_workers(cloud_file, tmp_path):
+    one = measured(village_map(), cloud_file, tmp_path / "one", workers=1)
+    two = measured(village_map(), cloud_file, tmp_path / "two", workers=2)
+    assert one[0].digest == two[0].digest
+    assert json.dumps(one[0].cloud) == json.dumps(two[0].cloud)
+    files = [next(iter((tmp_path / name).glob("*.tif"))) for name in ("one", "two")]
+    assert files[0].name == files[1].name
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_tags_win_when_they_are_preferred_and_disagreements_are_reported_anyway(cloud_file, tmp_path):
+    tagged = {"way/1": {"height": "14", "roof:shape": "hipped", "roof:height": "3"}}
+    for prefer, height, shape in (("tags", "14", "hipped"), ("cloud", "8.9", "gabled")):
+        osm, _ = measured(village_map(tags=tagged), cloud_file, tmp_path, prefer=prefer)
+        tags = tags_of(osm)["way/1"]
+        assert float(tags["height"]) == pytest.approx(float(height), abs=0.2)
+        assert tags["roof:shape"] == shape
+        found = [p.detail for p in osm.problems if p.reason == "cloud-height-differs"]
+        assert len(found) == 1
+        assert found[0].endswith(f"{prefer.rstrip('s')} used")
+
+
+def test_a_shift_between_map_and_cloud_is_reported_and_removed_on_request(tmp_path):
+    path = las_of(village_cloud(shift=(1.5, -1.0)), tmp_path / "moved.laz")
+    for align in (False, True):
+        osm, _ = measured(village_map(), path, tmp_path, cloud_align=align)
+        shift = osm.cloud["shift_m"]
+        assert (shift["east"], shift["north"]) == pytest.approx((-1.5, 1.0), abs=0.25)
+        assert shift["applied"] is align
+    assert tags_of(osm)["way/1"]["roof:shape"] == "gabled"
+    assert float(tags_of(osm)["way/1"]["height"]) == pytest.approx(9.0, abs=0.15)
+
+
+def test_heights_in_feet_that_were_taken_for_metres_are_told_by_the_tags():
+    with pytest.raises(InputError, match=r"3\.28 times as high as tagged.*`cloud_unit`"):
+        check_unit([3.28] * 12)
+    check_unit([3.28] * 3)
+    check_unit([1.0] * 12)
+
+
+def test_a_cloud_that_leaves_ground_unknown_needs_elevation_or_leave(tmp_path):
+    xyz = village_cloud()
+    osm = village_map()
+    wide = (osm.bounds[0] - 0.004, *osm.bounds[1:])
+    path = las_of(xyz, tmp_path / "part.laz")
+    osm = OsmData(wide, [], osm.areas, osm.points, [], source="village")
+    # the scene's frame is that of the wider map
+    with pytest.raises(InputError, match=r"% of the scene is over 100 m from any ground return.*`dem_gaps`"):
+        with_clouds(osm, BuildOptions(), cloud=CloudOptions((str(path),)), cache_dir=tmp_path)
+    _, options = with_clouds(
+        osm, BuildOptions(dem_gaps="nearest"), cloud=CloudOptions((str(path),)), cache_dir=tmp_path
+    )
+    assert len(options.dem) == 1
+
+
+def test_options_of_clouds_without_a_cloud_are_refused():
+    with pytest.raises(InputError, match="`cloud_align`: has no effect without `cloud`"):
+        CloudOptions(cloud_align=True)
