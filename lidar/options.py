@@ -21,6 +21,7 @@ from geoscene.options import KINDS, BuildOptions, Degrees
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
+from lidar.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
     from geoscene.reach import RoadMap
@@ -69,7 +70,7 @@ FILM_VIEWS = ("chase", "top")
 FILM_COLORS = ("class", "height", "intensity", "time", "origin")
 """What colours of returns in a film can show."""
 
-METHODS = ("kiss-icp", "genz-icp", "small_gicp")
+METHODS = ("kiss-icp", "genz-icp", "small_gicp", "orb", "orb+depth", "stereo", "fused")
 """Methods of odometry."""
 
 ECHOES = ("all", "first", "last", "single")
@@ -803,11 +804,21 @@ class OdometryOptions:
     """Options of odometry."""
 
     method: Annotated[str, Parameter(converter=_lower, n_tokens=1)]
-    """Method: kiss-icp, genz-icp or small_gicp (laser scanners)."""
+    """Method: kiss-icp, genz-icp, small_gicp (laser scanners); orb (a camera), orb+depth (a camera and laser
+    scanners), stereo (two cameras); fused (GNSS with an inertial unit and odometry, as far as there are)."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
-    """Names of the sensors to use. Scanners: by default the one whose sweeps have the most points; several
-    are merged."""
+    """Names of the sensors to use; repeat for more. By default the scanner whose sweeps have the most points,
+    the first camera, and for stereo the next one whose images have the same times; several scanners are
+    merged."""
+
+    relative: Annotated[str, Parameter(converter=_lower, n_tokens=1)] = ""
+    """Odometry that fused takes: one of the other methods, or none; by default small_gicp, without a scanner
+    stereo, and none without both."""
+
+    imu_grade: Annotated[str, Parameter(converter=_lower, n_tokens=1)] = ""
+    """Noise of the inertial unit that fused takes: adis16448, vn100, mti-g-700 or tactical; by default that
+    of the drive's rig."""
 
     start_pose: Annotated[
         tuple[float, ...] | None, Parameter(converter=_six, n_tokens=1, metavar="X,Y,Z,ROLL,PITCH,YAW")
@@ -828,6 +839,15 @@ class OdometryOptions:
         """Validate the options."""
         if self.method not in METHODS:
             raise InputError(f"`method` {self.method}: one of {', '.join(METHODS)}")
+        others = [name for name in METHODS if name != "fused"]
+        if self.relative not in ("", "none", *others):
+            raise InputError(f"`relative` {self.relative}: none, or one of {', '.join(others)}")
+        if self.imu_grade not in ("", *PRESETS):
+            raise InputError(f"`imu_grade` {self.imu_grade}: one of {', '.join(PRESETS)}")
+        if self.method != "fused" and (self.relative or self.imu_grade):
+            raise InputError("`relative` and `imu_grade` are for the `method` fused")
+        if self.method == "fused" and self.start_pose is not None:
+            raise InputError("`start_pose`: fused begins where the fixes are; leave it out")
 
 
 @Parameter(name="*")

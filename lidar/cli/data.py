@@ -265,6 +265,10 @@ def odometry(
 
     lidar odometry drive --method kiss-icp --sensor lidar_top --set voxel=0.5 -o estimate
 
+    lidar odometry drive --method stereo --sensor image_2 --sensor image_3 -o estimate
+
+    lidar odometry drive --method fused --relative small_gicp -o estimate
+
     Parameters
     ----------
     dataset

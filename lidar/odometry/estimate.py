@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ class Estimate:
               vehicle has at the first
     sigma   : (n, 6) one standard deviation of the rotation (radians about) and position (metres along) the
               axes of the frame that poses are in; None if the method states none
+    step_sigma : (n - 1, 6) of the motion from each pose to the next, along the axes of the later one
     quality : (n,) columns by name, such as the number of matches
     report  : what was done
     in_scene : whether poses are georeferenced: scene coordinates over ``scale`` horizontally
@@ -46,7 +48,8 @@ class Estimate:
     time_ns: Ints
     poses: Float
     sigma: Float | None = None
-    quality: dict[str, Ints | Float] = field(default_factory=dict)
+    step_sigma: Float | None = None
+    quality: Mapping[str, Ints | Float] = field(default_factory=dict)
     report: dict[str, Any] = field(default_factory=dict)
     in_scene: bool = False
     scale: float = 1.0
@@ -117,9 +120,7 @@ def begun_at(estimate: Estimate, place: tuple[float, ...], *, frame: Frame) -> E
         turned = np.tile(np.eye(4), (len(sigma), 1, 1))
         turned[:, :3, :3] = first[:3, :3] @ estimate.poses[0, :3, :3].T
         sigma = along_axes(turned, covariance)
-    return Estimate(
-        estimate.time_ns, moved, sigma, estimate.quality, estimate.report, in_scene=True, scale=scale
-    )
+    return replace(estimate, poses=moved, sigma=sigma, in_scene=True, scale=scale)
 
 
 def write_estimate(folder: Path, estimate: Estimate, *, dataset: Dataset) -> None:
@@ -159,4 +160,4 @@ def _columns(estimate: Estimate, *, dataset: Dataset) -> dict[str, Any]:
     if estimate.sigma is not None:
         names = [f"sigma_{name}" for name in ("alpha", "beta", "gamma", "x", "y", "z")]
         columns |= dict(zip(names, estimate.sigma.T, strict=True))
-    return columns | estimate.quality
+    return columns | dict(estimate.quality)

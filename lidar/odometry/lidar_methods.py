@@ -64,14 +64,20 @@ def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, pro
             information.append(found)
         progress("aligning sweeps", k + 1, total=len(scans))
     covered = np.array(poses)
-    sigma = None
+    sigma = step_sigma = None
     if any(one is not None for one in information):
         free = np.diag(_usual(scans, settings) ** 2)
         covariance = [free if one is None else np.linalg.inv(one) for one in information]
         sigma = propagated(covered, np.array(covariance))
+        step_sigma = np.sqrt(np.einsum("nii->ni", np.array(covariance)))
     points_of = np.array(counts, np.int64)
     return Estimate(
-        scans.time_ns, covered, sigma, {"points": points_of}, _report(scans, method, counts=points_of)
+        scans.time_ns,
+        covered,
+        sigma,
+        step_sigma,
+        {"points": points_of},
+        _report(scans, method, counts=points_of),
     )
 
 

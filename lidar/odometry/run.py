@@ -15,9 +15,11 @@ from geoscene.progress import Progress, silent
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.odometry.estimate import OWN_FILES, Estimate, begun_at, write_estimate
+from lidar.odometry.fused_method import fused_odometry
 from lidar.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.odometry.scans import scans_of
 from lidar.odometry.settings import OdometrySettings, read_settings
+from lidar.odometry.visual_methods import VISUAL_METHODS, visual_odometry
 from lidar.options import OdometryOptions
 
 log = logging.getLogger(__name__)
@@ -89,5 +91,30 @@ def _by_lidar(
     return lidar_odometry(scans, options.method, settings=settings, progress=progress)
 
 
-_METHODS: dict[str, Callable[..., Estimate]] = dict.fromkeys(LIDAR_METHODS, _by_lidar)
+def _by_camera(
+    dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
+) -> Estimate:
+    return visual_odometry(
+        dataset, options.method, names=options.sensors, settings=settings, progress=progress
+    )
+
+
+def _by_fusion(
+    dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
+) -> Estimate:
+    return fused_odometry(
+        dataset,
+        options.relative,
+        names=options.sensors,
+        grade=options.imu_grade,
+        settings=settings,
+        progress=progress,
+    )
+
+
+_METHODS: dict[str, Callable[..., Estimate]] = {
+    "fused": _by_fusion,
+    **dict.fromkeys(LIDAR_METHODS, _by_lidar),
+    **dict.fromkeys(VISUAL_METHODS, _by_camera),
+}
 """Function of each method."""

@@ -37,9 +37,30 @@ class OdometrySettings:
         high=100,
     )
     acceleration: float = _setting(
-        3.0, "m/s^2 along the road, which the motion of the sweep before leaves open", low=1e-3, high=1e3
+        3.0, "m/s^2, which the motion of the sweep or image before leaves open", low=1e-3, high=1e3
     )
     turn_acceleration: float = _setting(1.0, "rad/s^2, likewise", low=1e-3, high=1e3)
+    features: int = _setting(500, "ORB features of an image", low=50, high=20000)
+    pixel: float = _setting(1.0, "pixels: standard deviation of a feature's place", low=0.05, high=20)
+    ransac: int = _setting(200, "trials of three points for a pose", low=10, high=100000)
+    keyframe_matches: float = _setting(
+        0.7, "share of a keyframe's matches, below which the next frame is a keyframe", low=0.05, high=1
+    )
+    window: int = _setting(6, "keyframes that are refined together; 0: no refinement", low=0, high=50)
+    loop_distance: float = _setting(
+        15.0, "metres between keyframes that may show the same place; 0: no loops are sought", low=0, high=1e4
+    )
+    loop_path: float = _setting(30.0, "metres of way between such keyframes, at least", low=1, high=1e6)
+    depth_radius: float = _setting(
+        12.0, "pixels around a feature in which laser points tell its depth", low=1, high=200
+    )
+    knot_s: float = _setting(0.2, "seconds between the poses of a fusion without odometry", low=0.01, high=10)
+    gate: float = _setting(
+        0.999, "probability that a fix without fault passes the chi-square test", low=0.5, high=0.999999
+    )
+    correlation_s: float = _setting(
+        10.0, "seconds for which the errors of fixes are taken as the same", low=0, high=3600
+    )
 
 
 def read_settings(pairs: Iterable[tuple[str, str]], *, path: Path | None = None) -> OdometrySettings:
