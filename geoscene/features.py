@@ -14,6 +14,7 @@ from geoscene.ground import Layers
 from geoscene.objects.barriers import Barriers
 from geoscene.objects.furniture import Furniture
 from geoscene.objects.vegetation import Trees
+from geoscene.objects.wires import Wires
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene.geopackage import Layer
@@ -125,6 +126,11 @@ def structure_layer(structures: Structures) -> Layer:
         piers=np.array([len(shape.geoms) for shape in structures.pier], np.int64),
     )
     return Layer("structures", structures.polygon, columns)
+
+
+def wire_layer(wires: Wires) -> Layer:
+    """Layer ``wires``: spans of overhead wires in plan, from support to support."""
+    return Layer("wires", wires.lines, _columns(wires, "feature osm_id kind"))
 
 
 def class_names(codes: NDArray[np.integer]) -> NDArray[np.str_]:

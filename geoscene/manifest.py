@@ -184,6 +184,7 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
         "parts_guessed": dict(sorted(parts.items())),
+        "wires": _tally(plan.wires.kind),
         "roofs_guessed": dict(sorted(roofs.items())),
     }
 

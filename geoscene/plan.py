@@ -21,6 +21,7 @@ from geoscene.features import (
     road_layer,
     structure_layer,
     tree_layer,
+    wire_layer,
 )
 from geoscene.frames import Frame, extent_of, wrapped
 from geoscene.ground import (
@@ -52,6 +53,7 @@ from geoscene.objects.sidewalks import with_details, with_guesses
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import Taken, guess_furniture
 from geoscene.objects.vegetation import Trees, clear_of, read_trees
+from geoscene.objects.wires import Wires, read_wires
 from geoscene.options import BuildOptions
 from geoscene.progress import Progress
 from geoscene.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
@@ -118,6 +120,7 @@ class Plan:
     relief    : of surfaces, of `geoscene.options.RELIEFS`
     facades   : what the openings of walls depend on; None without relief
     rooftops  : what stands on roofs; None without full relief
+    wires     : overhead wires; none without relief
     layers    : feature tables in the order of feature numbers; those of objects and surfaces far from a route
                 are not complete
     ranges    : range [start, stop) of the feature numbers of each table
@@ -148,6 +151,7 @@ class Plan:
     relief: str
     facades: Setting | None
     rooftops: Rooftops | None
+    wires: Wires
     layers: list[Layer]
     ranges: dict[str, tuple[int, int]]
     chosen: list[tuple[int, int]]
@@ -239,6 +243,8 @@ def make_plan(
         barrier_layer(barriers),
         structure_layer(structures),
     ]
+    if len(local.wires):
+        layers.append(wire_layer(local.wires))
     facades = None
     if options.relief != "off":
         facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
@@ -268,6 +274,7 @@ def make_plan(
         relief=options.relief,
         facades=facades,
         rooftops=rooftops,
+        wires=local.wires,
         layers=layers,
         ranges=local.ranges,
         area=area,
@@ -363,6 +370,7 @@ class _Local:
     trees: Trees
     furniture: Furniture
     barriers: Barriers
+    wires: Wires
     shapes: dict[str, NDArray[np.object_]]
     rows: dict[str, dict[tuple[int, int], NDArray[np.int64]]]
     chosen: list[tuple[int, int]]
@@ -424,6 +432,8 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         problems, _surfaces(osm, frame, extent=extent, buildings=buildings, made=made, only=options.only)
     )
     found = _collect(problems, _objects(osm, frame, extent=extent, options=options))
+    strung = options.relief != "off" and "furniture" in options.only
+    wires = read_wires(osm if strung else replace(osm, ways=[]), frame, extent=extent)
     ranges = number_ranges(
         {
             "buildings": buildings.count,
@@ -433,6 +443,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             "roads": len(roads.graph),
             **{name: count for name, (_, _, count) in found.items()},
             "structures": len(structures),
+            **({"wires": len(wires)} if len(wires) else {}),
         }
     )
     cover, surfaces = (
@@ -440,6 +451,8 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         for name, table in (("landcover", cover), ("road_surfaces", surfaces))
     )
     structures = replace(structures, feature=np.arange(*ranges["structures"], dtype=np.int32))
+    if len(wires):
+        wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
     covers = Layers.concatenate([cover, surfaces, pads, low])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
@@ -458,6 +471,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         "furniture": shapely.points(furniture.xy),
         "barriers": barriers.polygon,
         "structures": structures.polygon,
+        "wires": wires.lines,
     }
     rows = {kind: _by_tile(column, options.tile_size) for kind, column in shapes.items()}
     rows["parts"] = {tile: buildings.count + parts for tile, parts in rows["parts"].items()}
@@ -466,6 +480,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             carriageway_boxes(roads.carriageways),
             *(boxes for _, boxes, _ in found.values()),
             shapely.bounds(structures.polygon).reshape(-1, 4),
+            shapely.bounds(wires.lines).reshape(-1, 4),
         ]
     )
     ground = joined(ground, {*rows["buildings"], *rows["parts"], *_squares(boxes, options.tile_size)})
@@ -492,6 +507,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         trees,
         furniture,
         barriers,
+        wires,
         shapes,
         rows,
         chosen,

@@ -29,6 +29,7 @@ from geoscene.objects.forests import forest_tree_count
 from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.rooftops import roof_objects
 from geoscene.objects.vegetation import tree_instances
+from geoscene.objects.wires import wire_instances
 from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures, unexpected
@@ -46,7 +47,13 @@ _TILES = 4
 _GREY = 128
 """Colour of faces whose colour is left out."""
 
-_SINGULAR = {"trees": "tree", "furniture": "furniture", "barriers": "barrier", "structures": "structure"}
+_SINGULAR = {
+    "trees": "tree",
+    "furniture": "furniture",
+    "barriers": "barrier",
+    "structures": "structure",
+    "wires": "wire",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,6 +170,7 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
         *made(
             furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=height)
         ),
+        *made(plan.wires, "wires", make=lambda rows: wire_instances(plan.wires.take(rows), height=height)),
     ]
     solids = made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height))
     meshes += [mesh for some in solids for mesh in some]

@@ -166,12 +166,6 @@ def street_shapes() -> dict[str, Mesh]:
         ),
         "table": _table(),
         "table_parasol": concatenate([_table(), *_parasol()]),
-        "tram_mast": concatenate(
-            [
-                _metal(prism(circle(0.22), -0.3, top=7.0, taper=0.7), klass=Class.POLE),
-                _metal(box((2.6, 0.07), (6.1, 6.18), at=(1.3, 0.0)), klass=Class.POLE),
-            ]
-        ),
         "wire": _wire(),
     }
 
