@@ -27,7 +27,7 @@ def evaluate(
 
     For example:
 
-    lidar evaluate odometry.tum --against drive
+    lidar evaluate odometry --against drive
 
     lidar evaluate odometry.tum --against drive --align none --map-error -o evaluation
 
@@ -41,8 +41,8 @@ def evaluate(
     ----------
     estimate
         Trajectory in the layout of TUM (timestamp tx ty tz qx qy qz qw), of KITTI (12 numbers a line), or of
-        poses.csv; or a dataset. Detections: a folder of KITTI's NNNNNN.txt, or nuScenes' results as JSON.
-        Tracks: a text file of KITTI's tracking benchmark or of MOT.
+        poses.csv; a folder of lidar odometry; or a dataset. Detections: a folder of KITTI's NNNNNN.txt, or
+        nuScenes' results as JSON. Tracks: a text file of KITTI's tracking benchmark or of MOT.
     against
         The truth: a dataset, or for a trajectory another one.
     out

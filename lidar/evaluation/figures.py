@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from geoscene.panels import Band, Panel, Raster, Series, figure
 from geoscene.scene import open_scene
 from geoscene.typing import Float
 from lidar.evaluation.pose_errors import absolute, by_axis
+from lidar.evaluation.trajectories import ESTIMATE, file_of
 from lidar.evaluation.trajectory import Compared
 from lidar.plots.drawn import WIDE, plain, thinned
 
@@ -28,7 +30,8 @@ _WIDTH = 1400
 _ROAD, _EARTH = (222, 224, 228), (255, 255, 255)
 _BARS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
 _TRUE, _FOUND = (40, 40, 46), (200, 60, 40)
-_KNOWN = ("timestamp", "time_ns", "time_s", "frame")
+_KNOWN = re.compile(r"timestamp|time_(ns|s)|frame|[xyz]|alpha|beta|gamma|q[xyzw]|lon|lat|h|sigma_.*")
+"""Columns of times, poses and their uncertainty."""
 _MOST_QUALITIES = 6
 
 
@@ -163,10 +166,14 @@ def axes(compared: Compared) -> Canvas:
 def qualities(estimate: Path) -> Canvas | None:
     """What an estimate says of its frames, such as matches and inliers; None if it says nothing.
 
-    It is in the numeric columns of a CSV file with the estimate's name, of which one is ``frame`` or a time.
+    It is in numeric columns, but those of poses, of a CSV file with the estimate's name, or of ``poses.csv``
+    in the folder of an estimate.
     """
+    estimate = file_of(estimate)
     beside = estimate.with_suffix(".csv")
-    if estimate.suffix.lower() == ".csv" or not beside.is_file():
+    if estimate.name == ESTIMATE:
+        beside = estimate.with_name("poses.csv")
+    if not beside.is_file():
         return None
     with beside.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -176,7 +183,7 @@ def qualities(estimate: Path) -> Canvas | None:
             columns[name] = np.array([float(row[name] or "nan") for row in rows])
         except (TypeError, ValueError):
             continue
-    values = {name: v for name, v in columns.items() if name not in _KNOWN and np.isfinite(v).any()}
+    values = {name: v for name, v in columns.items() if not _KNOWN.fullmatch(name) and np.isfinite(v).any()}
     if not values:
         return None
     frame = columns.get("frame", np.arange(len(rows), dtype=float))

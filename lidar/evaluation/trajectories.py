@@ -20,7 +20,10 @@ from lidar.geometry.trajectory_csv import MANIFEST
 from lidar.geometry.trajectory_tum import read_tum, write_tum
 from lidar.time_scales import posix_ns
 
+ESTIMATE = "trajectory.tum"
+"""Name of the trajectory in folders of estimates."""
 _POSES = ("timestamp", "x", "y", "z", "qx", "qy", "qz", "qw")
+_OF_ESTIMATE = "poses.csv"
 _LARGEST = 1e9
 """Metres: greatest coordinate."""
 
@@ -106,6 +109,7 @@ def read_path(source: Path, *, truth: Dataset | None, sensor: str) -> Path3D:
 
     Raises as `read_truth`.
     """
+    source = file_of(source)
     if source.is_dir():
         return true_path(open_dataset(source))
     if source.suffix.lower() == ".csv":
@@ -122,11 +126,10 @@ def read_path(source: Path, *, truth: Dataset | None, sensor: str) -> Path3D:
     )
 
 
-def looks_like_path(source: Path) -> bool:
-    """Whether a file is a trajectory by its first line, or a folder a dataset."""
-    if source.is_dir():
-        return (source / MANIFEST).is_file()
-    return source.suffix.lower() == ".csv" or len(_first_words(source)) in (8, 12)
+def file_of(source: Path) -> Path:
+    """The trajectory in a folder of `lidar.odometry`; any other path as it is."""
+    inside = source / ESTIMATE
+    return inside if inside.is_file() else source
 
 
 def _first_words(source: Path) -> list[str]:
@@ -164,6 +167,11 @@ def _read_kitti(source: Path, *, truth: Dataset | None, sensor: str) -> Path3D:
         if len(seconds) != len(values) or not (np.diff(seconds) > 0).all():
             raise FormatError(f"{beside}: {len(seconds)} times for {len(values)} poses, or not rising")
         time_ns = frames[0] + np.round(seconds * 1e9).astype(np.int64)
+    elif source.with_name(_OF_ESTIMATE).is_file() and source.with_name(ESTIMATE).is_file():
+        found = _read_csv(source.with_name(_OF_ESTIMATE), truth=truth)
+        if len(found) != len(values):
+            raise FormatError(f"{source}: {len(values)} poses, and {len(found)} in poses.csv beside it")
+        return Path3D(found.time_ns, position, rotation)
     elif len(frames) == len(values):
         time_ns = frames
     else:
@@ -198,7 +206,8 @@ def _read_csv(source: Path, *, truth: Dataset | None) -> Path3D:
     good = (np.abs(values) < _LARGEST).all() and (abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < 1e-3).all()
     if len(rows) < 2 or not good or (np.diff(time_ns) <= 0).any():
         raise FormatError(f"{source}: a trajectory has two or more poses at rising times")
-    scale = float(frame.trajectory().scale[0]) if frame else 1.0
+    in_scene = frame is not None and "lon" in rows[0]  # estimates without a place in the world have none
+    scale = float(frame.trajectory().scale[0]) if frame and in_scene else 1.0
     return Path3D(time_ns, values[:, :3] / [scale, scale, 1.0], matrix_from_quat(values[:, 3:]))
 
 

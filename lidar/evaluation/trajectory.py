@@ -24,7 +24,7 @@ from lidar.evaluation.pose_errors import (
     over_metres,
     segments,
 )
-from lidar.evaluation.trajectories import Path3D, read_path, read_truth, sensor_mount
+from lidar.evaluation.trajectories import Path3D, file_of, read_path, read_truth, sensor_mount
 from lidar.options import EvaluateOptions, MapOptions
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def evaluate_trajectory(
         what = "sensor" if options.sensor else "map_error"
         raise InputError(f"`{what}` needs a dataset as the truth; {against} is none")
     found = read_path(estimate, truth=dataset, sensor=options.sensor)
-    if estimate.is_dir():
+    if file_of(estimate).is_dir():
         found = found.mounted(mount)
     pairs = matched(found, truth, how=options.associate, gap_s=options.max_gap)
     motion = alignment(pairs, options.align)

@@ -24,6 +24,7 @@ from lidar.evaluation.pose_errors import absolute, by_axis, lengths_for, over_fr
 from lidar.evaluation.trajectories import Path3D, read_path, read_truth, true_path
 from lidar.evaluation.trajectory import evaluate_trajectory
 from lidar.geometry.poses import Trajectory
+from lidar.odometry.estimate import Estimate, write_estimate
 from lidar.options import EvaluateOptions
 from lidar.time_scales import posix_ns
 
@@ -374,6 +375,26 @@ def test_a_folder_is_written_whole_with_figures_and_tables(tmp_path):
     )
     assert again.returncode == 2
     assert "exists already" in again.stderr
+
+
+def test_folders_of_odometry_are_estimates_with_their_own_times(tmp_path):
+    """Poses are those of the ends of sweeps, as ``poses.csv`` says, in KITTI's form too."""
+    data, folder = drive(tmp_path / "d"), tmp_path / "estimate"
+    truth = true_path(data).take(slice(10, 600, 10))
+    poses = np.tile(np.eye(4), (len(truth), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = truth.rotation, truth.position
+    first = np.linalg.inv(poses[0]) @ poses
+    folder.mkdir()
+    estimate = Estimate(truth.time_ns - posix_ns(START), first, quality={"matches": np.arange(len(truth))})
+    write_estimate(folder, estimate, dataset=data)
+    (tmp_path / "d" / "top" / "timestamps.csv").write_text("frame,time_ns\n0,0\n")
+    for source in (folder, folder / "trajectory.tum", folder / "trajectory.kitti", folder / "poses.csv"):
+        errors = evaluate_trajectory(source, tmp_path / "d", options=EvaluateOptions(align="origin")).errors
+        assert errors.translation.max < 1e-6, source
+    picture = qualities(folder)
+    assert picture is not None
+    assert b'data-name="matches"' in picture.encoded(".svg")
+    assert b'data-name="qx"' not in picture.encoded(".svg")
 
 
 def test_an_estimate_that_says_nothing_of_its_frames_has_no_figure_of_it(tmp_path):
