@@ -96,12 +96,12 @@ def tree_layer(trees: Trees, z: NDArray[np.float64], *, relief: bool = False) ->
 def furniture_layer(furniture: Furniture, z: NDArray[np.float64], *, relief: bool = False) -> Layer:
     """Layer ``furniture``: positions of lamps, signals, signs, benches and similar objects.
 
-    relief : with the source of each object
+    relief : with the source of each object and the faces of signs
     """
     columns = _columns(
         furniture,
         "feature osm_id shape height height_source heading heading_source place_source moved"
-        + (" source" if relief else ""),
+        + (" source face" if relief else ""),
     )
     return Layer("furniture", shapely.points(np.column_stack([furniture.xy, z])), columns)
 

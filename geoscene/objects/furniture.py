@@ -16,6 +16,7 @@ from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
 from geoscene.objects.shapes import place, shapes
+from geoscene.objects.signs import directed, sign_face, sign_shape
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import stands as bicycle_stands
 from geoscene.objects.street import street_shape
@@ -27,8 +28,8 @@ from geoscene.typing import Bools, Float, Height, Ints
 
 _Stand = tuple[Float, float, str]
 """(place, heading, heading source)."""
-_Row = tuple[Float, float, str, str, float, str, str, str, Float, int]
-"""A stand with (shape, height, height source, place source, id, where it is mapped)."""
+_Row = tuple[Float, float, str, str, float, str, str, str, str, Float, int]
+"""A stand with (shape, height, height source, place source, face, id, where it is mapped, number)."""
 
 _TALLEST = 60.0
 """Metres; greater heights are taken for masts or typing errors."""
@@ -77,6 +78,7 @@ class Furniture(Columns):
     heading_source : (n,) str: ``direction`` (tag), ``road`` (towards its traffic or the road) or ``default``
     source   : (n,) str: ``mapped``, ``outdoor_seating`` (tables at a place that the map says to have some) or
                 ``guess``
+    face     : (n,) str: with relief, what is drawn on a sign as far as it is mapped, `geoscene.objects.signs`
     osm_id   : (n,) str: of its node; of guesses, the street or the place to eat
     feature  : (n,) int32: as read, `POSTS` (with relief `STANDS`) times the row of its node among
                 `mapped_furniture`; further posts and stands add 1, 2 ...; then guesses follow
@@ -91,6 +93,7 @@ class Furniture(Columns):
     moved: Float
     heading_source: NDArray[np.str_]
     source: NDArray[np.str_]
+    face: NDArray[np.str_]
     osm_id: NDArray[np.str_]
     feature: NDArray[np.int32]
 
@@ -112,7 +115,7 @@ def read_furniture(
     Lamps face the nearest road. Left out and listed as problems are signals and signs of bridges and tunnels,
     objects inside buildings, and those without a clear place within `geoscene.objects.siting.FARTHEST`.
 
-    With relief, bicycle parkings are rows of stands.
+    With relief, bicycle parkings are rows of stands, and signs have the plates of their codes and faces.
 
     left_hand : traffic keeps left
     relief    : of `geoscene.options.RELIEFS`; with ``plain`` and ``full`` there are more kinds
@@ -139,13 +142,14 @@ def read_furniture(
         )
         if not stands:
             problems.append(Problem(point.osm_id, "furniture", "dropped", "on-bridge-or-in-tunnel"))
+        face = sign_face(point.tags) if relief != "off" and shape.startswith("sign_") else ""
         source = "roadside" if addressing[k] else "moved" if amid[k] else "node"
         if shape == "bicycle_stand":
             at, heading, heading_source = stands[0]
             row = bicycle_stands(point.tags, place=at, heading=heading, most=STANDS)
             stands = [(place, heading, heading_source) for place in row]
         rows += [
-            (*stand, shape, height, height_source, source, point.osm_id, mapped[k], each * k + nth)
+            (*stand, shape, height, height_source, source, face, point.osm_id, mapped[k], each * k + nth)
             for nth, stand in enumerate(stands)
         ]
     table, lost = _beside_roads(_table(rows), sites, left_hand=left_hand)
@@ -162,9 +166,12 @@ def mapped_furniture(
     osm: OsmData, frame: Frame, *, extent: Sequence[float], relief: str = "off"
 ) -> tuple[list[tuple[Point, str]], Float]:
     """The nodes within an extent that are street furniture, with their shapes, and their places (n, 2)."""
+    points = osm.points
+    if relief != "off":
+        points = [replace(p, tags=tags) if (tags := directed(p.tags)) is not p.tags else p for p in points]
     chosen = [
         (point, shape)
-        for point in osm.points
+        for point in points
         if (shape := shape_of(point.tags, relief=relief)) is not None and not _off_ground(point.tags)
     ]
     x, y = frame.from_geographic(*np.array([(p.lon, p.lat) for p, _ in chosen]).reshape(-1, 2).T)
@@ -197,7 +204,9 @@ def shape_of(tags: Tags, *, relief: str = "off") -> str | None:
         if tags.get(key) == value:
             return shape
     sign = tags.get("traffic_sign", "")
-    return _sign(sign.lower()) if sign not in {"", "no"} else None
+    if sign in {"", "no"}:
+        return None
+    return _sign(sign.lower()) if relief == "off" else sign_shape(sign_face(tags))
 
 
 def _sign(value: str) -> str:
@@ -400,10 +409,9 @@ def _beside_roads(table: Furniture, sites: Sites, *, left_hand: bool) -> tuple[F
 
 
 def _table(rows: list[_Row]) -> Furniture:
-    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 10
-    where, heading, heading_source, shape, height, height_source, place_source, osm_id, mapped, number = (
-        columns
-    )
+    columns: list[list[object]] = [list(column) for column in zip(*rows, strict=True)] if rows else [[]] * 11
+    where, heading, heading_source, shape, height, height_source, place_source, face, *ids = columns
+    osm_id, mapped, number = ids
     xy = np.array(where, float).reshape(-1, 2)
     return Furniture(
         xy,
@@ -415,6 +423,7 @@ def _table(rows: list[_Row]) -> Furniture:
         np.hypot(*(xy - np.array(mapped, float).reshape(-1, 2)).T),
         np.array(heading_source, np.str_),
         np.full(len(rows), "mapped"),
+        np.array(face, np.str_),
         np.array(osm_id, np.str_),
         np.array(number, np.int32),
     )

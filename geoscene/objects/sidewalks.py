@@ -29,6 +29,7 @@ def with_guesses(table: Furniture, guesses: Guesses, *, sites: Sites, taken: Tak
         np.zeros(n),
         np.full(n, "road"),
         found.source,
+        np.full(n, ""),
         found.osm_id,
         (first + row).astype(np.int32),
     )

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Float
-from lidar.camera import shade
+from lidar.camera import appearance, shade
 from lidar.camera.edges import edge_pixels
 from lidar.camera.facades import Facades, facades_of
 from lidar.camera.light import Light, daylight
@@ -461,7 +461,7 @@ def _shaded(
         normal,
         surfaces.klass,
         surfaces.material,
-        surfaces.color,
+        _drawn(world, view, size=size) if options.detail else surfaces.color,
         surfaces.feature,
         wall,
         (walls.tangent, walls.along, walls.height, walls.style),
@@ -476,6 +476,32 @@ def _shaded(
     )
     out[~view.seen] = 0.0
     return out, gloss, facet
+
+
+def _drawn(world: World, view: View, *, size: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of the surfaces of a view, with what is drawn on instances."""
+    hits, found = view.hits, view.surfaces
+    on = np.flatnonzero(hits.instance >= 0)
+    if not len(on):
+        return found.color
+    point = view.origin[view.row[on]] + hits.range[on, None] * view.direction[on]
+    time = np.zeros(len(on)) if view.time is None else view.time[on]
+    transform = _transforms(world, hits.instance[on], time=time)
+    offset = (point - transform[:, :, 3])[..., None]
+    distance = hits.range[on] * np.linalg.norm(view.direction[on], axis=1)
+    color = found.color.copy()
+    color[on] = appearance.colors(
+        world,
+        instance=hits.instance[on],
+        face=hits.face[on],
+        klass=found.klass[on],
+        material=found.material[on],
+        feature=found.feature[on],
+        color=color[on],
+        place=np.linalg.solve(transform[:, :, :3], offset)[..., 0].astype(np.float64),
+        width=size[0] + size[1] * distance,
+    )
+    return color
 
 
 def _noisy(

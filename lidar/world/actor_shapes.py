@@ -326,7 +326,7 @@ Close to cars of segments D, C and J, a large van, a lorry of 12 t and a city bu
 are left out.
 """
 
-_FLEET: dict[str, dict[str, Rgb]] = {
+FLEET: dict[str, dict[str, Rgb]] = {
     "van": {"white": (232, 232, 228), "grey": (120, 122, 126), "blue": (32, 58, 118)},
     "truck": {"blue": (30, 62, 120), "red": (140, 30, 28)},
     "bus": {"red": (170, 30, 34), "blue": (24, 78, 140)},
@@ -334,6 +334,7 @@ _FLEET: dict[str, dict[str, Rgb]] = {
     "parked_motorcycle": {"black": (24, 24, 26), "red": (150, 24, 28)},
     "bicycle": {"black": (26, 26, 28), "blue": (40, 82, 140)},
 }
+"""Paints of other vehicles by kind."""
 
 _CLASS = {
     "van": Class.VAN, "truck": Class.TRUCK, "bus": Class.BUS, "motorcycle": Class.MOTORCYCLIST,
@@ -359,8 +360,8 @@ def catalogue() -> dict[str, Shape]:
     """All shapes by name, in a fixed order. People have `STRIDE` walking poses and one standing."""
     made: list[tuple[str, str, float, list[Mesh]]] = []
     paints = {name: color for name, (color, _) in PAINTS.items()}
-    for kind in ("sedan", "hatchback", "suv", *_FLEET):
-        for name, paint in _FLEET.get(kind, paints).items():
+    for kind in ("sedan", "hatchback", "suv", *FLEET):
+        for name, paint in FLEET.get(kind, paints).items():
             size = _SIZES.get(kind)
             base = size[0] * size[3] if size else 1.2
             made.append((f"{kind}/{name}", kind, base, _parts(kind, paint)))

@@ -14,8 +14,9 @@ _LEG, _HIP, _SHOULDER, _CHIN = 0.48, 0.53, 0.82, 0.87
 """Heights of hip joints, bottom and top of the torso, and chin as shares of an adult's stature."""
 _SWING = np.radians(26.0)
 """Largest angle of a leg from the vertical at walking speed."""
-_SKIN: Rgb = (198, 152, 122)
-_HAIR: Rgb = (62, 46, 36)
+SKIN: Rgb = (198, 152, 122)
+HAIR: Rgb = (62, 46, 36)
+"""Colours of skin and hair."""
 
 
 def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mesh]:
@@ -111,13 +112,13 @@ def _trunk(low: tuple[float, float], high: tuple[float, float], *, h: float, jac
 def _head(chin: tuple[float, float], h: float, *, helmet: Rgb | None = None) -> list[Mesh]:
     x, z = chin
     face = ball(
-        (x + 0.005, 0.0, z + 0.062 * h), (0.115 * h, 0.09 * h, 0.125 * h), material="skin", color=_SKIN
+        (x + 0.005, 0.0, z + 0.062 * h), (0.115 * h, 0.09 * h, 0.125 * h), material="skin", color=SKIN
     )
     if helmet is not None:
         middle, size = (x, 0.0, z + 0.075 * h), (0.15 * h, 0.135 * h, 0.13 * h)
         return [face, ball(middle, size, material="car_paint", color=helmet)]
     middle, size = (x - 0.012 * h, 0.0, z + 0.078 * h), (0.112 * h, 0.098 * h, 0.104 * h)
-    return [face, ball(middle, size, material="clothing", color=_HAIR)]
+    return [face, ball(middle, size, material="clothing", color=HAIR)]
 
 
 def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -> list[Mesh]:
@@ -126,7 +127,7 @@ def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -
     return [
         limb(shoulder, elbow, thick=(0.055 * h, 0.045 * h), color=jacket),
         limb(elbow, hand, thick=(0.045 * h, 0.035 * h), color=jacket),
-        ball(hand, (0.05 * h, 0.03 * h, 0.055 * h), material="skin", color=_SKIN),
+        ball(hand, (0.05 * h, 0.03 * h, 0.055 * h), material="skin", color=SKIN),
     ]
 
 
