@@ -373,9 +373,12 @@ class _Graph:
         """Poses (n, 4, 4) and their standard deviations (n, 6), of rotation and position."""
         count = len(self._time_ns)
         poses = np.array([values.atPose3(self._pose(k)).matrix() for k in range(count)])
+        parameters = self._gtsam.ISAM2Params()
+        parameters.setFactorization("QR")  # the marginals of a batch have Cholesky's alone
+        smoother = self._gtsam.ISAM2(parameters)
         try:
-            marginals = self._gtsam.Marginals(self._last, values)
+            smoother.update(self._last, values)
+            covariance = np.array([smoother.marginalCovariance(self._pose(k)) for k in range(count)])
         except RuntimeError as error:
             raise DatasetError(_UNDETERMINED) from error
-        covariance = np.array([marginals.marginalCovariance(self._pose(k)) for k in range(count)])
         return poses, along_axes(poses, covariance)
