@@ -29,7 +29,8 @@ from lidar.rig.imu_grades import Noise
 
 _MOVING = 1.0  # m/s, from which the course tells the heading
 _LEAST_SIGMA = 0.02  # metres, of a fix
-_UPRIGHT = (0.2, 0.2, 0.3)  # radians: what is known of roll, pitch and heading at the first knot
+_OPEN_SKY = 8.0  # satellites of a system over an open horizon; where some are hidden, fixes have multipath
+_UPRIGHT = (0.05, 0.1, 0.3)  # radians: roll, slope and heading at the first knot, about level and the course
 _PLACE = 10.0  # metres: what is known of the first position
 _VELOCITY = 20.0  # m/s, likewise
 _BIASES = (0.1, 0.01)  # m/s^2 and rad/s: of an inertial unit when it is switched on
@@ -93,6 +94,8 @@ class Fused:
 def fixes_of(dataset: Dataset, receiver: str) -> Fixed:
     """The fixes of a receiver with the deviations that their state and dilution of precision stand for.
 
+    Multipath is that of the share of the sky which is hidden, as the number of satellites tells it.
+
     Raises DatasetError without two fixes, and for damaged files.
     """
     fixes, _ = read_fixes(dataset.paths, receiver, vertical=dataset.frame.vertical)
@@ -104,6 +107,9 @@ def fixes_of(dataset: Dataset, receiver: str) -> Fixed:
     x, y = dataset.frame.from_geographic(lon, lat)
     states = [STATES[name] for name in NAMES]
     typical = np.array([[math.hypot(s.white[k], s.bias[k]) for k in (0, 0, 1)] for s in states])
+    blocked = np.array([[s.blocked[k] for k in (0, 0, 1)] for s in states])
+    systems = len({name[0] for name in fixes.names.tolist()})
+    hidden = np.clip(1.0 - fixes.satellites[on] / (_OPEN_SKY * max(systems, 1)), 0.0, 1.0)
     speeds = np.array([s.speed for s in states])
     state, dop = fixes.state[on], np.fmax(fixes.dop[on][:, [0, 0, 1]], 1.0)
     heading = math.pi / 2 - (fixes.course[on] - dataset.frame.convergence(lon, lat))
@@ -115,7 +121,7 @@ def fixes_of(dataset: Dataset, receiver: str) -> Fixed:
         fixes.time_ns[on],
         np.column_stack([x / scale, y / scale, height]),
         velocity,
-        np.fmax(typical[state] * dop, _LEAST_SIGMA),
+        np.fmax(np.hypot(typical[state], hidden[:, None] * blocked[state]) * dop, _LEAST_SIGMA),
         spread,
         fixes.quality[on].astype(np.int64),
         np.array(dataset.sensors("gnss")[receiver]["vehicle_from_sensor"], float)[:3, 3],

@@ -1,14 +1,17 @@
 """Fusion of fixes, inertial samples and odometry: known drives, wrong fixes, and outages."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.map_data import FRAME
 from scipy.spatial.transform import Rotation
 
 from lidar.errors import DatasetError, InputError
+from lidar.navigation.gnss import NAMES, Fixes
 from lidar.navigation.imu import Inertial
-from lidar.odometry.fusion import Fixed, Unit, fused
+from lidar.odometry.fusion import Fixed, Unit, fixes_of, fused
 from lidar.odometry.run import estimate_motion
 from lidar.odometry.settings import OdometrySettings
 from lidar.options import OdometryOptions
@@ -160,6 +163,33 @@ def test_a_vehicle_at_rest_has_no_heading():
     given.velocity[:] = 0
     with pytest.raises(DatasetError, match="no fix while the vehicle moves"):
         run(given)
+
+
+def test_fixes_with_few_satellites_state_multipath(monkeypatch):
+    """Of 32 satellites of four systems 12 are left; 7.5 m and 15 m are the errors where all are hidden."""
+    count, none = 3, np.full((3, 3), np.nan)
+    recorded = Fixes(
+        time_ns=np.arange(count) * 10**9,
+        state=np.full(count, NAMES.index("single"), np.int8),
+        quality=np.ones(count, np.int8),
+        satellites=np.array([32, 12, 12], np.int8),
+        dop=np.array([[1.0, 1, 1], [1, 1, 1], [2, 3, 3]]),
+        lonlath=np.tile([24.945, 60.167, 5.0], (count, 1)),
+        speed=np.full(count, 5.0),
+        course=np.zeros(count),
+        error=none,
+        true_lonlath=none,
+        true_velocity=none,
+        used=np.ones((count, 4), bool),
+        names=np.array(["G01", "R65", "E02", "C03"]),
+    )
+    monkeypatch.setattr("lidar.odometry.fusion.read_fixes", lambda *_, **__: (recorded, None))
+    sensor = {"gnss": {"vehicle_from_sensor": np.eye(4).tolist()}}
+    sigma = fixes_of(SimpleNamespace(frame=FRAME, paths=None, sensors=lambda _: sensor), "gnss").sigma
+    open_sky = np.hypot([0.3, 0.3, 0.6], [1.5, 1.5, 2.5])
+    np.testing.assert_allclose(sigma[0], open_sky)
+    np.testing.assert_allclose(sigma[1], np.hypot(open_sky, 0.625 * np.array([7.5, 7.5, 15])))
+    np.testing.assert_allclose(sigma[2], sigma[1] * [2, 2, 3])
 
 
 @pytest.mark.parametrize("relative", ["small_gicp", "none"])
