@@ -13,6 +13,7 @@ from pathlib import Path
 
 import osmium
 import pytest
+from helpers.clouds import write_survey
 from helpers.overture import overture_row, write_overture
 from helpers.profiles import measure_little
 from helpers.programs import run_process, run_program
@@ -103,6 +104,7 @@ def inputs(tmp_path_factory):
     rows = [overture_row(area) for area in osm.areas if "building" in area.tags]
     write_overture(folder / "buildings.parquet", rows)
     write_slope(folder / "heights.tif", BOX, rise=0.3)
+    write_survey(folder / "survey.laz", BOX)
     stages = (ROOT / "docs" / "stages.md").read_text("utf-8").split("```toml")[1].split("```")[0]
     sweep = (ROOT / "docs" / "sweeps.md").read_text("utf-8").split("```toml")[1].split("```")[0]
     sweep = sweep.replace("duration = 20", "duration = 0.1").replace("seed = [1, 2, 3]", "seed = [1]")

@@ -93,7 +93,7 @@ def _with_buildings(
             tags = _with_roof(tags, roof, turn=turn)
         areas[k] = replace(area, tags=tags)
     check_unit(ratios)
-    counts["too_few_points"] = len(names) - len(found)
+    counts["not_measured"] = len(names) - len(found)
     sigma = [roof.sigma for roof, _ in found.values()]
     about = {
         **dict(sorted(counts.items())),

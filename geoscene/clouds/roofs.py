@@ -18,8 +18,9 @@ from geoscene.typing import Bools, Float
 FEWEST = 15
 """Points on a roof with which it is measured."""
 
-COVERED = 0.5
-"""Least share of a roof's cells that a fit explains."""
+COVERED = {"flat": 0.4, "pitched": 0.65}
+"""Least share of the points, and of the footprint, that a fit explains: a plane through one side of a gabled
+roof explains half of it. Flat roofs carry more plant, and may have further levels."""
 
 _AT_MOST = 1200  # points that are fitted
 _PAIRS = 60  # hypotheses of two points for each shape
@@ -93,9 +94,9 @@ def fit_roof(polygon: Any, xyz: Float, *, seed: str) -> Roof | None:
                 continue
             roof, error = fitted
             score = _score(roof, error, parameters=_PARAMETERS[spec.shape])
-            if score < least:
+            if score < least and _covers(roof, xyz[np.abs(error) < _OFF], polygon=polygon, among=len(xyz)):
                 best, least = roof, score
-    if not _covers(best, xyz, polygon=polygon):
+    if best is flat and not _covers(flat, xyz[np.abs(z - flat.top) < _OFF], polygon=polygon, among=len(xyz)):
         return None
     return best
 
@@ -231,14 +232,19 @@ def _pitched(
     return Roof(low + rise, rise, spec.shape, direction, spec.across, sigma, share), everywhere
 
 
-def _covers(roof: Roof, xyz: Float, *, polygon: Any) -> bool:
-    """Whether the points of a roof lie all over the footprint, and not along a wall or in a corner only."""
-    if roof.share < COVERED:
+def _covers(roof: Roof, inliers: Float, *, polygon: Any, among: int) -> bool:
+    """Whether a fit explains enough points, all over the footprint and not along a wall or on one side only.
+
+    inliers : (k, 3) points that it explains
+    among   : points on the roof
+    """
+    least = COVERED["flat" if roof.shape == "flat" else "pitched"]
+    if len(inliers) < max(least * among, FEWEST):
         return False
     area = float(shapely.area(polygon))
-    cell = max(1.0, np.sqrt(3.0 * area / len(xyz)))
-    taken = len(np.unique(np.floor(xyz[:, :2] / cell), axis=0))
-    return bool(taken * cell**2 >= COVERED * area)
+    cell = max(1.0, np.sqrt(3.0 * area / among))
+    taken = len(np.unique(np.floor(inliers[:, :2] / cell), axis=0))
+    return bool(taken * cell**2 >= least * area)
 
 
 def roof_points(polygon: Any, xyz: Float, *, inset: float) -> Bools:

@@ -20,3 +20,12 @@ def write_las(path, coordinates, *, crs=None, klass=None, scale=0.001):
         cloud.classification = klass
     cloud.write(path)
     return path
+
+
+def write_survey(path, box, *, height=20.0):
+    """A cloud of level ground in and around a box in degrees, a point every 2 m; returns the path."""
+    west, south, east, north = box
+    step = 2.0 / 111_195.0
+    lat, lon = np.mgrid[south - 0.003 : north + 0.003 : step, west - 0.006 : east + 0.006 : 2 * step]
+    coordinates = np.column_stack([lon.ravel(), lat.ravel(), np.full(lon.size, height)])
+    return write_las(path, coordinates, crs="EPSG:4326", klass=np.full(lon.size, 2, np.uint8))

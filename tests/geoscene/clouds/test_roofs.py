@@ -73,6 +73,15 @@ def test_few_points_or_points_along_one_wall_give_no_roof():
     assert fit_roof(polygon, along_wall, seed="way/1") is None
 
 
+def test_a_plane_through_one_side_of_a_broken_roof_is_no_roof():
+    """Two overlapping strips of a survey, one of them a metre too high: no shape explains both."""
+    polygon, xyz = house("gabled", long=16, wide=9, eaves=6, rise=4.5, turn=0.3, noise=0.02, seed=4)
+    rng = np.random.default_rng(0)
+    xyz[rng.random(len(xyz)) < 0.5, 2] += 1.0
+    roof = fit_roof(polygon, xyz, seed="way/1")
+    assert roof is None or abs(roof.height - 4.5) < 1.1
+
+
 def test_a_roof_of_two_levels_says_so():
     polygon, xyz = house("flat", long=20, wide=10, eaves=6, rise=0, turn=0.0, noise=0.02, seed=1, chimneys=0)
     xyz[xyz[:, 0] > 503, 2] += 4.0

@@ -106,7 +106,7 @@ def test_heights_roofs_trees_and_ground_of_a_village_are_measured(cloud_file, tm
         assert tags[name]["roof:shape"] == shape
         assert float(tags[name]["roof:height"]) == pytest.approx(rise, abs=0.1)
     assert "height" not in tags["way/4"]
-    assert osm.cloud["buildings"]["too_few_points"] == 1
+    assert osm.cloud["buildings"]["not_measured"] == 1
     assert osm.cloud["trees"]["mapped_measured"] == 1
     assert osm.cloud["trees"]["added"] == 1
     heights = sorted(float(point.tags["height"]) for point in osm.points)
