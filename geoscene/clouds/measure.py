@@ -13,7 +13,7 @@ from geoscene.buildings import Buildings
 from geoscene.clouds import shift as shifts
 from geoscene.clouds import trees as canopy
 from geoscene.clouds.ground import MARGIN, Grid, ground_heights
-from geoscene.clouds.read import VEGETATION
+from geoscene.clouds.read import GROUND, VEGETATION
 from geoscene.clouds.roofs import Roof, fit_roof, roof_points
 from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
 from geoscene.frames import Frame
@@ -271,7 +271,7 @@ def _trees_of(work: Work, square: Square, *, points: Points, terrain: Terrain) -
     use = (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
     vegetation = np.isin(points.klass, VEGETATION)
     if work.spool.vegetation:
-        use &= vegetation
+        use &= vegetation | np.isin(points.klass, GROUND)
     else:
         use &= ~np.isin(points.klass, (6, 9, 11, 17))
     xyz = points.xyz[use]

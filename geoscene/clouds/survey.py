@@ -83,6 +83,8 @@ def with_clouds(
     attribution = cloud.cloud_attribution or f"point cloud {', '.join(f.path.name for f in files)}" + (
         "" if cloud.cloud_licence else ", licence unknown"
     )
+    inside = ((measured.trees.xy >= extent[:2]) & (measured.trees.xy < extent[2:])).all(axis=1)
+    measured = replace(measured, trees=measured.trees.take(inside))
     credit = Credit(
         "cloud",
         ", ".join(file.path.name for file in files),

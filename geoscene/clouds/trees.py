@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -20,7 +19,9 @@ MARGIN = 12.0
 _LOWEST = 2.5  # metres of a tree; lower things are cars, walls and hedges
 _SHARE = 0.4  # of a peak's height down to which the canopy around it is its crown
 _SMALLEST, _WIDEST = 3.0, 24.0  # square metres of a crown; metres of its diameter
-_ROUGH = 0.12  # metres from a plane by which a crown's points differ: roofs, awnings and decks differ less
+_ROUGHER, _ROUGH = 1.4, 0.02  # how much rougher than the ground, and metres more, crowns are than roofs
+_PLANE, _PLANE_POINTS = 2.5, 6  # metres of the planes by which roughness is told, and points for one
+_NEAR_GROUND = 0.3  # metres
 _SLENDER = 0.12  # crown diameter over height, at least: lamps, masts and cranes have less
 
 
@@ -76,9 +77,12 @@ def find_trees(xyz: Float, above: Float, *, grid: Grid, excluded: Bools) -> Foun
             / count[:, None]
         )
     diameter = 2 * np.sqrt(count * grid.cell**2 / np.pi)
-    rough = _roughness(xyz, label[cell], above=above, height=height, free=free)
+    member = np.where(free, label[cell], -1)
+    member[member >= 0] = np.where(above > 0.4 * height[member], member, -1)[member >= 0]
+    noise = float(_roughness(xyz, np.where(np.abs(above) < _NEAR_GROUND, 0, -1), count=1)[0])
+    rough = _roughness(xyz, member, count=len(peaks))
     keep = (count * grid.cell**2 >= _SMALLEST) & (diameter <= _WIDEST) & (height >= _LOWEST)
-    keep &= (rough > _ROUGH) & (diameter > _SLENDER * height)
+    keep &= (rough > _ROUGHER * noise + _ROUGH) & (diameter > _SLENDER * height)
     return Found(centre[keep], height[keep], diameter[keep])
 
 
@@ -125,18 +129,32 @@ def _crowns(smooth: Float, top: Float, *, cell: float) -> tuple[Float, Ints]:
     return np.column_stack(np.divmod(peaks, columns)).astype(float), crown.reshape(smooth.shape)
 
 
-def _roughness(xyz: Float, crown: Ints, *, above: Float, height: Float, free: Bools) -> Float:
-    """Metres (m,), standard deviation of the upper points of each crown about a plane."""
-    member = free & (crown >= 0)
-    member[member] = above[member] > 0.4 * height[crown[member]]
-    order = np.argsort(crown[member], kind="stable")
-    rows = np.flatnonzero(member)[order]
-    cuts = np.searchsorted(crown[rows], np.arange(len(height) + 1))
-    out = np.zeros(len(height))
-    for k, (a, b) in enumerate(pairwise(cuts.tolist())):
-        if b - a >= 6:
-            some = xyz[rows[a:b]] - xyz[rows[a:b]].mean(axis=0)
-            system = np.column_stack([some[:, :2], np.ones(len(some))])
-            error = some[:, 2] - system @ np.linalg.lstsq(system, some[:, 2], rcond=None)[0]
-            out[k] = float(error.std())
+def _roughness(xyz: Float, group: Ints, *, count: int) -> Float:
+    """Metres (count,), the typical standard deviation of a group's points about planes of 2.5 m; 0 without.
+
+    Roofs of any shape are planes at this scale, but for a few cells at ridges; crowns are not.
+
+    group : (n,) of each point, -1 for none
+    """
+    rows = np.flatnonzero(group >= 0)
+    place = np.floor(xyz[rows, :2] / _PLANE).astype(np.int64)
+    cells, owner, size = np.unique(
+        np.column_stack([group[rows], place]), axis=0, return_inverse=True, return_counts=True
+    )
+    owner = owner.ravel()
+    mean = np.column_stack([np.bincount(owner, xyz[rows, k]) for k in range(3)]) / size[:, None]
+    x, y, z = (xyz[rows] - mean[owner]).T
+    xx, xy, yy, xz, yz, zz = (
+        np.bincount(owner, product) / size for product in (x * x, x * y, y * y, x * z, y * z, z * z)
+    )
+    flat = xx * yy - xy**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        explained = (yy * xz**2 - 2 * xy * xz * yz + xx * yz**2) / flat
+    fitted = (size >= _PLANE_POINTS) & (flat > 1e-3)
+    spread = np.sqrt(np.maximum(zz - explained, 0.0))[fitted]
+    owners = cells[fitted, 0]
+    order = np.lexsort((spread, owners))
+    first, many = np.unique(owners[order], return_index=True, return_counts=True)[1:]
+    out = np.zeros(count)
+    out[owners[order][first]] = spread[order][first + many // 2]
     return out
