@@ -487,6 +487,7 @@ def _print_scene(report: dict[str, Any]) -> None:
         f" direction{steep}",
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
+        "facades": _listed(report.get("relief", {}).get("facades", {})),
         "guessed": _listed(report.get("relief", {}).get("parts_guessed", {})),
     }
     for_drives = "area" in report

@@ -9,6 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings
+from geoscene.buildings.facades import Setting
 from geoscene.classes import Class, materials
 from geoscene.ground import Layers
 from geoscene.objects.barriers import Barriers
@@ -27,11 +28,16 @@ def _columns(table: Any, names: str, **computed: NDArray[Any]) -> dict[str, NDAr
 
 
 def building_layers(
-    buildings: Buildings, base: NDArray[np.float64], *, parapet: NDArray[np.float64] | None = None
+    buildings: Buildings,
+    base: NDArray[np.float64],
+    *,
+    parapet: NDArray[np.float64] | None = None,
+    facades: Setting | None = None,
 ) -> list[Layer]:
     """Layers ``buildings`` and ``building_parts``; ``base`` (n,) is z of each building's base in metres.
 
     parapet : (n,) metres, guessed heights of the parapets of all rows; no column by default
+    facades : types of the facades of all rows; no columns by default
     """
     columns = _columns(
         buildings,
@@ -44,6 +50,9 @@ def building_layers(
     if parapet is not None:
         columns["parapet"] = parapet
         columns["parapet_source"] = np.where(parapet > 0, "guess", "")
+    if facades is not None:
+        columns["facade"] = facades.styles.names
+        columns["facade_source"] = facades.source
     layers = []
     for name, rows in (
         ("buildings", slice(0, buildings.count)),

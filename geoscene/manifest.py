@@ -172,8 +172,9 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
 def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
     """What the scene has for its relief, by kind and source."""
     furniture = plan.furniture
-    parts, roofs = Counter[str](), Counter[str]()
+    parts, roofs, facades = Counter[str](), Counter[str](), Counter[str]()
     for report in reports:
+        facades.update(report.facades)
         parts.update(report.guessed)
         roofs.update(report.roofs)
     if plan.rooftops is not None:
@@ -186,6 +187,19 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "parts_guessed": dict(sorted(parts.items())),
         "wires": _tally(plan.wires.kind),
         "roofs_guessed": dict(sorted(roofs.items())),
+        "facades": dict(sorted(facades.items())),
+        **_facade_tallies(plan),
+    }
+
+
+def _facade_tallies(plan: Plan) -> dict[str, dict[str, int]]:
+    """Buildings by the type of their facades and its source."""
+    count, setting = plan.buildings.count, plan.facades
+    if setting is None:
+        return {}
+    return {
+        "facade_types": _tally(setting.styles.names[:count]),
+        "facade_source": _tally(setting.source[:count]),
     }
 
 

@@ -233,8 +233,13 @@ def make_plan(
     rooftops = None
     if options.relief == "full":
         rooftops = plan_rooftops(buildings, centre=_checked_centre(osm))
+    facades = None
+    if options.relief != "off":
+        facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
     layers = [
-        *building_layers(buildings, base, parapet=None if rooftops is None else rooftops.parapet),
+        *building_layers(
+            buildings, base, parapet=None if rooftops is None else rooftops.parapet, facades=facades
+        ),
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
@@ -245,9 +250,6 @@ def make_plan(
     ]
     if len(local.wires):
         layers.append(wire_layer(local.wires))
-    facades = None
-    if options.relief != "off":
-        facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
     plan = Plan(
         frame=frame,
         terrain=terrain,

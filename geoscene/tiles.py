@@ -18,7 +18,7 @@ import numpy as np
 import shapely
 
 from geoscene.buildings import build_solids
-from geoscene.buildings.facades import wall_relief
+from geoscene.buildings.facades import Layout, Setting, wall_relief
 from geoscene.classes import Class
 from geoscene.cluster import Cluster
 from geoscene.files import digest_of, naming, write_atomically
@@ -222,10 +222,7 @@ def build_tile(
         copies = copies.shifted(-origin)
     on_roofs, roofs = _roof_objects(plan, solids, lod=lod, problems=problems)
     copies = Instances.concatenate([copies, on_roofs.shifted(-origin)])
-    layout = None
-    if plan.facades is not None:
-        guess = plan.relief == "full"
-        layout = wall_relief(solids, plan.facades, base=plan.base, height=plan.height, guess=guess)
+    layout = None if plan.facades is None else _facades(plan, plan.facades, solids=solids, problems=problems)
     attached = [layout.parts.shifted(-origin)] if layout else []
     mesh = concatenate([solids.shifted(-origin), *attached, rest])
     if not plan.use.colors:
@@ -254,6 +251,27 @@ def build_tile(
         guessed,
         roofs,
     )
+
+
+def _facades(plan: Plan, setting: Setting, *, solids: Mesh, problems: list[Problem]) -> Layout:
+    """The relief of the walls of a tile's buildings and what stands out of them, scene metres."""
+
+    def failed(row: int, error: Exception) -> None:
+        problems.append(unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
+        bad.append(row)
+
+    def made(rows: Ints) -> Layout:
+        mine = np.isin(solids.feature, rows)
+        guess = plan.relief == "full"
+        layout = wall_relief(solids.take(mine), setting, base=plan.base, height=plan.height, guess=guess)
+        wall = np.full(len(solids), -1, np.int32)
+        wall[mine] = layout.relief.wall
+        return replace(layout, relief=replace(layout.relief, wall=wall))
+
+    bad: list[int] = []
+    rows = np.unique(solids.feature).astype(np.int64)
+    found = make_without_failures(made, rows, failed=failed)
+    return found[0] if len(found) == 1 and not bad else made(np.setdiff1d(rows, bad))
 
 
 def _roof_objects(

@@ -37,7 +37,7 @@ SLOW = frozenset(
         "test_ego_drive", "test_elevation", "test_examples", "test_fcd", "test_files",
         "test_flight_planning", "test_footprints", "test_interruptions", "test_network",
         "test_outputs", "test_overture", "test_places", "test_raycast", "test_rays",
-        "test_real", "test_render", "test_roofs", "test_ros",
+        "test_real", "test_relief_scenes", "test_render", "test_roofs", "test_ros",
         "test_scale", "test_scene_cache", "test_sensors", "test_site", "test_siting", "test_storage",
         "test_structures",
         "test_sumo", "test_sweep", "test_traffic", "test_view", "test_view_browser",

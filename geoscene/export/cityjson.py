@@ -29,7 +29,7 @@ from geoscene.export.tables import target_crs
 from geoscene.export.vertices import Vertices
 from geoscene.files import append, atomic_file, spool
 from geoscene.frames import Frame, utm_crs
-from geoscene.mesh import DOOR, FLOOR, ROOF, WALL, WINDOW, Instances, Mesh
+from geoscene.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Instances, Mesh
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
@@ -66,6 +66,7 @@ _TYPES: dict[int, str] = {
 }
 _CONSTRUCTIONS = frozenset({"Building", "Bridge", "Tunnel", "OtherConstruction"})
 _WITH_PARTS = frozenset({"Building", "Bridge", "Tunnel"})
+_INSTALLATION = "BuildingInstallation"
 _AUXILIARY = frozenset({Class.KERB, Class.LANE_MARKING})
 _PARTS = {"Railway": "TrafficArea", "WaterBody": "WaterSurface"}
 
@@ -274,7 +275,16 @@ def _solid_entries(
     """The city objects of a feature with one or more bodies, in geometry types that the schema permits.
 
     Buildings, bridges and tunnels of several bodies have a part for each; plant cover is always a MultiSolid.
+    What stands out of a building's walls is its installation.
     """
+    attached = [solid for solid in solids if solid["type"] == _INSTALLATION]
+    if attached:
+        solids = [solid for solid in solids if solid["type"] != _INSTALLATION]
+        (own, *rest) = _solid_entries(name, kind, attributes=attributes, solids=solids)
+        part = f"{name}-installation"
+        whole = own[1] | {"children": [*own[1].get("children", ()), part]}
+        installation = {"type": _INSTALLATION, "parents": [name], "geometry": [_multi_solid(attached)]}
+        return [(name, whole), *rest, (part, installation)]
     if kind in _WITH_PARTS and len(solids) > 1:
         names = [f"{name}-{k + 1}" for k in range(len(solids))]
         parts_of = [
@@ -284,15 +294,18 @@ def _solid_entries(
         whole = {"type": kind, "attributes": attributes, "children": names, "geometry": []}
         return [(name, whole), *parts_of]
     if kind not in _CONSTRUCTIONS and (len(solids) > 1 or kind == "PlantCover"):
-        looks = [solid["material"]["visual"]["values"] for solid in solids]
-        multi = {
-            "lod": solids[0]["lod"],
-            "type": "MultiSolid",
-            "boundaries": [solid["boundaries"] for solid in solids],
-            "material": {"visual": {"values": looks}},
-        }
-        solids = [multi]
+        solids = [_multi_solid(solids)]
     return [(name, {"type": kind, "attributes": attributes, "geometry": solids})]
+
+
+def _multi_solid(solids: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Solids without semantics as one geometry."""
+    return {
+        "lod": solids[0]["lod"],
+        "type": "MultiSolid",
+        "boundaries": [solid["boundaries"] for solid in solids],
+        "material": {"visual": {"values": [solid["material"]["visual"]["values"] for solid in solids]}},
+    }
 
 
 def _solids(
@@ -324,7 +337,9 @@ def _solids(
             "boundaries": [number[triangles[rows]][:, None].tolist() for rows in body],
             "material": {"visual": {"values": [look[rows].tolist() for rows in body]}},
         }
-        if kind in _CONSTRUCTIONS:
+        if kind == "Building" and (mesh.surface[piece.rows[np.concatenate(body)]] == OTHER).all():
+            solid["type"] = _INSTALLATION
+        elif kind in _CONSTRUCTIONS:
             marks = [values[rows].tolist() for rows in body]
             solid["semantics"] = {"surfaces": surfaces, "values": marks}
         out.append(solid)

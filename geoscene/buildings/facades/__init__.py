@@ -3,6 +3,7 @@
 from geoscene.buildings.facades.description import Facades as Facades
 from geoscene.buildings.facades.description import Openings as Openings
 from geoscene.buildings.facades.description import WallRelief as WallRelief
+from geoscene.buildings.facades.layout import Layout as Layout
 from geoscene.buildings.facades.layout import wall_relief as wall_relief
 from geoscene.buildings.facades.setting import Setting as Setting
 from geoscene.buildings.facades.setting import read_setting as read_setting

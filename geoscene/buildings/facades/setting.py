@@ -54,6 +54,13 @@ class Setting:
     streets: shapely.STRtree
     entrances: Entrances
 
+    @property
+    def source(self) -> NDArray[np.object_]:
+        """(n,) str, ``tag`` where the map has storeys, entrances or balconies, else ``guess``."""
+        own = self.buildings.outline
+        tagged = self.styles.tagged | self.styles.balcony_tagged | np.isin(own, self.entrances.building)
+        return np.where(tagged, "tag", "guess").astype(object)
+
 
 def read_setting(
     osm: OsmData, frame: Frame, *, buildings: Buildings, streets: NDArray[np.object_]

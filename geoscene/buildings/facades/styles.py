@@ -148,6 +148,11 @@ class Styles(Columns):
     frames: NDArray[np.uint8]
     colors: NDArray[np.uint8]
 
+    @property
+    def names(self) -> NDArray[np.object_]:
+        """(n,) str, the types by name."""
+        return np.array(TYPES, object)[self.type]
+
 
 @functools.cache
 def usual_facades() -> Mapping[str, Mapping[str, Any]]:
