@@ -273,13 +273,13 @@ def _types(buildings: Buildings, given: Sequence[Tags], *, area: Float, eaves: F
         elif "shop" in tags and eaves[k] < 9.0:
             name[k] = "retail"
     plain = name == ""
-    name[plain & (eaves < 9.5) & (area < 350.0)] = "house"
+    name[plain & (eaves < 12.0) & (area < 400.0)] = "house"
     name[plain & (eaves < 13.0) & (area > 2500.0)] = "hall"
     name[plain & (eaves < 4.5) & (area < 20.0)] = "blank"
     name[plain & (eaves < 4.5) & (area < 40.0) & (area >= 20.0)] = "garage"
     name[(name == "")] = "apartments"
     flats = np.isin(name, ("apartments",))
-    old = (draw < 0.8) & (eaves < 26.0) & (area < 900.0)
+    old = (draw < 0.8) & (eaves >= 12.0) & (eaves < 26.0) & (area < 900.0)
     name[flats & old & plain] = "prewar"
     name[flats & (eaves > 40.0)] = "tower"
     glass = np.isin(buildings.wall_material, [materials()[m].code for m in ("glass",)])
