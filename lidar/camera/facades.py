@@ -1,224 +1,242 @@
-"""Flat walls of buildings and the windows that are generated on them."""
-
-# mypy: disallow-untyped-decorators=False
+"""Facades in images: what a pixel sees of the openings of a wall, averaged over its footprint."""
 
 from __future__ import annotations
 
 import math
-import weakref
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.mesh import WALL
-from geoscene.typing import Float
-from lidar.camera.texture import covered, hashed, pulses, span
-from lidar.raycast import Caster, Geometry, Hits
+from geoscene.classes import materials
+from lidar.raycast import Hits
+from lidar.raycast.memory import called, inlined
+from lidar.relief import FRAME, INFILL, ROOM, SILL, WallTables, march
+from lidar.relief.walls import depth_of, height_of, on_wall, outwards
+from lidar.world.surfaces import Surfaces
 from lidar.world.world import World
 
+_SHARP = 0.1
+"""Metres of a pixel's footprint up to which light and shadow are those of the point that its ray hits in the
+depth of an opening; beyond, those of the plane of the wall."""
 
-@dataclass(frozen=True, slots=True)
-class Facades(Columns):
-    """Flat walls of buildings, and the wall of each face.
+_STEEP = 20.0
+"""Metres along the wall for each metre of depth, up to which pixels see the sides of openings."""
 
-    wall    : (m,) int32 per face, row of its wall below, -1 for other faces
-    tangent : (k, 2) horizontal unit vector along the wall, to the right as seen from outside
-    along   : (k, 2) start and end of the wall along the tangent, metres
-    height  : (k, 2) z of the building's foot and of the wall's top, metres
-    style   : (k, 10) appearance of its windows, see `_styles`
+_CELLS = 2.0
+"""Size of the greatest footprint in cells; greater ones see those in their middle."""
+
+_LIT, _DARK = 0.4, 0.03
+"""Light in a room as a share of that outside: at the pane, and at the back. Typical values of a day."""
+
+GLASS, ASIDE, UPRIGHT, PAINTED, LIGHT, BEHIND = 0, 1, 2, 3, 4, 7
+SEEN = 10
+"""Columns that `facade` fills: shares of panes, of sides of recesses whose normals run along the wall and
+upright, and of painted parts (sills, frames, doors, blinds); albedo of these parts times their share (3), and
+of what is behind panes (3)."""
+
+
+class Facades(NamedTuple):
+    """The openings of a world's walls, for compiled code.
+
+    tables   : of the walls
+    deep     : whether openings lie behind the walls; else they are painted on them
+    color    : (m, 3) sRGB of faces
+    material : (m,) of faces
+    glass    : code of this material
     """
 
-    wall: NDArray[np.int32]
-    tangent: Float
-    along: Float
-    height: Float
-    style: Float
-
-
-def facades(corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: NDArray[np.bool_]) -> Facades:
-    """The flat walls among m faces: upright ones of one feature in one plane are one wall.
-
-    corners : (m, 3, 3) metres
-    normal  : (m, 3) unit normals
-    wall    : (m,) bool, the face is a wall of a building
-    """
-    m = len(corners)
-    length = np.hypot(normal[:, 0], normal[:, 1])
-    face = np.flatnonzero(wall & (np.abs(normal[:, 2]) < 0.02) & (length > 0))
-    if not len(face):
-        none = np.empty((0, 2))
-        return Facades(np.full(m, -1, np.int32), none, none, none, np.empty((0, 10)))
-
-    flat = normal[face, :2] / length[face, None]
-    corners, feature = corners[face], feature[face]
-    turn = np.arctan2(flat[:, 1], flat[:, 0])
-    # Sorting and splitting at gaps groups values that differ by rounding errors; rounded keys would not.
-    order = np.lexsort((turn, feature))
-    bearing = _runs(feature[order], turn[order], gap=0.005)
-    tangent = np.empty((len(face), 2))
-    first = np.flatnonzero(np.r_[True, np.diff(bearing) > 0])
-    tangent[order] = np.stack([-flat[order[first], 1], flat[order[first], 0]], axis=1)[bearing]
-    away = np.einsum("ij,ij->i", corners[:, 0, :2], np.stack([tangent[:, 1], -tangent[:, 0]], axis=1))
-    group = np.empty(len(face), np.int64)
-    group[order] = bearing
-    order = np.lexsort((away, group))
-    run = _runs(group[order], away[order], gap=0.05)
-    plane = np.empty(len(face), np.int64)
-    plane[order] = run
-
-    k = int(run[-1]) + 1
-    place = np.einsum("ijk,ik->ij", corners[:, :, :2], tangent)
-    lower, upper = corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)
-    along, height = np.empty((k, 2)), np.empty((k, 2))
-    along[:] = np.inf, -np.inf
-    np.minimum.at(along[:, 0], plane, place.min(axis=1))
-    np.maximum.at(along[:, 1], plane, place.max(axis=1))
-    _, building = np.unique(feature, return_inverse=True)
-    foot = np.full(int(building.max()) + 1, np.inf)
-    np.minimum.at(foot, building, lower)
-    height[plane, 0] = foot[building]
-    height[:, 1] = -np.inf
-    np.maximum.at(height[:, 1], plane, upper)
-    tangents = np.empty((k, 2))
-    tangents[plane] = tangent
-    of_face = np.full(m, -1, np.int32)
-    of_face[face] = plane
-    owner = np.empty(k, np.int32)
-    owner[plane] = feature
-    return Facades(of_face, tangents, along, height, _styles(owner, along, height=height))
-
-
-def _runs(key: NDArray[np.integer], value: Float, *, gap: float) -> NDArray[np.int64]:
-    """Numbers (n,) of the runs in sorted rows: a new one where the key changes or the value jumps."""
-    numbers = np.zeros(len(key), np.int64)
-    np.cumsum((np.diff(key) != 0) | (np.diff(value) > gap), out=numbers[1:])
-    return numbers
-
-
-BAY, STOREY, FLOORS, WIDE, TALL, RISE, SHOP_WIDE, SHOP_TALL, BAND, PAINT = range(10)
-"""Columns of `Facades.style`."""
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _chances(feature: NDArray[np.int32], count: int) -> Float:
-    """Hashes (k, count) from 0 to 1 of feature numbers (k,)."""
-    out = np.empty((len(feature), count))
-    for i in range(len(feature)):
-        for j in range(count):
-            out[i, j] = hashed(feature[i], j, 20)
-    return out
-
-
-def _styles(feature: NDArray[np.int32], along: Float, *, height: Float) -> Float:
-    """Appearance of the windows of each wall (k, 10), a hash of the building's number: maps do not hold it.
-
-    Metres, but for FLOORS (a count; 0 for a wall without windows) and PAINT (albedo of the frames).
-    SHOP_WIDE is 0 where the ground floor is like the others, BAND where no line marks the storeys.
-    """
-    style = np.zeros((len(feature), 10))
-    chance = _chances(feature, 7)
-    width = along[:, 1] - along[:, 0]
-    storey = 2.9 + 0.7 * chance[:, 0]
-    bays = np.floor(width / (2.1 + 1.7 * chance[:, 1]))
-    floors = np.floor((height[:, 1] - height[:, 0] - 0.3) / storey)
-    bay = width / np.maximum(bays, 1.0)
-    shop = chance[:, 2] < 0.5
-    style[:, BAY], style[:, STOREY] = np.maximum(bay, 1e-3), storey
-    style[:, FLOORS] = np.where((bays > 0) & (floors > 0), floors, 0.0)
-    style[:, WIDE], style[:, TALL] = bay * (0.36 + 0.28 * chance[:, 3]), storey * (0.42 + 0.2 * chance[:, 4])
-    style[:, RISE] = 0.08 * storey
-    style[:, SHOP_WIDE], style[:, SHOP_TALL] = np.where(shop, 0.84 * bay, 0.0), 0.76 * storey
-    style[:, BAND] = np.where(chance[:, 5] < 0.5, 0.12, 0.0)
-    style[:, PAINT] = np.where(chance[:, 6] < 0.6, 0.75, 0.06)
-    return style
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def windows(
-    u: float, v: float, style: Float, w: int, across: float, up: float, feature: int, out: Float
-) -> None:
-    """Fill ``out`` with the shares of glass, frame and band in a pixel, and the albedo behind the glass.
-
-    style, w   : `Facades.style` and the wall's row of it
-    u, v       : metres from the wall's left end and the building's foot
-    across, up : the pixel's footprint along them, metres
-    """
-    out[:] = 0.0
-    bay, storey = style[w, BAY], style[w, STOREY]
-    k = math.floor(v / storey)
-    if style[w, BAND] > 0.0:
-        out[2] = pulses(v + 0.5 * storey, storey, style[w, BAND], up)
-    if k < 0 or k >= style[w, FLOORS]:
-        return
-    wide, tall, rise = style[w, WIDE], style[w, TALL], style[w, RISE]
-    if k == 0 and style[w, SHOP_WIDE] > 0.0:
-        wide, tall, rise = style[w, SHOP_WIDE], style[w, SHOP_TALL], -0.06 * storey
-    column = math.floor(u / bay)
-    aside = abs(u - (column + 0.5) * bay) - 0.5 * wide - 0.08
-    above = abs(v - rise - (k + 0.5) * storey) - 0.5 * tall - 0.08
-    if across < bay and up < storey and (aside > 0.5 * across or above > 0.5 * up):
-        return
-    # Each storey's row of windows is one pulse; a footprint beyond a storey sees the mean of them.
-    x, y = span(u, bay, across), span(v - rise, storey, up)
-    inside_y = covered(y, storey, tall)
-    inner, bar = covered(x, bay, wide) * inside_y, covered(x, bay, 0.06) * inside_y
-    outer = covered(x, bay, wide + 0.16) * covered(y, storey, tall + 0.16)
-    out[0] = inner - bar
-    out[1] = max(outer - inner, 0.0) + bar
-    fade = max(0.0, 1.0 - max(across / bay, up / storey))
-    shown = hashed(feature * 131 + column, k, 21)
-    out[3] = 0.06 + fade * (0.45 * shown * shown * shown - 0.04)
+    tables: WallTables
+    deep: bool
+    color: NDArray[np.uint8]
+    material: NDArray[np.uint8]
+    glass: int
 
 
 def facades_of(world: World) -> Facades:
-    """The walls of a world's own mesh, ``wall`` by the face numbers of its hits; kept with its tiles."""
-    caster = world.caster
-    known, last, whole = _CACHE.get(caster, ({}, (), None))
-    parts = caster.scene.parts
-    state = tuple((number, part.first, id(part.vertices)) for number, part in parts.items())
-    if whole is not None and state == last:
-        return whole
-    found = {}
-    for number, part in parts.items():
-        old = known.get(number)
-        same = old is not None and old[0] is part.vertices
-        found[number] = old if old is not None and same else (part.vertices, _of_part(world, part))
-    whole = _concatenated([found[number][1] for number in parts], [_numbers(part) for part in parts.values()])
-    _CACHE[caster] = found, state, whole
-    return whole
+    """The facades of a world."""
+    surfaces, deep = world.surfaces, world.settings.relief != "off"
+    return Facades(world.walls.tables, deep, surfaces.color, surfaces.material, materials()["glass"].code)
 
 
-_Part = tuple[Float, Facades]
-_CACHE: weakref.WeakKeyDictionary[
-    Caster, tuple[dict[int, _Part], tuple[tuple[int, int, int], ...], Facades | None]
-] = weakref.WeakKeyDictionary()
+def walls_of(facades: Facades, hits: Hits) -> NDArray[np.int32]:
+    """Wall (n,) of each hit, a row of the tables; -1 for none."""
+    if not len(facades.tables.first):
+        return np.full(len(hits), -1, np.int32)
+    return np.where(hits.instance < 0, facades.tables.wall[hits.face], np.int32(-1))
 
 
-def _numbers(part: Geometry) -> NDArray[np.int32]:
-    """Face numbers in hits of a part's faces."""
-    own = part.numbers[: len(part)] if len(part.numbers) else np.arange(len(part), dtype=np.int32)
-    return own + np.int32(part.first)
+def bare(facades: Facades, surfaces: Surfaces, *, hits: Hits, wall: NDArray[np.int32]) -> Surfaces:
+    """The surfaces of hits; those of parts of openings are the surfaces of their walls."""
+    row = np.flatnonzero(wall >= 0)
+    row = row[facades.tables.part[hits.face[row]] > 0]
+    if not len(row):
+        return surfaces
+    own = facades.tables.own[wall[row]]
+    color, material = surfaces.color.copy(), surfaces.material.copy()
+    color[row], material[row] = facades.color[own], facades.material[own]
+    return replace(surfaces, color=color, material=material)
 
 
-def _of_part(world: World, part: Geometry) -> Facades:
-    m = len(part)
-    own, ones = np.full(m, -1, np.int32), np.ones(m)
-    surfaces = world.lookup(Hits(ones, _numbers(part), own, ones.astype(np.float32), np.empty((0, 3))))
-    corners = part.vertices[part.faces] + world.caster.origin
-    wall = (surfaces.klass == Class.BUILDING) & (surfaces.surface == WALL)
-    return facades(corners, part.planes[:m, :3], feature=surfaces.feature, wall=wall)
+@njit(cache=True, nogil=True, error_model="numpy")
+def flatten(facades: Any, wall: Any, view: Any, size: Any, distance: Any, normal: Any) -> None:
+    """Move hits in openings to the plane of the wall where a pixel does not resolve them.
+
+    view             : origins of the rays, row of each ray's origin, and directions
+    size             : width of a pixel at distance 0 in metres, and its growth with distance
+    distance, normal : of the hits, changed in place
+    """
+    for i in range(len(wall)):
+        if wall[i] >= 0:
+            _flatten_one(facades.tables.frame, wall[i], i, view, size, distance, normal)
 
 
-def _concatenated(parts: list[Facades], numbers: list[NDArray[np.int32]]) -> Facades:
-    """Walls of several parts whose faces have the given numbers."""
-    wall = np.full(max((int(n.max(initial=-1)) for n in numbers), default=-1) + 1, -1, np.int32)
-    first = 0
-    for part, number in zip(parts, numbers, strict=True):
-        wall[number] = np.where(part.wall >= 0, part.wall + np.int32(first), -1)
-        first += len(part.style)
-    none = Facades(wall, np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 2)), np.empty((0, 10)))
-    return replace(Facades.concatenate([none, *parts]), wall=wall)
+@inlined
+def _flatten_one(frame: Any, w: int, i: int, view: Any, size: Any, distance: Any, normal: Any) -> None:
+    origins, rows, directions = view
+    o, t = rows[i], distance[i]
+    x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+    place = origins[o, 0] + t * x, origins[o, 1] + t * y, origins[o, 2] + t * z
+    _, _, _, _, inwards = on_wall(frame, w, place, (x, y, z))
+    if size[0] + size[1] * t * math.sqrt(x * x + y * y + z * z) > _SHARP and inwards > 0.0:
+        distance[i] = t - depth_of(frame, w, place) / inwards
+        normal[i, 0], normal[i, 1] = outwards(frame, w)
+        normal[i, 2] = 0.0
+
+
+@inlined
+def _lengths(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) -> Any:
+    """Metres of a footprint that see, in one direction: panel, its back, reveal, frame, panes, infill.
+
+    low, high : ends of the footprint on the plane of the cell
+    slope     : metres along the wall for each metre of depth. Where a ray through x on the plane passes a
+                rectangle at a depth z, x lies in the rectangle moved by -slope * z
+    """
+    p, q = kinds[k, march.PANEL + axis], kinds[k, march.PANEL + 2 + axis]
+    a, b = max(low, p), min(high, q)
+    panel = max(b - a, 0.0)
+    shift = slope * kinds[k, march.PANEL_DEPTH]
+    a, b = max(a, p - shift), min(b, q - shift)
+    back = max(b - a, 0.0)
+    p, q = kinds[k, march.OPENING + axis], kinds[k, march.OPENING + 2 + axis]
+    a, b = max(a, p - shift), min(b, q - shift)
+    reveal = max(b - a, 0.0)
+    shift = slope * kinds[k, march.REVEAL_DEPTH]
+    a, b = max(a, p - shift), min(b, q - shift)
+    frame, panes, infill = max(b - a, 0.0), 0.0, 0.0
+    bars, bar = kinds[k, march.BARS + axis], kinds[k, march.BAR]
+    p, q = p + kinds[k, march.FRAME_WIDTH], q - kinds[k, march.FRAME_WIDTH]
+    step = (q - p) / (bars + 1.0)
+    end = slope * kinds[k, march.PANE_DEPTH]
+    for i in range(int(bars) + 1):
+        start = p + i * step + (0.5 * bar if i > 0 else 0.0)
+        stop = p + (i + 1.0) * step - (0.5 * bar if i < bars else 0.0)
+        c, d = max(a, start - shift), min(b, stop - shift)
+        panes += max(d - c, 0.0)
+        infill += max(min(d, stop - end) - max(c, start - end), 0.0)
+    return panel, back, reveal, frame, panes, infill
+
+
+@inlined
+def _sill(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) -> Any:
+    """Metres of a footprint that see the sill, in one direction: its front, moved back by its depth."""
+    p, q = kinds[k, march.SILL_BOX + axis], kinds[k, march.SILL_BOX + 2 + axis]
+    shift = slope * kinds[k, march.PANEL_DEPTH]
+    return max(min(high, max(q, q - shift)) - max(low, min(p, p - shift)), 0.0) if q > p else 0.0
+
+
+@inlined
+def _paint(facades: Any, face: int, share: float, linear: Any, out: Any) -> None:
+    """Add a painted part to what is seen."""
+    out[PAINTED] += share
+    for c in range(3):
+        out[LIGHT + c] += share * linear[facades.color[face, c]]
+
+
+@inlined
+def _room(facades: Any, cell: int, w: int, at: Any, share: float, linear: Any, out: Any) -> None:
+    """Add the room behind a pane; ``at`` is the pixel's ray in the cell, for each metre of depth."""
+    tables = facades.tables
+    frame, kinds, k = tables.frame, tables.kinds, tables.cells[cell]
+    x, y, bottom, a, b = at
+    width, height = frame[w, 7], height_of(frame, w, bottom)
+    pane, deep = kinds[k, march.PANE_DEPTH], kinds[k, march.ROOM_DEPTH]
+    x, y = min(max(x, 0.0), width), min(max(y, 0.0), height)
+    depth, axis = march.in_room(kinds, k, width, height, (x, y, 0.0, a, b, 1.0))
+    dark = min(max((depth - pane) / (deep - pane), 0.0), 1.0)
+    light = _DARK + (_LIT - _DARK) * (1.0 - dark) * (1.0 - dark)
+    if axis == 1:
+        light *= 0.7 if b < 0.0 else 1.2  # floors are darker than ceilings
+    face = tables.faces[cell] + ROOM - 1
+    out[GLASS] += share
+    for c in range(3):
+        out[BEHIND + c] += share * light * linear[facades.color[face, c]]
+
+
+@inlined
+def _row(y: float, ground: float, height: float) -> Any:
+    """Row of cells at a height; -1 below the lowest."""
+    if y < ground:
+        return 0.0 if y >= 0.0 else -1.0
+    return 1.0 + math.floor((y - ground) / height)
+
+
+@called
+def facade(facades: Any, w: int, place: Any, direction: Any, size: float, linear: Any, out: Any) -> None:
+    """Fill ``out`` (`SEEN`,) with what a pixel sees of the openings of a wall.
+
+    The footprint is a rectangle on the plane of the wall. All rectangles of an opening are moved on this
+    plane by their depth times the slope of the ray, so that the shares of the footprint are those of
+    rays through it: windows are at the same place in colour as in depth.
+
+    w         : row of the wall
+    place     : where the pixel's ray hits, on the wall or in an opening
+    direction : unit vector of the ray
+    size      : width of the pixel across the ray, metres
+    linear    : `lidar.camera.shade.linear_table`
+    """
+    out[:] = 0.0
+    tables = facades.tables
+    frame, kinds = tables.frame, tables.kinds
+    u, v, along, up, inwards = on_wall(frame, w, place, direction)
+    if inwards < 1e-6:
+        return
+    a, b, depth = along / inwards, up / inwards, depth_of(frame, w, place)
+    u, v = u - a * depth, v - b * depth
+    a, b = min(max(a, -_STEEP), _STEEP), min(max(b, -_STEEP), _STEEP)
+    width, height, columns, rows = frame[w, 7], frame[w, 8], frame[w, 10], frame[w, 11]
+    across = min(size * math.sqrt(1.0 + a * a), _CELLS * width)
+    upright = min(size * math.sqrt(1.0 + b * b), _CELLS * height)
+    inverse = 1.0 / (across * upright)
+    x0, x1, y0, y1 = u - 0.5 * across, u + 0.5 * across, v - 0.5 * upright, v + 0.5 * upright
+    p, q = (a, b) if facades.deep else (0.0, 0.0)
+    ground = frame[w, 9]
+    first, last = max(math.floor(x0 / width), 0.0), min(math.floor(x1 / width), columns - 1.0)
+    lowest, highest = max(_row(y0, ground, height), 0.0), min(_row(y1, ground, height), rows - 1.0)
+    for r in range(int(lowest), int(highest) + 1):
+        bottom = ground + (r - 1.0) * height if r > 0 else 0.0
+        for column in range(int(first), int(last) + 1):
+            left = column * width
+            cell = tables.first[w] + r * int(columns) + column
+            k = tables.cells[cell]
+            if k < 0:
+                continue
+            lx = _lengths(kinds, k, 0, x0 - left, x1 - left, p)
+            ly = _lengths(kinds, k, 1, y0 - bottom, y1 - bottom, q)
+            sill = _sill(kinds, k, 0, x0 - left, x1 - left, 0.0)  # its ends are too small to be seen
+            sill *= _sill(kinds, k, 1, y0 - bottom, y1 - bottom, q) * inverse
+            face = tables.faces[cell] - 1
+            if sill > 0.0:
+                _paint(facades, face + SILL, sill, linear, out)
+            # Rays beyond both sides of a corner are shared: half of them hit either side.
+            half = 0.5 * inverse
+            out[ASIDE] += ((lx[0] - lx[1]) * (ly[0] + ly[1]) + (lx[2] - lx[3]) * (ly[2] + ly[3])) * half
+            out[UPRIGHT] += ((lx[0] + lx[1]) * (ly[0] - ly[1]) + (lx[2] + lx[3]) * (ly[2] - ly[3])) * half
+            seen = lx[5] * ly[5] * inverse
+            _paint(facades, face + FRAME, lx[3] * ly[3] * inverse - seen, linear, out)
+            if facades.material[face + INFILL] != facades.glass:
+                _paint(facades, face + INFILL, seen, linear, out)
+            elif seen > 0.0:
+                _room(facades, cell, w, (u - left, v - bottom, bottom, a, b), seen, linear, out)

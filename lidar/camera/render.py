@@ -13,7 +13,7 @@ from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.camera import appearance, shade
 from lidar.camera.edges import edge_pixels
-from lidar.camera.facades import Facades, facades_of
+from lidar.camera.facades import Facades, bare, facades_of, flatten, walls_of
 from lidar.camera.light import Light, daylight
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -430,12 +430,17 @@ def _shaded(
     size : width of a pixel at distance 0 in metres, and its growth with distance
     wet  : whether films of water mirror, as `lidar.camera.shade.shade` describes
     """
-    hits, surfaces = view.hits, view.surfaces
+    hits = view.hits
     n = len(hits)
-    normal = hits.normal
+    wall = walls_of(walls, hits)
+    surfaces = bare(walls, view.surfaces, hits=hits, wall=wall)
+    distance, normal = hits.range, hits.normal
+    if walls.deep and (wall >= 0).any():
+        distance = distance.copy()
+        flatten(walls, wall, (view.origin, view.row, view.direction), size, distance, normal)
     start, which = np.empty((n, 3)), np.empty(n, np.int64)
     k = shade.shadow_rays(
-        view.origin, view.row, view.direction, hits.range, normal, light.direction, _LIFT, start, which
+        view.origin, view.row, view.direction, distance, normal, light.direction, _LIFT, start, which
     )
     lit = np.zeros(n, np.bool_)
     if k and light.beam.any():
@@ -449,22 +454,18 @@ def _shaded(
             lit[which] = True
     out = np.empty((n, 3), np.float32)
     gloss, facet = np.zeros(n if wet else 0, np.float32), np.empty((n if wet else 0, 3), np.float32)
-    if len(walls.style) and world.walls is None:
-        wall = np.where(hits.instance < 0, walls.wall[hits.face], np.int32(-1))
-    else:
-        wall = np.full(n, -1, np.int32)
     shade.shade(
         view.origin,
         view.row,
         view.direction,
-        hits.range,
+        distance,
         normal,
         surfaces.klass,
         surfaces.material,
         _drawn(world, view, size=size) if options.detail else surfaces.color,
         surfaces.feature,
         wall,
-        (walls.tangent, walls.along, walls.height, walls.style),
+        walls,
         lit,
         (light.direction, light.beam, light.ambient, light.sky, light.horizon),
         (*shade.material_tables(), shade.linear_table()),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.typing import Float
 from lidar.camera import ground_texture, texture
-from lidar.camera.facades import PAINT, windows
+from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, PAINTED, SEEN, UPRIGHT, Facades, facade
 from lidar.camera.ground_texture import HIGHEST, LOWEST, ground
 from lidar.camera.texture import detail, grain, hashed, noise
 
@@ -226,6 +226,31 @@ def _fresnel(straight: float, cosine: float) -> float:
 
 
 @compiled
+def _irradiance(
+    ambient: Float,
+    beam: Float,
+    sun: Float,
+    nx: float,
+    ny: float,
+    nz: float,
+    lit: bool,  # noqa: FBT001 - compiled
+    open_sky: float,
+    out: Float,
+) -> None:
+    """Fill ``out`` (3,) with the irradiance of a surface with this normal: by the sky, if lit by the sun."""
+    b4, b5, b6 = 1.092548 * nx * ny, 1.092548 * ny * nz, 0.315392 * (3.0 * nz * nz - 1.0)
+    b7, b8 = 1.092548 * nx * nz, 0.546274 * (nx * nx - ny * ny)
+    facing = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0) if lit else 0.0
+    for c in range(3):
+        e = 0.282095 * ambient[0, c] + 0.488603 * (
+            ny * ambient[1, c] + nz * ambient[2, c] + nx * ambient[3, c]
+        )
+        e += b4 * ambient[4, c] + b5 * ambient[5, c] + b6 * ambient[6, c]
+        e += b7 * ambient[7, c] + b8 * ambient[8, c]
+        out[c] = max(e, 0.0) * open_sky + beam[c] * facing
+
+
+@compiled
 def shade(
     origin: Float,
     row: NDArray[np.int32],
@@ -237,7 +262,7 @@ def shade(
     color: NDArray[np.uint8],
     feature: NDArray[np.int32],
     wall: NDArray[np.int32],
-    walls: tuple[Float, Float, Float, Float],
+    walls: Facades,
     lit: NDArray[np.bool_],
     light: tuple[Float, Float, Float, Float, Float],
     tables: tuple[NDArray[np.uint8], NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
@@ -252,22 +277,22 @@ def shade(
     Of wet surfaces also fill ``gloss`` (n,) with the share of what their films of water reflect, which is not
     in ``out``, and ``facet`` (n, 3) with the films' normals; both are empty in a dry world.
 
-    walls    : tangent, along, height, style of `lidar.camera.facades.Facades`; ``wall`` (n,) are rows of them
+    walls    : `lidar.camera.facades.Facades`; ``wall`` (n,) are rows of its tables, -1 for other surfaces
     light    : direction, beam, ambient, sky, horizon of `lidar.camera.light.Light`
     tables   : `material_tables` and `linear_table`
     settings : size of a pixel at distance 0 (metres) and its growth with distance (radians), extinction of
                haze (1/m), whether detail is drawn
     covers   : `covers` of the world
     """
-    tangent, along, height, style = walls
+    frame = walls.tables.frame
     sun, beam, ambient, sky, horizon = light
     kinds, floors, mirrors, plain, soaked, linear = tables
     blur, angle, extinction, detailed = settings
     wetness, pools, snow, patches = covers
     glow = np.empty(3)
-    pane = np.empty(4)
+    seen = np.zeros(SEEN)
     d = np.empty(3)
-    albedo = np.empty(3)
+    albedo, sides, aslant = np.empty(3), np.empty(3), np.empty(3)
     irradiance = np.empty(3)
     town = 0.6 * horizon
     for i in range(len(range_)):
@@ -285,7 +310,10 @@ def shade(
             continue
         o = row[i]
         x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
+        w = wall[i]
         nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+        if w >= 0:
+            nx, ny, nz = frame[w, 4], -frame[w, 3], 0.0
         cosine = max(-(nx * d[0] + ny * d[1] + nz * d[2]), 0.0)
         distance = t * length
         size = blur + distance * angle
@@ -294,11 +322,10 @@ def shade(
         is_open = material[i] > 127
         kind = kinds[m]
         mirror = mirrors[m]
-        w = wall[i]
         upright = abs(nz) < 0.3
         u = 0.0
         if w >= 0:
-            u = x * tangent[w, 0] + y * tangent[w, 1]
+            u = x * frame[w, 3] + y * frame[w, 4]
         elif upright:
             flat = math.sqrt(nx * nx + ny * ny)
             u = (y * nx - x * ny) / flat
@@ -318,17 +345,17 @@ def shade(
             r, g, b = color[i, 0], color[i, 1], color[i, 2]
             if r == plain[m, 0] and g == plain[m, 1] and b == plain[m, 2]:
                 _painted(feature[i], w >= 0, albedo)
-        glass = 0.0
+        glass = aside = upwards = 0.0
         open_sky = 1.0
         if w >= 0:
-            foot = z - height[w, 0]
-            open_sky = 0.6 + 0.4 * min(max(foot / 9.0, 0.0), 1.0)
+            open_sky = 0.6 + 0.4 * min(max((z - frame[w, 2]) / 9.0, 0.0), 1.0)
             if detailed:
-                windows(u - along[w, 0], foot, style, w, size / max(cosine, 0.05), size, feature[i], pane)
-                glass, paint = pane[0], style[w, PAINT]
+                facade(walls, w, (x, y, z), (d[0], d[1], d[2]), size, linear, seen)
+                glass, aside, upwards = seen[GLASS], seen[ASIDE], seen[UPRIGHT]
+                front = 1.0 - glass - aside - upwards - seen[PAINTED]
                 for c in range(3):
-                    albedo[c] *= 1.0 - 0.3 * pane[2]
-                    albedo[c] += pane[1] * (paint - albedo[c]) + glass * (pane[3] - albedo[c])
+                    sides[c] = albedo[c]
+                    albedo[c] = front * albedo[c] + seen[LIGHT + c] + seen[BEHIND + c]
 
         film = pool = 0.0
         if is_open:
@@ -358,21 +385,26 @@ def shade(
         if mirror > 0.0:
             shine = max(shine, _fresnel(mirror, cosine))
 
-        b4, b5, b6 = 1.092548 * nx * ny, 1.092548 * ny * nz, 0.315392 * (3.0 * nz * nz - 1.0)
-        b7, b8 = 1.092548 * nx * nz, 0.546274 * (nx * nx - ny * ny)
-        facing = max(nx * sun[0] + ny * sun[1] + nz * sun[2], 0.0) if lit[i] else 0.0
-        for c in range(3):
-            e = 0.282095 * ambient[0, c] + 0.488603 * (
-                ny * ambient[1, c] + nz * ambient[2, c] + nx * ambient[3, c]
-            )
-            e += b4 * ambient[4, c] + b5 * ambient[5, c] + b6 * ambient[6, c]
-            e += b7 * ambient[7, c] + b8 * ambient[8, c]
-            irradiance[c] = max(e, 0.0) * open_sky + beam[c] * facing
+        _irradiance(ambient, beam, sun, nx, ny, nz, lit[i], open_sky, irradiance)
         if shine > 0.0:
             _mirrored(sky, sun, d, rx, ry, rz, town, glow)
+        for c in range(3):
+            irradiance[c] *= albedo[c]
+        if aside > 0.0:
+            along = 1.0 if d[0] * frame[w, 3] + d[1] * frame[w, 4] < 0.0 else -1.0
+            _irradiance(
+                ambient, beam, sun, along * frame[w, 3], along * frame[w, 4], 0.0, lit[i], open_sky, aslant
+            )
+            for c in range(3):
+                irradiance[c] += aside * sides[c] * aslant[c]
+        if upwards > 0.0:
+            up = 1.0 if d[2] < 0.0 else -1.0
+            _irradiance(ambient, beam, sun, 0.0, 0.0, up, lit[i], open_sky, aslant)
+            for c in range(3):
+                irradiance[c] += upwards * sides[c] * aslant[c]
         clear = math.exp(-extinction * distance)
         for c in range(3):
-            r = (1.0 - shine) * (1.0 - film) * albedo[c] * irradiance[c] / math.pi
+            r = (1.0 - shine) * (1.0 - film) * irradiance[c] / math.pi
             if shine > 0.0:
                 r += shine * glow[c]
             out[i, c] = r * clear + horizon[c] * (1.0 - clear)

@@ -251,7 +251,10 @@ class Caster:
             hits, at = self._left(rays, on, normals=False)
             blocked = hits.face >= 0
             for row, part in _parts(rays, at):
-                blocked[row] = self._any_hit(part, None, threads=threads)
+                if at[row[0]] == 0.0:
+                    blocked[row] = self._any_hit(part, None, threads=threads)
+                else:  # they start on a face, which only first hits are sure to leave out
+                    blocked[row] = self._first_hits(part, None, normals=False, threads=threads).face >= 0
             return blocked
         blocked = self.scene.occluded(rays, threads=threads)
         if self.refiners and np.isfinite(rays.far).any():

@@ -9,6 +9,7 @@ from lidar.relief.march import INFILL as INFILL
 from lidar.relief.march import PARTS as PARTS
 from lidar.relief.march import ROOM as ROOM
 from lidar.relief.march import SILL as SILL
+from lidar.relief.walls import NO_WALLS as NO_WALLS
 from lidar.relief.walls import WallRefiner as WallRefiner
 from lidar.relief.walls import WallTables as WallTables
 from lidar.relief.walls import joined as joined

@@ -28,8 +28,8 @@ _X, _Y, _Z = range(3)
 _ON = 1e-6
 """Metres off a surface up to which a ray starts on it."""
 
-(PANEL, _, _, _, _SILL, _, _, _, _OPENING, _, _, _) = range(12)
-_PANEL_DEPTH, _REVEAL_DEPTH, PANE_DEPTH, _FRAME, _BARS_X, _BARS_Y, _BAR, _ROOM_DEPTH = range(12, 20)
+(PANEL, _, _, _, SILL_BOX, _, _, _, OPENING, _, _, _) = range(12)
+PANEL_DEPTH, REVEAL_DEPTH, PANE_DEPTH, FRAME_WIDTH, BARS, _, BAR, ROOM_DEPTH = range(12, 20)
 WIDTH = 20
 """Columns of `opening_table`."""
 
@@ -131,23 +131,28 @@ def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
     layer    : 0 panel, 1 reveal, 2 panes
     """
     ox, oy, _, dx, dy, dz = ray
-    d0, d1, d2 = kinds[k, _PANEL_DEPTH], kinds[k, _REVEAL_DEPTH], kinds[k, PANE_DEPTH]
+    d0, d1, d2 = kinds[k, PANEL_DEPTH], kinds[k, REVEAL_DEPTH], kinds[k, PANE_DEPTH]
     x0, y0, x1, y1 = (
-        kinds[k, _OPENING],
-        kinds[k, _OPENING + 1],
-        kinds[k, _OPENING + 2],
-        kinds[k, _OPENING + 3],
+        kinds[k, OPENING],
+        kinds[k, OPENING + 1],
+        kinds[k, OPENING + 2],
+        kinds[k, OPENING + 3],
     )
-    f, bar = kinds[k, _FRAME], kinds[k, _BAR]
+    f, bar = kinds[k, FRAME_WIDTH], kinds[k, BAR]
     t, front, passes = start, layer == 0 and dz > 0.0, layer == 2
     while True:
         if layer == 0:
             p, q, r, s = kinds[k, PANEL], kinds[k, PANEL + 1], kinds[k, PANEL + 2], kinds[k, PANEL + 3]
             begin = t
             t, axis = _leaves(p, q, 0.0, r, s, d0, ray)
-            p, q, r, s = kinds[k, _SILL], kinds[k, _SILL + 1], kinds[k, _SILL + 2], kinds[k, _SILL + 3]
+            p, q, r, s = (
+                kinds[k, SILL_BOX],
+                kinds[k, SILL_BOX + 1],
+                kinds[k, SILL_BOX + 2],
+                kinds[k, SILL_BOX + 3],
+            )
             if r > p:
-                if front and within(kinds, k, _SILL, ox + begin * dx, oy + begin * dy, 0.0):
+                if front and within(kinds, k, SILL_BOX, ox + begin * dx, oy + begin * dy, 0.0):
                     return begin, _Z, SILL
                 at, side = _enters(p, q, 0.0, r, s, d0, ray, begin)
                 if at < t:
@@ -156,7 +161,7 @@ def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
                 return t, axis, WALL
             if dz < 0.0:
                 return t, _Z, OUT
-            if not within(kinds, k, _OPENING, ox + t * dx, oy + t * dy, 0.0):
+            if not within(kinds, k, OPENING, ox + t * dx, oy + t * dy, 0.0):
                 return t, _Z, WALL
             layer = 1
         if layer == 1:
@@ -168,8 +173,8 @@ def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
                 continue
             passes = False
         x, y = ox + t * dx, oy + t * dy
-        p, r = _pane(x0 + f, x1 - f, kinds[k, _BARS_X], bar, x)
-        q, s = _pane(y0 + f, y1 - f, kinds[k, _BARS_Y], bar, y)
+        p, r = _pane(x0 + f, x1 - f, kinds[k, BARS], bar, x)
+        q, s = _pane(y0 + f, y1 - f, kinds[k, BARS + 1], bar, y)
         if not (passes or (p <= x <= r and q <= y <= s)):
             return t, _Z, FRAME
         t, axis = _leaves(p, q, d1, r, s, d2, ray)
@@ -183,20 +188,20 @@ def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
 @inlined
 def layer_of(kinds: Any, k: int, x: float, y: float, z: float) -> int:
     """The layer whose air holds a point, its surfaces included; -1 for none."""
-    if z <= kinds[k, _PANEL_DEPTH] + _ON:
-        sill = kinds[k, _SILL + 2] > kinds[k, _SILL] and within(kinds, k, _SILL, x, y, -_ON)
+    if z <= kinds[k, PANEL_DEPTH] + _ON:
+        sill = kinds[k, SILL_BOX + 2] > kinds[k, SILL_BOX] and within(kinds, k, SILL_BOX, x, y, -_ON)
         return 0 if within(kinds, k, PANEL, x, y, _ON) and not sill else -1
-    if z <= kinds[k, _REVEAL_DEPTH] + _ON:
-        return 1 if within(kinds, k, _OPENING, x, y, _ON) else -1
+    if z <= kinds[k, REVEAL_DEPTH] + _ON:
+        return 1 if within(kinds, k, OPENING, x, y, _ON) else -1
     if z > kinds[k, PANE_DEPTH] + _ON:
         return -1
-    f, bar = kinds[k, _FRAME], kinds[k, _BAR]
-    p, r = _pane(kinds[k, _OPENING] + f, kinds[k, _OPENING + 2] - f, kinds[k, _BARS_X], bar, x)
-    q, s = _pane(kinds[k, _OPENING + 1] + f, kinds[k, _OPENING + 3] - f, kinds[k, _BARS_Y], bar, y)
+    f, bar = kinds[k, FRAME_WIDTH], kinds[k, BAR]
+    p, r = _pane(kinds[k, OPENING] + f, kinds[k, OPENING + 2] - f, kinds[k, BARS], bar, x)
+    q, s = _pane(kinds[k, OPENING + 1] + f, kinds[k, OPENING + 3] - f, kinds[k, BARS + 1], bar, y)
     return 2 if p - _ON <= x <= r + _ON and q - _ON <= y <= s + _ON else -1
 
 
 @inlined
 def in_room(kinds: Any, k: int, width: float, height: float, ray: Any) -> Any:
     """Ray parameter and axis at which a ray that has passed the pane hits the room; it is closed."""
-    return _leaves(0.0, 0.0, kinds[k, PANE_DEPTH], width, height, kinds[k, _ROOM_DEPTH], ray)
+    return _leaves(0.0, 0.0, kinds[k, PANE_DEPTH], width, height, kinds[k, ROOM_DEPTH], ray)

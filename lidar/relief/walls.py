@@ -24,6 +24,7 @@ from lidar.relief.march import (
     ROOM,
     SILL,
     WALL,
+    WIDTH,
     in_room,
     layer_of,
     march,
@@ -88,6 +89,20 @@ class WallTables(NamedTuple):
     faces: NDArray[np.int32]
     kinds: Float
     bits: NDArray[np.uint32]
+
+
+NO_WALLS = WallTables(
+    wall=np.empty(0, np.int32),
+    part=np.empty(0, np.uint8),
+    frame=np.empty((0, 12)),
+    first=np.empty(0, np.int64),
+    own=np.empty(0, np.int32),
+    cells=np.empty(0, np.int32),
+    faces=np.empty(0, np.int32),
+    kinds=np.empty((0, WIDTH)),
+    bits=np.empty(0, np.uint32),
+)
+"""The tables of a tile without facades."""
 
 
 def tables_of(relief: WallRelief, pairs: Pairs, *, origin: Float, bits: NDArray[np.uint32]) -> WallTables:
@@ -198,7 +213,7 @@ class WallRefiner:
 
 
 @inlined
-def _on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
+def on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
     """A ray relative to the first cell of a wall: origin without its depth, direction."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]
     x, y, z = origin[0] - frame[w, _FOOT], origin[1] - frame[w, _FOOT + 1], origin[2] - frame[w, _FOOT + 2]
@@ -213,7 +228,13 @@ def _on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
 
 
 @inlined
-def _cell(frame: Any, w: int, u: float, v: float) -> Any:
+def outwards(frame: Any, w: int) -> Any:
+    """The horizontal normal of a wall."""
+    return frame[w, _TANGENT + 1], -frame[w, _TANGENT]
+
+
+@inlined
+def cell_number(frame: Any, w: int, u: float, v: float) -> Any:
     """Number of the cell of a wall's grid at a place (-1: none), and its lower left corner."""
     width, height, ground = frame[w, _WIDTH], frame[w, _HEIGHT], frame[w, _GROUND]
     column, row, low = np.floor(u / width), 0.0, 0.0
@@ -239,7 +260,7 @@ def _write_normal(frame: Any, w: int, axis: int, along: float, up: float, out: A
 
 
 @inlined
-def _height(frame: Any, w: int, bottom: float) -> Any:
+def height_of(frame: Any, w: int, bottom: float) -> Any:
     """Height of the cell of a wall that starts at a height above the first one."""
     return frame[w, _HEIGHT] if bottom > 0.0 else frame[w, _GROUND]
 
@@ -255,11 +276,11 @@ def _refine_one(tables: Any, rays: Any, i: int, columns: Any) -> None:
         return
     frame, kinds = tables.frame, tables.kinds
     direction = direction_of(rays, i)
-    ox, oy, dx, dy, dz = _on_wall(frame, w, origin_of(rays, i), direction)
+    ox, oy, dx, dy, dz = on_wall(frame, w, origin_of(rays, i), direction)
     if not dz > 0.0:
         return
     t = distance[i]
-    number, left, bottom = _cell(frame, w, ox + t * dx, oy + t * dy)
+    number, left, bottom = cell_number(frame, w, ox + t * dx, oy + t * dy)
     if number < 0:
         return
     number += tables.first[w]
@@ -272,7 +293,7 @@ def _refine_one(tables: Any, rays: Any, i: int, columns: Any) -> None:
         return
     s, axis, part = march(kinds, k, ray, t, 0)
     if part == INFILL and rays.mask & tables.bits[k] == 0:
-        s, axis = in_room(kinds, k, frame[w, _WIDTH], _height(frame, w, bottom), ray)
+        s, axis = in_room(kinds, k, frame[w, _WIDTH], height_of(frame, w, bottom), ray)
         part = ROOM
     if s > rays.far[i if len(rays.far) > 1 else 0]:
         distance[i], face[i], instance[i], cosine[i] = np.inf, -1, -1, 0.0
@@ -313,9 +334,9 @@ def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
         return 0.0
     frame, kinds, near = tables.frame, tables.kinds, rays.near
     origin, direction = origin_of(rays, i), direction_of(rays, i)
-    ox, oy, dx, dy, dz = _on_wall(frame, w, origin, direction)
-    depth = _depth(frame, w, origin)
-    number, left, bottom = _cell(frame, w, ox + near * dx, oy + near * dy)
+    ox, oy, dx, dy, dz = on_wall(frame, w, origin, direction)
+    depth = depth_of(frame, w, origin)
+    number, left, bottom = cell_number(frame, w, ox + near * dx, oy + near * dy)
     if number < 0:
         return 0.0
     number += tables.first[w]
@@ -330,7 +351,7 @@ def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
     if part == OUT:
         return s
     if part == INFILL and rays.mask & tables.bits[k] == 0:
-        s, axis = in_room(kinds, k, frame[w, _WIDTH], _height(frame, w, bottom), ray)
+        s, axis = in_room(kinds, k, frame[w, _WIDTH], height_of(frame, w, bottom), ray)
         part = ROOM
     if not s > rays.far[i if len(rays.far) > 1 else 0]:
         number = tables.faces[number] + part - 1 if part != WALL else tables.own[w]
@@ -347,7 +368,7 @@ def _leave(tables: Any, rays: Any, on: Any, columns: Any, at: Any) -> None:
 
 
 @inlined
-def _depth(frame: Any, w: int, place: Any) -> Any:
+def depth_of(frame: Any, w: int, place: Any) -> Any:
     """Depth of a place behind the plane of a wall."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]
     return tx * (place[1] - frame[w, _FOOT + 1]) - ty * (place[0] - frame[w, _FOOT])
@@ -360,13 +381,13 @@ def _rooms(tables: Any, face: Any, place: Any, direction: Any, out: Any) -> None
     for i in range(len(face)):
         w = tables.wall[face[i]]
         x, y, z = direction[i, 0], direction[i, 1], direction[i, 2]
-        ox, oy, dx, dy, dz = _on_wall(frame, w, (place[i, 0], place[i, 1], place[i, 2]), (x, y, z))
-        number, left, bottom = _cell(frame, w, ox, oy)
+        ox, oy, dx, dy, dz = on_wall(frame, w, (place[i, 0], place[i, 1], place[i, 2]), (x, y, z))
+        number, left, bottom = cell_number(frame, w, ox, oy)
         number += tables.first[w]
         k = tables.cells[number]
-        depth = _depth(frame, w, (place[i, 0], place[i, 1], place[i, 2]))
+        depth = depth_of(frame, w, (place[i, 0], place[i, 1], place[i, 2]))
         ray = ox - left, oy - bottom, depth, dx, dy, dz
-        t, axis = in_room(kinds, k, frame[w, _WIDTH], _height(frame, w, bottom), ray)
+        t, axis = in_room(kinds, k, frame[w, _WIDTH], height_of(frame, w, bottom), ray)
         across = dx if axis == 0 else (dy if axis == 1 else dz)
         distance[i], hit[i] = max(t, 0.0), tables.faces[number] + ROOM - 1
         cosine[i] = abs(across) / np.sqrt(x * x + y * y + z * z)

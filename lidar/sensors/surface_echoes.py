@@ -158,7 +158,7 @@ def _beyond(
         power = (power * (1 - mirror) ** 2)[through]
         pulse, travelled = pulse[through], travelled[through] + _CLEAR
         time = None if time is None else time[through]
-        behind = _panes(world, hits.take(through))
+        behind = world.walls.panes(hits.take(through))
         if not through.any():
             break
     return [part.take(part.range <= far) for part in found]
@@ -176,16 +176,11 @@ def _cast(
     """First hits of rays; those that have passed the pane ``behind`` (n,; -1 for none) hit the room there."""
     hits = world.caster.cast(start, direction, far=far, time=time, normals=True)
     row = np.flatnonzero(behind >= 0)
-    if len(row) and world.walls is not None:
+    if len(row):
         rooms = world.walls.rooms(behind[row], start[row], direction[row])
         for column, new in zip(hits.columns().values(), rooms.columns().values(), strict=True):
             column[row] = new
     return hits
-
-
-def _panes(world: World, hits: Hits) -> NDArray[np.int32]:
-    """Faces (n,) of hits on panes of facades, -1 for other hits."""
-    return np.full(len(hits), -1, np.int32) if world.walls is None else world.walls.panes(hits)
 
 
 def _along(

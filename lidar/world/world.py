@@ -18,6 +18,7 @@ from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 from lidar.raycast.refine import Refiner
 from lidar.relief import (
+    NO_WALLS,
     GroundRefiner,
     GroundTables,
     WallRefiner,
@@ -66,14 +67,14 @@ class _Tile:
     """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
 
     surfaces : of the faces of the mesh, then of those that ``walls`` adds
-    walls    : openings of its walls, None for none
+    walls    : openings of its walls
     ground   : roughness of its ground, None for none
     centre   : (m, 3) of the faces of the mesh, scene metres; then zeros
     """
 
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
-    walls: WallTables | None
+    walls: WallTables
     ground: GroundTables | None
     shape: NDArray[np.int32]
     transform: Float
@@ -120,7 +121,7 @@ class World:
         self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
-        self._walls: WallRefiner | None = None
+        self._walls = WallRefiner(NO_WALLS)
         relief = scene.manifest.get("options", {}).get("relief", "off")
         self._rough = relief != "off" and settings.relief != "off"
         self._concatenate_tables()
@@ -244,8 +245,13 @@ class World:
         return self._faces
 
     @property
-    def walls(self) -> WallRefiner | None:
-        """The openings of walls, None without any."""
+    def surfaces(self) -> Surfaces:
+        """The table of surfaces; hits on the mesh have the row `Hits.face`."""
+        return self._surfaces
+
+    @property
+    def walls(self) -> WallRefiner:
+        """The openings of walls; without relief (see the settings) rays do not meet them."""
         return self._walls
 
     def _refiners(self) -> list[Refiner]:
@@ -254,15 +260,16 @@ class World:
         A kind of surface is one `lidar.raycast.refine.Refiner`. It finds its own faces by `Hits.face`, which
         is also the row in the table of surfaces of the world.
         """
-        loaded = {self._first[rank]: tile.walls for rank, tile in self._tiles.items() if tile.walls}
-        self._walls = None
-        if loaded:
-            count = len(self._surfaces)
-            self._walls = WallRefiner(joined(list(loaded.values()), faces=list(loaded), count=count))
-        refiners: list[Refiner] = [self._walls] if self._walls else []
+        count = len(self._surfaces)
+        tables = [NO_WALLS, *(tile.walls for tile in self._tiles.values())]
+        faces = [0, *(self._first[rank] for rank in self._tiles)]
+        self._walls = WallRefiner(joined(tables, faces=faces, count=count))
+        refiners: list[Refiner] = []
+        if self.settings.relief != "off" and len(self._walls.tables.first):
+            refiners.append(self._walls)
         rough = {self._first[rank]: tile.ground for rank, tile in self._tiles.items() if tile.ground}
         if rough:
-            refiners.append(GroundRefiner(joined_ground(rough, count=len(self._surfaces))))
+            refiners.append(GroundRefiner(joined_ground(rough, count=count)))
         return refiners
 
     def _read(self, rank: int) -> _Tile:
@@ -273,9 +280,9 @@ class World:
         )
         transform = copies.transform.copy()
         transform[:, :, 3] += tile.origin
-        surfaces, walls = surfaces_of(mesh, self.settings), None
+        surfaces, walls = surfaces_of(mesh, self.settings), NO_WALLS
         centre = mesh.vertices[mesh.faces].mean(axis=1) + tile.origin
-        if tile.relief is not None and self.settings.relief != "off":
+        if tile.relief is not None:
             bits = mask_bits(np.arange(256, dtype=np.uint8))
             walls, added = openings_of(tile.relief, origin=tile.origin, bits=bits)
             surfaces = Surfaces.concatenate([surfaces, added])

@@ -167,3 +167,59 @@ def _placed(relief, quads):
     return Mesh.of(
         vertices, faces, feature=int(facades.feature[0]), klass=Class.BUILDING, surface=WALL, material=parts
     )
+
+
+def window():
+    """One kind of opening, for cells of at least 2.5 x 3 m: a window of 1.2 x 1.5 m with a sill."""
+    known = {name: np.array([m.code], np.uint8) for name, m in materials().items()}
+    grey = np.array([[200, 200, 195]], np.uint8)
+    one = np.ones(1)
+    return Openings(
+        panel=np.array([[0.5, 0.6, 2.0, 2.6]]),
+        sill=np.array([[0.55, 0.8, 1.95, 0.9]]),
+        opening=np.array([[0.65, 0.9, 1.85, 2.4]]),
+        panel_depth=0.03 * one,
+        reveal_depth=0.15 * one,
+        pane_depth=0.2 * one,
+        frame=0.06 * one,
+        bars=np.array([[1, 1]], np.int32),
+        bar=0.04 * one,
+        room=4.0 * one,
+        trim=known["stone"],
+        frame_material=known["wood"],
+        infill=known["glass"],
+        trim_color=grey,
+        frame_color=grey + 20,
+        infill_color=grey // 2,
+        room_color=grey // 2,
+    )
+
+
+def with_windows(mesh):
+    """Windows on all upright walls of a mesh of boxes along the axes."""
+    normal, rows, wall = mesh.normals(), [], np.full(len(mesh), -1, np.int32)
+    for feature in np.unique(mesh.feature[mesh.surface == WALL]):
+        for way in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            mine = (mesh.feature == feature) & (normal[:, :2] @ way > 0.9)
+            corners = mesh.vertices[mesh.faces[mine]].reshape(-1, 3)
+            tangent = np.array([-way[1], way[0]], float)
+            along = corners[:, :2] @ tangent
+            low, high = corners[:, 2].min(), corners[:, 2].max()
+            foot = np.array([*corners[np.argmin(along), :2], low])
+            grid = [int((np.ptp(along) - 0.4) // 2.5), int((high - low - 0.4) // 3.0)]
+            wall[mine] = len(rows)
+            rows.append((feature, foot, tangent, (np.ptp(along), high - low), grid))
+    feature, foot, tangent, size, grid = (np.array(column) for column in zip(*rows, strict=True))
+    k, cells = len(rows), grid.prod(axis=1)
+    facades = Facades(
+        feature.astype(np.int32),
+        foot,
+        tangent,
+        size,
+        start=np.full((k, 2), 0.2),
+        cell=np.tile([2.5, 3.0], (k, 1)),
+        ground=np.full(k, 3.0),
+        grid=grid.astype(np.int32),
+        first=(np.cumsum(cells) - cells).astype(np.int32),
+    )
+    return WallRelief(facades, np.zeros(cells.sum(), np.int32), window(), wall)

@@ -4,14 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from geoscene.buildings.facades import WallRelief
 from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.raycast.geometry import split
+from lidar.relief import NO_WALLS, WallRefiner, joined
+from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of
-from lidar.world.surfaces import Faces, Surfaces, packed, surfaces_of
+from lidar.world.surfaces import MISS, Faces, Surfaces, mask_bits, packed, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 
@@ -26,15 +29,22 @@ _FACES = np.array(
 
 @dataclass
 class MeshWorld:
-    """A world of one mesh."""
+    """A world of one mesh, with or without openings in its walls."""
 
     mesh: Mesh
     reach = np.inf
-    walls = None
     settings: WorldSettings = PLAIN
+    relief: WallRelief | None = None
 
     def __post_init__(self):
         self.caster = Caster(self.mesh.vertices, self.mesh.faces)
+        self.surfaces, tables = surfaces_of(self.mesh, self.settings), NO_WALLS
+        if self.relief is not None:
+            bits = mask_bits(np.arange(256, dtype=np.uint8))
+            tables, added = openings_of(self.relief, origin=np.zeros(3), bits=bits)
+            self.surfaces = Surfaces.concatenate([self.surfaces, added])
+        self.walls = WallRefiner(joined([tables], faces=[0], count=len(self.surfaces) + 1))
+        self.caster.refiners = [self.walls] if self.relief is not None else []
 
     def shelter(self, position):
         """The covered air within 60 m."""
@@ -44,17 +54,13 @@ class MeshWorld:
 
     @property
     def faces(self):
-        m, surfaces = self.mesh, surfaces_of(self.mesh, self.settings)
-        what = np.append(packed(surfaces, m.klass == Class.HEDGE), np.int64(-1) << 32)
-        low, high = int(m.feature.min()), int(m.feature.max())
+        surfaces = self.surfaces
+        what = np.append(packed(surfaces, surfaces.klass == Class.HEDGE), np.int64(-1) << 32)
+        low, high = int(surfaces.feature.min()), int(surfaces.feature.max())
         return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES]))
 
     def lookup(self, hits):
-        seen, m = hits.face >= 0, surfaces_of(self.mesh, self.settings)
-        rows = np.where(seen, hits.face, 0)
-        feature = np.where(seen, m.feature[rows], -1).astype(np.int32)
-        columns = (np.where(seen, c[rows], 0).astype(np.uint8) for c in (m.klass, m.material, m.surface))
-        return Surfaces(feature, *columns, m.color[rows] * seen[:, None].astype(np.uint8))
+        return Surfaces.concatenate([self.surfaces, MISS]).take(hits.face)
 
 
 def box(low, high, *, feature=0, klass=Class.BUILDING, material="brick"):

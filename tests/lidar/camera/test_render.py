@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from helpers.facades import with_windows
 from helpers.sensor_worlds import MeshWorld, box, plate, world
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.camera.edges import edge_pixels
-from lidar.camera.facades import FLOORS, facades_of
 from lidar.camera.png import encode_png
 from lidar.camera.render import RenderOptions, exposure_times, optical_flow, render
 from lidar.errors import InputError
@@ -328,19 +328,6 @@ def test_a_fisheye_measures_along_its_rays_and_is_black_outside_its_circle():
     assert frame.depth[v, 79:81] == pytest.approx(3.0, abs=0.01)
 
 
-def test_buildings_get_windows_that_fit_their_walls():
-    town = street()
-    walls = facades_of(town)
-    assert (walls.wall >= 0).sum() == 3 * 8  # four walls of two triangles each
-    assert len(walls.style) == 12
-    width = walls.along[:, 1] - walls.along[:, 0]
-    assert sorted(np.round(width).astype(int).tolist()) == sorted([50, 50, 12, 12] * 2 + [100, 100, 10, 10])
-    heights = {f: np.ptp(walls.height, axis=1)[k] for f, k in zip((1, 2, 3), (0, 4, 8), strict=True)}
-    assert heights == {1: 14.0, 2: 9.0, 3: 12.0}
-    assert (walls.style[:, FLOORS] >= 2).all()
-    assert facades_of(town) is walls
-
-
 def _corners(rgb):
     """Number of Harris corners above a fixed strength."""
     grey = rgb.astype(float).mean(axis=2)
@@ -358,15 +345,17 @@ def _corners(rgb):
 def test_detail_gives_odometry_features_to_track():
     camera = replace(CAMERA, width=640, height=480, fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     town, poses = street(), looking((-20, 0, 1.5), yaw=0.1)
+    windows = MeshWorld(town.mesh, relief=with_windows(town.mesh))
     smooth = RenderOptions(supersample=3)
-    drawn = _corners(render(camera, poses, world=town, sun=NOON, options=smooth).rgb)
+    drawn = _corners(render(camera, poses, world=windows, sun=NOON, options=smooth).rgb)
     plain = _corners(render(camera, poses, world=town, sun=NOON, options=replace(smooth, detail=False)).rgb)
     assert drawn > 300
     assert drawn > 10 * plain
 
 
 def test_detail_stays_in_its_place_when_the_camera_moves():
-    wall = MeshWorld(house((10, -20, -20), (12, 20, 20), material="plaster"))
+    mesh = house((10, -20, -20), (12, 20, 20), material="plaster")
+    wall = MeshWorld(mesh, relief=with_windows(mesh))
     camera = replace(CAMERA, width=320, fx=200.0, fy=200.0, cx=159.5)
     options = RenderOptions(supersample=3, visibility=np.inf)
     a, b = (
@@ -475,6 +464,7 @@ class ActorWorld:
         transform = np.array([[np.column_stack([np.eye(3), place]) for place in places]])
         back = plate(50.0)
         self.back = MeshWorld(back)
+        self.surfaces, self.walls = self.back.surfaces, self.back.walls
         self.caster = Caster(
             back.vertices, back.faces, instances=[Instances((shape,), np.zeros(1, np.int32), transform)]
         )

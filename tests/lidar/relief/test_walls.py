@@ -146,6 +146,22 @@ def test_shadow_rays_agree_with_triangles(seed, far):
         assert np.array_equal(dark[sure], reference.occluded(begin, towards, far=far)[sure])
 
 
+@pytest.mark.parametrize("backend", ["embree", "float64"])
+def test_the_wall_itself_does_not_shade_its_openings_from_light_in_front(backend):
+    rng = np.random.default_rng(1)
+    relief = random_relief(rng)
+    caster = refined(relief, backend=backend)
+    start, way = rays_at(relief, rng, 5000, close=False)
+    hits = caster.cast(start, way, normals=True)
+    light = (on_wall(relief, np.array([[0, 0, 1.0]])) - relief.facades.foot)[0]
+    row = np.flatnonzero(hits.normal @ light > 0.5)
+    place = start[row] + hits.range[row, None] * way[row] + 1e-3 * light
+    deep = (place - relief.facades.foot[0]) @ light < 0
+    dark = caster.occluded(place, np.broadcast_to(light, place.shape), on=hits.face[row])
+    assert deep.sum() > 300
+    assert not dark.any()
+
+
 @FEW
 @given(SEEDS)
 def test_no_ray_passes_through_a_facade(seed):
