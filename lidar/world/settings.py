@@ -18,7 +18,7 @@ ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""
 
 
-RELIEFS = ("off", "full")
+RELIEFS = ("off", "full", "mesh")
 """What is used of the relief of a scene."""
 
 
@@ -34,8 +34,8 @@ class WorldSettings:
     trees     : single trees and those of rows
     furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
     barriers  : walls, fences and hedges
-    relief    : of `RELIEFS`: ``full``, what the scene holds; ``off``: walls are planes, in a scene with
-                relief, too
+    relief    : of `RELIEFS`: ``full``, what the scene holds; ``off``: walls are planes and the ground is
+                smooth, in a scene with relief, too; ``mesh``: openings of walls as triangles
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
     """

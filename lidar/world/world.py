@@ -106,7 +106,7 @@ class World:
     ) -> None:
         named = scene.shapes()
         self._meshes = shapes = list(named.values())
-        self.scene = scene
+        self.scene = scene.with_relief_mesh() if settings.relief == "mesh" else scene
         self._names = tuple(named)
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
         self.margin = min(margin, settings.reach)
