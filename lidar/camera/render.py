@@ -434,6 +434,7 @@ def _shaded(
     n = len(hits)
     wall = walls_of(walls, hits)
     surfaces = bare(walls, view.surfaces, hits=hits, wall=wall)
+    view = replace(view, surfaces=surfaces)
     distance, normal = hits.range, hits.normal
     if walls.deep and (wall >= 0).any():
         distance = distance.copy()
