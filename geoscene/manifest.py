@@ -12,6 +12,7 @@ import shapely
 from geoscene import __version__
 from geoscene.frames import wrapped
 from geoscene.ground import tile_span
+from geoscene.ground.kerbs import count_lowered
 from geoscene.limits import height_limit, places, scale_limit
 from geoscene.objects.shapes import leaf_area_density
 from geoscene.plan import Plan
@@ -184,6 +185,7 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
+        "kerbs_lowered": count_lowered(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
         "wires": _tally(plan.wires.kind),
         "roofs_guessed": dict(sorted(roofs.items())),

@@ -36,6 +36,7 @@ from geoscene.ground import (
     water_levels,
 )
 from geoscene.ground.foundations import foundation_heights
+from geoscene.ground.kerbs import lowered_kerbs
 from geoscene.ground.relief import Relief
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
@@ -456,7 +457,8 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     if len(wires):
         wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
-    covers = Layers.concatenate([cover, surfaces, pads, low])
+    relief = options.relief != "off"
+    covers = Layers.concatenate([cover, surfaces, pads, low, *([lowered_kerbs(surfaces)] if relief else [])])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
     ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
     trees, furniture, barriers = (
@@ -531,6 +533,7 @@ def _plan_ground(
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
         coarse=terrain.lines,
         relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
+        kerbs=options.relief != "off",
     )
 
 

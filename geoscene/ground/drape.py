@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.classes import materials
 from geoscene.frames import Frame
+from geoscene.ground.kerbs import kerb_heights, on_border
 from geoscene.ground.layers import Layers
 from geoscene.ground.partition import (
     GroundPlan,
@@ -21,7 +22,6 @@ from geoscene.ground.partition import (
     partition_tile,
     rows_at,
     rows_near,
-    tile_box,
     tile_lattice,
     values_at,
 )
@@ -108,7 +108,9 @@ def drape(
     depends on all layers there, not on the tile's own cells, so that neighbouring tiles agree.
     """
     x, y = triangles.points.T
-    z = np.zeros(len(x)) if height is None else np.asarray(height(x, y), float)
+    z = np.zeros(len(x)) if height is None else np.array(height(x, y), float)
+    if plan.kerbs:
+        z += kerb_heights(plan, cells, triangles=triangles)
     if levels is not None:
         z = _flooded(plan, cells, triangles=triangles, z=z, levels=levels)
     color = np.zeros((256, 3), np.uint8)
@@ -202,12 +204,7 @@ def _flooded(
         return z
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3)
-    edge = np.zeros(len(z), bool)
-    for i, j in np.unique(cells.tile, axis=0):
-        xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
-        x, y = triangles.points.T
-        within = (x >= xmin) & (x <= xmax) & (y >= ymin) & (y <= ymax)
-        edge |= within & ((x == xmin) | (x == xmax) | (y == ymin) | (y == ymax))
+    edge = on_border(plan, cells, triangles=triangles)
     inner = ~edge[vertex] & (row >= 0)
     vertex, row = vertex[inner], row[inner]
     around = triangles.points[edge][:, None] + _AROUND * np.stack(

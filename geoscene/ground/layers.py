@@ -17,6 +17,9 @@ from geoscene.typing import Float
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
 """Lowest priorities of land cover, of road surfaces and of building pads."""
 
+SIDEWALKS, KERBS, RAMPS, LOWERED = 112.0, 120.0, 120.5, 121.0
+"""Priorities of the sidewalks and kerbs of carriageways, of kerbs that come down, and of lowered ones."""
+
 
 @dataclass(frozen=True, slots=True)
 class Layers(Columns):

@@ -81,6 +81,7 @@ class GroundPlan:
     offset: Ints
     tiles: Ints
     span: Ints
+    kerbs: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,7 @@ def plan_ground(
     coarse: float = 0.0,
     relief: Relief | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
+    kerbs: bool = False,
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
 
@@ -129,6 +131,7 @@ def plan_ground(
     coarse : spacing of the lines in other tiles, 0 for none
     relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
     base   : class and material where no polygon lies
+    kerbs  : whether sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
     """
@@ -166,6 +169,7 @@ def plan_ground(
         offset,
         np.stack([i, j], axis=1) + low,
         np.ones(len(i), np.int64),
+        kerbs,
     )
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
+from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
 from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
@@ -23,7 +24,7 @@ from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
 from geoscene.typing import Float, Ints
 
-_SIDEWALK, _KERB, _CARRIAGEWAY = 112.0, 120.0, 130.0
+_CARRIAGEWAY = 130.0
 # Metres by which a bridge is wider than its surfaces on each side, for the parapet. Assumed.
 _PARAPET = 0.5
 
@@ -184,8 +185,8 @@ def _carriageway_rows(
     walk_source = np.where(tagged, "sidewalk/default", "default/default")
     walk_material = np.where(np.isin(roads.material, list(PAVED)), "paving", "gravel")
     for klass, priority, material, shape in (
-        (Class.KERB, _KERB, np.full(len(roads), "concrete"), "kerb"),
-        (Class.SIDEWALK, _SIDEWALK, walk_material, "walk"),
+        (Class.KERB, KERBS, np.full(len(roads), "concrete"), "kerb"),
+        (Class.SIDEWALK, SIDEWALKS, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
         bands_of = _widened(roads, half, extra=extra, rows=chosen)
