@@ -105,6 +105,7 @@ def test_blocks_and_flat_parts_have_no_parapets():
         assert solids.vertices[:, 2].max() == pytest.approx(top)
 
 
+@pytest.mark.shared
 @pytest.mark.parametrize(
     ("name", "more"), [("nyc_lower_east_side.osm.pbf", 1.2), ("berlin_siegessaeule.osm.gz", 1.0)]
 )

@@ -187,6 +187,7 @@ def test_without_relief_none_of_this_is_there():
     assert len(read_furniture(osm, FRAME, plan=town())[0]) == 0
 
 
+@pytest.mark.shared
 @pytest.mark.parametrize("name", ["nyc_lower_east_side.osm.pbf", "monaco.osm.pbf"])
 def test_nothing_of_a_real_place_stands_on_a_carriageway_or_in_a_building(shared_osm, name):
     plan, _ = make_plan(read_osm(shared_osm(name)), BuildOptions(relief="full"), progress=silent)

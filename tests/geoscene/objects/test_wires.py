@@ -86,6 +86,7 @@ def test_the_contact_wire_of_a_tramway_follows_the_track():
     assert on_track.max() < 0.02
 
 
+@pytest.mark.shared
 def test_tramways_of_a_real_place_have_wires_with_relief_alone(shared_osm):
     osm = read_osm(shared_osm("helsinki_center.osm.pbf"), bounds=(24.940, 60.168, 24.946, 60.171))
     plan, _ = make_plan(osm, BuildOptions(relief="plain"), progress=silent)
