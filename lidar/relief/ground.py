@@ -16,23 +16,27 @@ from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inlined
 from lidar.raycast.rays import share
 from lidar.relief.lines import direction_of, origin_of
-from lidar.relief.roughness import KINDS, kinds_of, roughness
+from lidar.relief.roughness import BLOCK, KINDS, kinds_of, roughness
 
-_DEPTH, _SLOPE = 6, 7
+_DEPTH, _SLOPE, _WAVE_SLOPE = 6, 7, 8
 """Columns of `Roughness.kinds`."""
 
-_LEAST = 5e-4
-"""Metres along the plane that a step covers at least; dips shorter than that can be missed."""
+_LEAST, _LEAST_GRAINS, _LEAST_WAVES = 5e-4, 2e-3, 5e-3
+"""Metres along the plane that a step covers at least: among joints, on grains (6 cm and more), and on waves
+(10 cm and more); dips shorter than that can be missed."""
 
 _STEPS = 4096
-_HALVINGS = 40
-"""Steps towards the surface at most, and halvings of the step that crosses it."""
+_NARROWINGS = 60
+"""Steps towards the surface at most, and narrowings of the step that crosses it."""
+
+_DIFFERENCE = 1e-3
+"""Metres to both sides over which the slope of joints is measured, so that normals in them point upwards."""
+
+_CLOSE = 1e-8
+"""Metres from the surface at which a crossing is found."""
 
 _OVER = 1e-3
 """Metres above the plane at which a ray from below it goes on: shadow rays keep as far off surfaces."""
-
-_DIFFERENCE = 1e-3
-"""Metres to both sides over which the slope of the surface is measured."""
 
 
 class GroundTables(NamedTuple):
@@ -130,10 +134,34 @@ def _joint(length: float, width: float, joint: float, deep: float, x: float, y: 
     return -deep * max(1.0 - 2.0 * edge / joint, 0.0)
 
 
+@inlined
+def _slope_at(field: Any, step: float, x: float, y: float) -> Any:
+    """Slopes of `_at` along x and y."""
+    n = field.shape[0]
+    u, v = x / step, y / step
+    fu, fv = np.floor(u), np.floor(v)
+    i, j = np.int64(fu) & (n - 1), np.int64(fv) & (n - 1)
+    k, m = (i + 1) & (n - 1), (j + 1) & (n - 1)
+    u, v = u - fu, v - fv
+    a, b, c, d = (
+        np.float64(field[i, j]),
+        np.float64(field[k, j]),
+        np.float64(field[i, m]),
+        np.float64(field[k, m]),
+    )
+    return ((b - a) * (1.0 - v) + (d - c) * v) / step, ((c - a) * (1.0 - u) + (d - b) * u) / step
+
+
+@inlined
+def _waves(rough: Any, k: int, x: float, y: float) -> Any:
+    """Height of the waves alone, of which grains and joints only take away."""
+    return rough.kinds[k, 0] * _at(rough.road, rough.step[0], x, y)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def _height(rough: Any, k: int, x: float, y: float) -> Any:
     kinds = rough.kinds
-    h = kinds[k, 0] * _at(rough.road, rough.step[0], x, y)
+    h = _waves(rough, k, x, y)
     if kinds[k, 1] > 0.0:
         h += kinds[k, 1] * _at(rough.grain, rough.step[1], x, y)
     if kinds[k, 2] > 0.0:
@@ -142,45 +170,170 @@ def _height(rough: Any, k: int, x: float, y: float) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _slopes(rough: Any, k: int, x: float, y: float) -> Any:
+    """Slopes of `_height` along x and y."""
+    kinds = rough.kinds
+    p, q = _slope_at(rough.road, rough.step[0], x, y)
+    sx, sy = kinds[k, 0] * p, kinds[k, 0] * q
+    if kinds[k, 1] > 0.0:
+        p, q = _slope_at(rough.grain, rough.step[1], x, y)
+        sx, sy = sx + kinds[k, 1] * p, sy + kinds[k, 1] * q
+    if kinds[k, 2] > 0.0:
+        length, width, joint, deep = kinds[k, 2], kinds[k, 3], kinds[k, 4], kinds[k, 5]
+        d = _DIFFERENCE
+        p = _joint(length, width, joint, deep, x + d, y) - _joint(length, width, joint, deep, x - d, y)
+        q = _joint(length, width, joint, deep, x, y + d) - _joint(length, width, joint, deep, x, y - d)
+        sx, sy = sx + p / (2.0 * d), sy + q / (2.0 * d)
+    return sx, sy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _heights(rough: Any, k: int, xy: Any, out: Any) -> None:
     for i in range(len(out)):
         out[i] = _height(rough, k, xy[i, 0], xy[i, 1])
 
 
+@inlined
+def _gap(rough: Any, k: int, place: Any, way: Any, t: float, whole: bool) -> Any:  # noqa: FBT001
+    """Metres of a ray above the surface, or above its waves alone, at a parameter."""
+    x, y = place[0] + t * way[0], place[1] + t * way[1]
+    h = _height(rough, k, x, y) if whole else _waves(rough, k, x, y)
+    return place[2] + t * way[2] - h
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def _crossing(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> float:
+def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any, whole: bool) -> Any:  # noqa: FBT001
+    """The crossing between two parameters with the gaps there, by false position (Illinois)."""
+    (a, above), (b, below) = low, high
+    side = 0
+    for _ in range(_NARROWINGS):
+        t = (a * below - b * above) / (below - above)
+        if not a < t < b:
+            return b if t >= b else a
+        gap = _gap(rough, k, place, way, t, whole)
+        if gap > 0.0:
+            a, above = t, gap
+            if gap < _CLOSE:
+                return a
+            if side > 0:
+                below *= 0.5
+            side = 1
+        else:
+            b, below = t, gap
+            if side < 0:
+                above *= 0.5
+            side = -1
+    return a
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _march(
+    rough: Any,
+    k: int,
+    place: Any,
+    way: Any,
+    start: float,
+    end: float,
+    least: float,
+    whole: bool,  # noqa: FBT001
+) -> Any:
+    """Ray parameter of the first crossing from above of the surface, or of its waves alone; inf without one.
+
+    Steps are so short that the greatest slope cannot reach the ray within them, but for those of ``least``
+    metres.
+    """
+    dx, dy, dz = way
+    across = np.sqrt(dx * dx + dy * dy)
+    closing = across * rough.kinds[k, _SLOPE if whole else _WAVE_SLOPE] + abs(dz)
+    shortest = least / max(across, abs(dz))
+    t, gap = start, _gap(rough, k, place, way, start, whole)
+    if gap <= 0.0:
+        return t
+    for _ in range(_STEPS):
+        ahead = min(t + max(gap / closing, shortest), end)
+        there = _gap(rough, k, place, way, ahead, whole)
+        if there <= 0.0:
+            return _narrowed(rough, k, place, way, (t, gap), (ahead, there), whole)
+        if ahead >= end:
+            return np.inf
+        t, gap = ahead, there
+    return t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _descent(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """The only crossing of the waves by a ray that falls faster than they can, by Newton's method."""
+    low, high, t, factor = start, end, start, rough.kinds[k, 0]
+    for _ in range(_NARROWINGS):
+        x, y = place[0] + t * way[0], place[1] + t * way[1]
+        gap = place[2] + t * way[2] - _waves(rough, k, x, y)
+        if abs(gap) < _CLOSE or (gap <= 0.0 and t <= start):
+            return t
+        if gap > 0.0:
+            low = t
+        else:
+            high = t
+        p, q = _slope_at(rough.road, rough.step[0], x, y)
+        t -= gap / (way[2] - factor * (p * way[0] + q * way[1]))
+        if not low < t < high:
+            t = 0.5 * (low + high)
+    return t
+
+
+@inlined
+def _border(x: float, way: float, cell: float) -> Any:
+    """Parameter from a coordinate to the border of its block."""
+    if way == 0.0:
+        return np.inf
+    return ((cell + (1.0 if way > 0.0 else 0.0)) * BLOCK - x) / way
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _among_grains(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """The first crossing of a surface with grains after one of its waves; blocks below the ray are passed."""
+    dx, dy, dz = way
+    across, n = np.sqrt(dx * dx + dy * dy), rough.highest.shape[0]
+    closing = across * rough.kinds[k, _WAVE_SLOPE] + abs(dz)
+    t, gap = start, _gap(rough, k, place, way, start, False)
+    for _ in range(_STEPS):
+        x, y = place[0] + t * dx, place[1] + t * dy
+        i, j = np.floor(x / BLOCK), np.floor(y / BLOCK)
+        step = min(_border(x, dx, i), _border(y, dy, j)) + 1e-9 / max(across, abs(dz))
+        ahead = min(t + max(step, 0.0), end)
+        there = _gap(rough, k, place, way, ahead, False)
+        top = rough.kinds[k, 1] * np.float64(rough.highest[np.int64(i) & (n - 1), np.int64(j) & (n - 1)])
+        if 0.5 * (gap + there - closing * (ahead - t)) <= top:
+            found = _march(rough, k, place, way, t, ahead, _LEAST_GRAINS, True)
+            if found < np.inf:
+                return found
+        if ahead >= end:
+            return np.inf
+        t, gap = ahead, there
+    return t
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _crossing(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
     """Ray parameter of the first crossing from above between two parameters; inf without one.
 
     place : x, y and height above the plane at parameter 0
     way   : change of each per parameter
 
-    Steps are so short that the greatest slope of the surface cannot reach the ray within them; the step that
-    crosses it nevertheless, being one of `_LEAST`, is halved.
+    The waves lie above grains and joints and are much flatter, so the way down to them takes few steps.
     """
-    x, y, z = place
-    dx, dy, dz = way
-    across = np.sqrt(dx * dx + dy * dy)
-    closing = across * rough.kinds[k, _SLOPE] + abs(dz)
-    least = _LEAST / max(across, abs(dz))
-    t = start
-    gap = z + t * dz - _height(rough, k, x + t * dx, y + t * dy)
-    if gap <= 0.0:
+    kinds = rough.kinds
+    if -way[2] > kinds[k, _WAVE_SLOPE] * np.sqrt(way[0] * way[0] + way[1] * way[1]):
+        t = _descent(rough, k, place, way, start, end)
+    else:
+        t = _march(rough, k, place, way, start, end, _LEAST_WAVES, False)
+    if t == np.inf:
         return t
-    for _ in range(_STEPS):
-        ahead = min(t + max(gap / closing, least), end)
-        gap = z + ahead * dz - _height(rough, k, x + ahead * dx, y + ahead * dy)
-        if gap <= 0.0:
-            low, high = t, ahead
-            for _half in range(_HALVINGS):
-                middle = 0.5 * (low + high)
-                if z + middle * dz - _height(rough, k, x + middle * dx, y + middle * dy) > 0.0:
-                    low = middle
-                else:
-                    high = middle
-            return low
-        if ahead >= end:
-            return np.inf
-        t = ahead
+    if kinds[k, 1] > 0.0:
+        return _among_grains(rough, k, place, way, t, end)
+    if kinds[k, 2] > 0.0:
+        x, y = place[0] + t * way[0], place[1] + t * way[1]
+        if _joint(kinds[k, 2], kinds[k, 3], kinds[k, 4], kinds[k, 5], x, y) < 0.0:
+            return _march(rough, k, place, way, t, end, _LEAST, True)
     return t
 
 
@@ -199,15 +352,13 @@ def _write(
 ) -> None:
     """Write a hit with the normal of the surface there."""
     distance, face, instance, cosine, normal = columns
-    k, d = tables.kind[f], _DIFFERENCE
-    x, y = place
-    nx = -tables.plane[f, 0] - (_height(rough, k, x + d, y) - _height(rough, k, x - d, y)) / (2.0 * d)
-    ny = -tables.plane[f, 1] - (_height(rough, k, x, y + d) - _height(rough, k, x, y - d)) / (2.0 * d)
+    sx, sy = _slopes(rough, tables.kind[f], place[0], place[1])
+    nx, ny = -tables.plane[f, 0] - sx, -tables.plane[f, 1] - sy
     size = np.sqrt(nx * nx + ny * ny + 1.0)
     dx, dy, dz = direction
     across = -(dx * nx + dy * ny + dz) / (size * np.sqrt(dx * dx + dy * dy + dz * dz))
     distance[i], face[i], instance[i] = t, f, -1
-    # The slope is a mean, so that a ray that grazes the surface may seem to come from behind.
+    # A ray that grazes the edge of a dip may seem to come from behind.
     cosine[i] = max(across, 1e-3)
     if len(normal) > 0:
         normal[i, 0], normal[i, 1], normal[i, 2] = nx / size, ny / size, 1.0 / size

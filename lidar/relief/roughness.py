@@ -34,6 +34,10 @@ _NODES = 1024
 _ROAD_STEP, _GRAIN_STEP = 0.02, 0.01
 """Nodes along a side of a field, and metres between them."""
 
+_BLOCK_NODES = 8
+BLOCK = _BLOCK_NODES * _GRAIN_STEP
+"""Metres: side of the blocks of grains whose greatest height is known."""
+
 _PEAK = 2.5
 """Standard deviations at which peaks and dips are cut off: 1.2 % of the area."""
 
@@ -109,12 +113,15 @@ class Roughness(NamedTuple):
 
     road, grain : (n, n) float32, heights of periodic fields, for Gd(n0) = 1 m^3 and for a standard
                   deviation of 1 m; at most 0, and 0 somewhere
+    highest     : (n / 8, n / 8) float32, greatest height of ``grain`` in blocks of side `BLOCK`
     step        : (2,) metres between their nodes
-    kinds       : (k, 8) factors of the fields, stones as in `Kind`, greatest depth, greatest slope
+    kinds       : (k, 9) factors of the fields, stones as in `Kind`, greatest depth, greatest slope, and
+                  that of the waves alone
     """
 
     road: NDArray[np.float32]
     grain: NDArray[np.float32]
+    highest: NDArray[np.float32]
     step: Float
     kinds: Float
 
@@ -138,9 +145,10 @@ def roughness() -> Roughness:
                 *kind.stones,
                 float(factors @ depth) + deep,
                 float(factors @ slope) + (2.0 * deep / joint if joint else 0.0),
+                float(factors[0] * slope[0]),
             ]
         )
-    return Roughness(road, grain, np.array([_ROAD_STEP, _GRAIN_STEP]), np.array(rows))
+    return Roughness(road, grain, _highest(grain), np.array([_ROAD_STEP, _GRAIN_STEP]), np.array(rows))
 
 
 def kinds_of(mesh: Mesh) -> NDArray[np.int8]:
@@ -162,6 +170,16 @@ def _below(field: Float) -> NDArray[np.float32]:
     """A field moved down to 0 and less, without its rare peaks, which would set the plane far above it."""
     most = _PEAK * float(field.std())
     return np.asarray(np.clip(field, -most, most) - most, np.float32)
+
+
+def _highest(field: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The greatest of the nodes in and on the border of each block of a periodic field."""
+    n = len(field) // _BLOCK_NODES
+    padded = np.pad(field, (0, 1), mode="wrap")
+    first = np.arange(n) * _BLOCK_NODES
+    within = first[:, None] + np.arange(_BLOCK_NODES + 1)
+    found: NDArray[np.float32] = padded[within[:, None, :, None], within[None, :, None, :]].max(axis=(2, 3))
+    return found
 
 
 def _steepest(field: NDArray[np.float32]) -> float:
