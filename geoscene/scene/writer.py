@@ -202,7 +202,8 @@ def _needed(layer: Layer, use: Use) -> Layer:
     rows: Any = slice(None)
     if needed.classes is not None:
         rows = np.isin(layer.columns.get("class", np.full(len(layer), "")), needed.classes)
-    names = layer.columns if needed.columns is None else ("feature", *needed.columns)
+    wanted = layer.columns if needed.columns is None else ("feature", *needed.columns)
+    names = [name for name in wanted if name in layer.columns]
     return Layer(layer.name, layer.geometry[rows], {name: layer.columns[name][rows] for name in names})
 
 

@@ -263,11 +263,11 @@ def odometry(
 
     lidar odometry drive --method small_gicp -o estimate
 
-    lidar odometry drive --method kiss-icp --sensor lidar_top --set voxel=0.5 -o estimate
+    lidar odometry drive --method kiss-icp --set voxel=0.5 -o kiss
 
-    lidar odometry drive --method stereo --sensor image_2 --sensor image_3 -o estimate
+    lidar odometry drive --method stereo --sensor image_2 --sensor image_3 -o stereo
 
-    lidar odometry drive --method fused --relative small_gicp -o estimate
+    lidar odometry drive --method fused --relative small_gicp -o fused
 
     Parameters
     ----------

@@ -54,6 +54,7 @@ def route(tmp_path_factory):
 CHANGES = {
     "crs": "utm",
     "lod": 1,
+    "relief": "full",
     "dem": "a file",
     "dem_gaps": "nearest",
     "dem_tolerance": 1.0,

@@ -51,7 +51,7 @@ def wall_relief(
     """
     walls, of_face = find_walls(mesh)
     at, some = Elevations.of(walls, setting, base=base, height=height)
-    number = np.full(len(walls), -1, np.int32)
+    number = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
     number[some] = np.arange(len(some))
     walls, grids, cells = at.walls, at.grids, at.cells
     chosen, parts, counts = _choose(at, guess=guess)
@@ -61,7 +61,7 @@ def wall_relief(
     kept[cells.wall[index >= 0]] = True
     again = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
     again[:-1][kept] = np.arange(np.count_nonzero(kept))
-    of_face = again[np.where(of_face >= 0, number[of_face], -1)]
+    of_face = again[number[of_face]]
     index = index[kept[cells.wall]]
     walls, grids = walls.take(kept), grids.take(kept)
     sizes = grids.count.prod(axis=1)
