@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import tomllib
 import zipfile
 import zlib
@@ -16,6 +17,9 @@ DAMAGED_ARCHIVE = (
     *(NotImplementedError, RuntimeError),
 )
 """What `read_arrays` raises for a damaged file."""
+
+_PARSING = threading.Lock()
+"""NumPy parses headers as Python, which fails now and then in CPython 3.11 if two threads do so."""
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
@@ -35,7 +39,8 @@ def array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
     """Shape, whether it is stored by columns, and type of the array in a member of an .npz file."""
     version = np.lib.format.read_magic(member)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_columns, kind = header(member)
+    with _PARSING:
+        shape, by_columns, kind = header(member)
     return shape, by_columns, kind
 
 
