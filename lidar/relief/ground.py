@@ -110,17 +110,34 @@ def heights(kind: str, xy: Float) -> Float:
 
 
 @inlined
-def _at(field: Any, step: float, x: float, y: float) -> Any:
-    """Height of a periodic field at a place, bilinear between its nodes."""
+def _cell(field: Any, step: float, x: float, y: float) -> Any:
+    """Heights of a periodic field at the corners of the cell of a place, and the place in it, 0 to 1."""
     n = field.shape[0]
     u, v = x / step, y / step
     fu, fv = np.floor(u), np.floor(v)
     i, j = np.int64(fu) & (n - 1), np.int64(fv) & (n - 1)
     k, m = (i + 1) & (n - 1), (j + 1) & (n - 1)
-    u, v = u - fu, v - fv
-    return (np.float64(field[i, j]) * (1.0 - u) + np.float64(field[k, j]) * u) * (1.0 - v) + (
-        np.float64(field[i, m]) * (1.0 - u) + np.float64(field[k, m]) * u
-    ) * v
+    corners = (
+        np.float64(field[i, j]),
+        np.float64(field[k, j]),
+        np.float64(field[i, m]),
+        np.float64(field[k, m]),
+    )
+    return corners, u - fu, v - fv
+
+
+@inlined
+def _at(field: Any, step: float, x: float, y: float) -> Any:
+    """Height of a periodic field at a place, bilinear between its nodes."""
+    (a, b, c, d), u, v = _cell(field, step, x, y)
+    return (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v
+
+
+@inlined
+def _slope_at(field: Any, step: float, x: float, y: float) -> Any:
+    """Slopes of `_at` along x and y."""
+    (a, b, c, d), u, v = _cell(field, step, x, y)
+    return ((b - a) * (1.0 - v) + (d - c) * v) / step, ((c - a) * (1.0 - u) + (d - b) * u) / step
 
 
 @inlined
@@ -132,24 +149,6 @@ def _joint(length: float, width: float, joint: float, deep: float, x: float, y: 
     u -= np.floor(u / length) * length
     edge = min(u, length - u, v, width - v)
     return -deep * max(1.0 - 2.0 * edge / joint, 0.0)
-
-
-@inlined
-def _slope_at(field: Any, step: float, x: float, y: float) -> Any:
-    """Slopes of `_at` along x and y."""
-    n = field.shape[0]
-    u, v = x / step, y / step
-    fu, fv = np.floor(u), np.floor(v)
-    i, j = np.int64(fu) & (n - 1), np.int64(fv) & (n - 1)
-    k, m = (i + 1) & (n - 1), (j + 1) & (n - 1)
-    u, v = u - fu, v - fv
-    a, b, c, d = (
-        np.float64(field[i, j]),
-        np.float64(field[k, j]),
-        np.float64(field[i, m]),
-        np.float64(field[k, m]),
-    )
-    return ((b - a) * (1.0 - v) + (d - c) * v) / step, ((c - a) * (1.0 - u) + (d - b) * u) / step
 
 
 @inlined
