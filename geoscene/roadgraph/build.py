@@ -13,6 +13,7 @@ from geoscene.report import Problem
 from geoscene.roadgraph.chains import Chain, Runs, chains_of, link_chains
 from geoscene.roadgraph.controls import add_controls
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.lane_uses import read_lane_uses
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Way
@@ -60,6 +61,7 @@ def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
     streets = []
     for way in ways:
         street, unread = read_street(way.tags)
+        unread += read_lane_uses(way.tags, street)[1]
         streets.append(street)
         problems += [Problem(way.osm_id, "road", "repaired", "unreadable-tag", text) for text in unread]
     return streets

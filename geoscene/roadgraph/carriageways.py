@@ -14,6 +14,7 @@ from geoscene.ground.kinds import SURFACES
 from geoscene.report import Problem
 from geoscene.roadgraph.build import read_runs
 from geoscene.roadgraph.chains import chains_of
+from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
@@ -28,6 +29,9 @@ SIDEWALK = 2.0
 # Streets that have sidewalks in built-up places, and the limit above which a place is not built up.
 _WALKED = ("primary", "secondary", "tertiary", "residential", "living_street")
 _BUILT_UP = 61 / 3.6
+
+MINOR = frozenset({"service", "track", "busway", "bus_guideway", "raceway", "escape"})
+"""Road classes without paint, and at whose junctions that of other roads is not interrupted."""
 
 PAVED = frozenset({"asphalt", "concrete", "paving", "brick", "stone"})
 """Materials that carry paint and kerbs."""
@@ -55,6 +59,7 @@ class Carriageways:
     walk_source : (k, 2) str: ``sidewalk`` (tag), ``default`` or "" (none)
     material, material_source : (k,) str
     marked : (k,) bool, lanes are painted, by ``lane_markings`` or by the road class
+    uses   : (k,) `LaneUses`, what else is painted on lanes; nothing on roads that are not paved
     osm_id : (k,) str
     """
 
@@ -69,6 +74,7 @@ class Carriageways:
     material: NDArray[np.str_]
     material_source: NDArray[np.str_]
     marked: Bools
+    uses: NDArray[np.object_]
     osm_id: NDArray[np.str_]
 
     def __len__(self) -> int:
@@ -118,10 +124,11 @@ class _Kind:
     walk_source: tuple[str, str]
     material: tuple[str, str]
     marked: bool
+    uses: LaneUses
 
     @property
     def symmetric(self) -> bool:
-        return self.street.symmetric and self.walk[0] == self.walk[1]
+        return self.street.symmetric and self.walk[0] == self.walk[1] and self.uses.symmetric
 
 
 def read_carriageways(
@@ -134,7 +141,7 @@ def read_carriageways(
     left_hand : traffic keeps left
     """
     ways = [way for way in osm.ways if drivable(way.tags, private=True)]
-    kinds = [_read_kind(way) for way in ways]
+    kinds = [_read_kind(way, left_hand=left_hand) for way in ways]
     ignored: list[Problem] = []  # reported with the road graph
     runs, node_id, lonlat = read_runs(ways, ignored)
     chains = chains_of(runs, kinds, nodes=len(node_id))
@@ -158,12 +165,13 @@ def read_carriageways(
         material=np.array([kind.material[0] for kind in of], "<U8"),
         material_source=np.array([kind.material[1] for kind in of], "<U8"),
         marked=np.array([kind.marked for kind in of], np.bool_),
+        uses=np.fromiter((kind.uses for kind in of), object, len(of)),
         osm_id=np.array([ways[chain.way[0]].osm_id for chain in chains], np.str_),
     )
     return _guess_sidewalks(table, osm, frame=frame, urban=sidewalks == "urban", left_hand=left_hand)
 
 
-def _read_kind(way: Way) -> _Kind:
+def _read_kind(way: Way, *, left_hand: bool) -> _Kind:
     street, _ = read_street(way.tags)
     walks = [_sidewalk(way.tags, side) for side in ("left", "right")]
     rough = street.highway == "track" and way.tags.get("tracktype") != "grade1"
@@ -172,7 +180,9 @@ def _read_kind(way: Way) -> _Kind:
     main = street.highway.removesuffix("_link") in ("motorway", "trunk", "primary", "secondary", "tertiary")
     mapped = street.lanes_source == "lanes" and sum(street.lanes) >= 2 and street.highway != "service"
     marked = markings != "no" and (main or mapped or markings == "yes") and material[0] in PAVED
-    return _Kind(street, (walks[0][0], walks[1][0]), (walks[0][1], walks[1][1]), material, marked)
+    painted = material[0] in PAVED and street.highway not in MINOR
+    uses = read_lane_uses(way.tags, street, left_hand=left_hand)[0] if painted else NO_USES
+    return _Kind(street, (walks[0][0], walks[1][0]), (walks[0][1], walks[1][1]), material, marked, uses)
 
 
 def _sidewalk(tags: Tags, side: str) -> tuple[float, str]:

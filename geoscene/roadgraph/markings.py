@@ -2,114 +2,196 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.roadgraph.carriageways import PAVED, Carriageways
+from geoscene.columns import Columns
+from geoscene.roadgraph.carriageways import MINOR, PAVED, Carriageways
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import junction_reach
-from geoscene.roadgraph.lanes import graph_lanes, lane_layout
+from geoscene.roadgraph.lane_uses import LaneUses
+from geoscene.roadgraph.lanes import LaneLayout, graph_lanes, lane_layout
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.typing import Bools, Float, Ints
 
 PRIORITY = 170.0
 
-# Metres. Widths of lines 0.10 to 0.15 (Vienna Convention, annex 2; MUTCD 3A.04: 4 to 6 inches); broken lane
-# lines 3 m on, 6 m off (RMS: 1:2; MUTCD 3A.04: 1:3); stop lines 0.3 to 0.6 wide (MUTCD 3B.19).
-_LINE = 0.12
+# Metres. Widths of lines 0.10 to 0.15, 0.25 beside lanes for buses (Vienna Convention, annex 2; MUTCD 3A.04:
+# 4 to 6 inches; RMS: 0.25); broken lane lines 3 m on, 6 m off (RMS: 1:2; MUTCD 3A.04: 1:3), those of cycle
+# lanes that cars may use 1 m on, 1 m off (RMS); stop lines 0.3 to 0.6 wide (MUTCD 3B.19).
+_LINE, _WIDE = 0.12, 0.25
 _DASH, _GAP = 3.0, 6.0
+_SHORT = 1.0
 _STOP = 0.4
 _EDGE_IN = 0.25
 # Paint ends this far (metres) before the rounding of a junction, where the stop line lies.
 _CLEAR = 1.0
 # A crossing that begins up to this far before a signal or sign belongs to it, metres.
 _STRIP_BEFORE = 12.0
-_MINOR = frozenset({"service", "track", "busway", "bus_guideway", "raceway", "escape"})
 _EDGED = frozenset({"motorway", "trunk", "primary", "secondary"})
 
+_SOLID, _BROKEN, _BUS, _ADVISORY = range(4)
+_STYLES = ((_LINE, 0.0, 0.0), (_LINE, _DASH, _GAP), (_WIDE, 0.0, 0.0), (_LINE, _SHORT, _SHORT))
+"""Lines by style: width, length of dashes (0 for solid ones) and of gaps."""
 
-def marking_rows(roads: Carriageways, edge: NDArray[np.int32], *, left_hand: bool) -> SurfaceRows:
-    """Lines along marked carriageways, interrupted at junctions of streets but not at driveways.
 
-    Between the two directions the line is solid, between lanes of one direction broken; roads of the upper
-    classes have edge lines where they have no kerb.
+@dataclass(frozen=True, slots=True)
+class PaintedStretches(Columns):
+    """The stretches of painted carriageways between junctions of streets, not interrupted at driveways.
+
+    row    : (p,) int64 rows of the carriageways
+    line   : (p,) shapely LineString, from the end of one junction's rounding to the start of the next
+    ends   : (p, 2) bool, whether the line starts and ends at a junction
+    layout : lanes along the line, and those against it as the others
     """
-    keep = np.array([s.highway not in _MINOR for s in roads.street], np.bool_)
+
+    row: Ints
+    line: NDArray[np.object_]
+    ends: Bools
+    layout: LaneLayout
+
+    def take(self, rows: ArrayLike | slice) -> PaintedStretches:
+        """The chosen rows."""
+        taken = Columns.take(self, rows)
+        return replace(taken, layout=self.layout.take(rows))
+
+
+def painted_stretches(roads: Carriageways) -> PaintedStretches:
+    """The stretches of the carriageways that have any paint along them."""
+    keep = np.array([s.highway not in MINOR for s in roads.street], np.bool_)
     streets, of = roads.take(keep), np.flatnonzero(keep)
     reach, _ = junction_reach(streets)
-    reach = np.where(reach > 0, reach + _CLEAR, 0.0)
-    shown = streets.marked & (shapely.length(streets.line) - reach.sum(axis=1) > _DASH)
-    rows = np.flatnonzero(shown)
+    junction = reach > 0
+    reach = np.where(junction, reach + _CLEAR, 0.0)
+    used = np.array([bool(uses) for uses in streets.uses], np.bool_)
+    rows = np.flatnonzero(
+        (streets.marked | used) & (shapely.length(streets.line) - reach.sum(axis=1) > _DASH)
+    )
     lines = np.empty(len(rows), object)
     for k, row in enumerate(rows.tolist()):
         xy = shapely.get_coordinates(streets.line[row])
         length = float(shapely.length(streets.line[row]))
         lines[k] = shapely.linestrings(polylines.cut(xy, reach[row, 0], end=length - reach[row, 1]))
+    chosen = [streets.street[row] for row in rows.tolist()]
+    lanes = np.array([s.lanes for s in chosen], float).reshape(-1, 2)
+    two_way = np.array([s.direction == 0 for s in chosen], np.bool_)
+    lanes = np.where(two_way[:, None], lanes, lanes.sum(axis=1, keepdims=True))
+    layout = lane_layout(lanes[:, 0], lanes[:, 1], two_way=two_way, width=streets.width[rows])
+    return PaintedStretches(of[rows], lines, junction[rows], layout)
 
-    which, aside, dashed = _offsets(streets, rows, left_hand=left_hand)
-    parallel = lines[which]
+
+def marking_rows(
+    roads: Carriageways, stretches: PaintedStretches, *, edge: NDArray[np.int32], left_hand: bool
+) -> SurfaceRows:
+    """Lines along marked carriageways.
+
+    Between the two directions the line is solid, between lanes of one direction broken; roads of the upper
+    classes have edge lines where they have no kerb. Lanes for buses have wide solid lines, cycle lanes thin
+    ones.
+    """
+    which, aside, style, kind = _offsets(roads, stretches, left_hand=left_hand)
+    parallel = stretches.line[which]
     moved = aside != 0
     parallel[moved] = shapely.offset_curve(parallel[moved], aside[moved], join_style="mitre")
     parts, index = shapely.get_parts(parallel, return_index=True)
-    which, dashed = which[index], dashed[index]
-    dashes, dash_of = _dashes(parts[dashed])
-    painted = np.concatenate([parts[~dashed], dashes])
-    row = of[rows[np.concatenate([which[~dashed], which[dashed][dash_of]])]]
+    which, style, kind = which[index], style[index], kind[index]
+    painted, line_of = [], []
+    for number, (_, dash, gap) in enumerate(_STYLES):
+        own = np.flatnonzero(style == number)
+        if dash:
+            dashes, dash_of = _dashes(parts[own], dash=dash, gap=gap)
+            painted.append(dashes)
+            line_of.append(own[dash_of])
+        else:
+            painted.append(parts[own])
+            line_of.append(own)
+    of = np.concatenate(line_of)
+    half = np.array([width for width, _, _ in _STYLES])[style[of]] / 2
+    row = stretches.row[which[of]]
+    lanes_source = np.array([s.lanes_source for s in roads.street], "<U8")[row]
     return SurfaceRows.of(
-        shapely.buffer(painted, _LINE / 2, cap_style="flat", join_style="mitre"),
+        shapely.buffer(np.concatenate(painted), half, cap_style="flat", join_style="mitre"),
         klass=Class.LANE_MARKING,
         material="lane_paint",
         priority=PRIORITY,
         osm_id=roads.osm_id[row],
-        source=np.array([f"{s.lanes_source}/default" for s in roads.street], "<U16")[row],
+        source=np.char.add(np.where(kind[of] == "", lanes_source, kind[of]), "/default"),
         place=roads.place[row],
         level=roads.layer[row],
         edge=edge[row],
     )
 
 
-def _offsets(roads: Carriageways, rows: Ints, *, left_hand: bool) -> tuple[Ints, Float, Bools]:
-    """Painted lines as (position in ``rows``, metres to the left of the centre line, broken)."""
-    found: list[tuple[int, float, bool]] = []
-    streets = [roads.street[row] for row in rows.tolist()]
-    # Lanes along the line lie on its right, or on its left where traffic keeps left.
-    lanes = np.array([s.lanes[::-1] if left_hand else s.lanes for s in streets], float).reshape(-1, 2)
-    two_way = np.array([s.direction == 0 for s in streets], np.bool_)
-    one = ~two_way[:, None]
-    lanes = np.where(one, lanes.sum(axis=1, keepdims=True), lanes)
-    layout = lane_layout(lanes[:, 0], lanes[:, 1], two_way=two_way, width=roads.width[rows])
-    for k, (street, count, lane) in enumerate(
-        zip(streets, layout.count.tolist(), layout.width.tolist(), strict=True)
-    ):
-        row, width = rows[k], float(layout.carriageway[k])
-        middle = float(layout.own[k] + 0.5 * layout.shared[k])
-        for i in range(1, count):
-            between = bool(two_way[k]) and abs(i - middle) < 0.75
-            found.append((k, (i - count / 2) * lane, not between))
-        if street.highway.removesuffix("_link") in _EDGED:
+def _offsets(
+    roads: Carriageways, stretches: PaintedStretches, *, left_hand: bool
+) -> tuple[Ints, Float, Ints, NDArray[np.str_]]:
+    """Painted lines: row of the stretches, metres to the left of the centre line, style, tag that it is from.
+
+    The tag is "" for lines between lanes and along edges.
+    """
+    found: list[tuple[int, float, int, str]] = []
+    layout = stretches.layout
+    for k, row in enumerate(stretches.row.tolist()):
+        street, uses = roads.street[row], roads.uses[row]
+        count, own, shared = int(layout.count[k]), int(layout.own[k]), bool(layout.shared[k])
+        lane, width = float(layout.width[k]), float(layout.carriageway[k])
+        # Lanes along the line lie on its right, or on its left where traffic keeps left.
+        aside = -1.0 if left_hand else 1.0
+        of_side = (own, int(layout.other[k]) or own)
+        buses = _bus_borders(uses, of_side, count=count, left_hand=left_hand)
+        for i in range(1, count if roads.marked[row] else 1):
+            between = street.direction == 0 and abs(i - own - 0.5 * shared) < 0.75
+            style = _SOLID if between else _BUS if i in buses else _BROKEN
+            found.append((k, aside * (i - count / 2) * lane, style, "busway" if style == _BUS else ""))
+        if roads.marked[row] and street.highway.removesuffix("_link") in _EDGED:
             for side, sign in ((0, 1.0), (1, -1.0)):
                 if roads.walk[row, side] == 0 and width > 4 * _EDGE_IN:
-                    found.append((k, sign * (width / 2 - _EDGE_IN), False))
+                    found.append((k, sign * (width / 2 - _EDGE_IN), _SOLID, ""))
+        for cycle, sign in zip(uses.cycle, (1.0, -1.0), strict=True):
+            if cycle is None or cycle.kind == "shared":
+                continue
+            style = _ADVISORY if cycle.kind == "advisory" else _SOLID
+            outer = width / 2 - cycle.inset
+            found.append((k, sign * (outer - cycle.width), style, "cycleway"))
+            if cycle.inset:
+                found.append((k, sign * outer, _SOLID, "cycleway"))
     return (
         np.array([f[0] for f in found], np.int64),
         np.array([f[1] for f in found], float),
-        np.array([f[2] for f in found], np.bool_),
+        np.array([f[2] for f in found], np.int64),
+        np.array([f[3] for f in found], "<U8"),
     )
 
 
-def _dashes(lines: NDArray[np.object_]) -> tuple[NDArray[np.object_], Ints]:
+def _bus_borders(uses: LaneUses, lanes: tuple[int, int], *, count: int, left_hand: bool) -> set[int]:
+    """Numbers of the lines beside lanes for buses, counted from the kerb of the lanes along the line.
+
+    lanes : number of lanes along the line, and against it
+    """
+    found = set()
+    for side in (0, 1):
+        for lane in uses.bus[side]:
+            from_kerb = lane if left_hand else lanes[side] - 1 - lane
+            first = from_kerb if side == 0 else count - 1 - from_kerb
+            found |= {first, first + 1}
+    return found
+
+
+def _dashes(lines: NDArray[np.object_], *, dash: float, gap: float) -> tuple[NDArray[np.object_], Ints]:
     """The dashes of broken lines, as lines, and the line of each."""
     length = shapely.length(lines)
-    count = np.maximum(np.floor((length + _GAP) / (_DASH + _GAP)), 0).astype(np.int64)
+    count = np.maximum(np.floor((length + gap) / (dash + gap)), 0).astype(np.int64)
     of = np.repeat(np.arange(len(lines)), count)
     number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
-    spare = (length - count * (_DASH + _GAP) + _GAP)[of] / 2
-    start = spare + number * (_DASH + _GAP)
-    at = start[:, None] + _DASH * np.array([0.0, 0.5, 1.0])
+    spare = (length - count * (dash + gap) + gap)[of] / 2
+    start = spare + number * (dash + gap)
+    at = start[:, None] + dash * np.array([0.0, 0.5, 1.0])
     points = shapely.line_interpolate_point(lines[of][:, None], at)
     if not len(of):
         return np.empty(0, object), of
@@ -127,7 +209,7 @@ def stop_rows(
     crossings : (c,) shapely, the strips where people cross
     """
     paved = dict(zip(roads.osm_id.tolist(), np.isin(roads.material, list(PAVED)).tolist(), strict=True))
-    keep = np.array([s.highway not in _MINOR for s in roads.street], np.bool_)
+    keep = np.array([s.highway not in MINOR for s in roads.street], np.bool_)
     streets = roads.take(keep)
     reach, _ = junction_reach(streets)
     inside: dict[int, float] = {}

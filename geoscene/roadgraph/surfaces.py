@@ -16,7 +16,8 @@ from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carr
 from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import JOINT, build_junctions, carriageway
-from geoscene.roadgraph.markings import marking_rows, stop_rows
+from geoscene.roadgraph.lane_symbols import symbol_rows
+from geoscene.roadgraph.markings import marking_rows, painted_stretches, stop_rows
 from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
@@ -80,14 +81,12 @@ def road_surfaces(
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
     paths = SurfaceRows.concatenate([square_surfaces(osm, frame), path_surfaces(osm, frame)])
     carriageways, count = _carriageway_rows(roads, edge, first=len(paths), area=area)
-    others = SurfaceRows.concatenate(
-        [
-            crossings,
-            marking_rows(roads, edge, left_hand=options.left_hand),
-            stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand),
-            rail_surfaces(osm, frame),
-        ]
-    )
+    stretches = painted_stretches(roads)
+    lines = marking_rows(roads, stretches, edge=edge, left_hand=options.left_hand)
+    stops = stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand)
+    taken = np.concatenate([strips, stops.polygon])
+    symbols = symbol_rows(roads, stretches, edge=edge, taken=taken, left_hand=options.left_hand)
+    others = SurfaceRows.concatenate([crossings, lines, stops, rail_surfaces(osm, frame), symbols])
     paths.number[:] = np.arange(len(paths))
     others.number[:] = count + np.arange(len(others))
     rows = SurfaceRows.concatenate([paths, *carriageways, others])

@@ -57,8 +57,10 @@ _SERVICE_WIDTH_ELSE = 4.5
 # One-way streets are kerb to kerb wider than their one lane: room to pass a stopped car. Assumed.
 _ONEWAY_AT_LEAST = 4.0
 
-# Metres: a cycle lane on the carriageway and a row of parked cars by how they stand (RASt 06).
-_CYCLE_LANE = 1.6
+CYCLE_LANE = 1.6
+"""Metres, a cycle lane on the carriageway (RASt 06)."""
+
+# Metres: a row of parked cars by how they stand (RASt 06).
 _PARKED = {"parallel": 2.0, "diagonal": 4.5, "perpendicular": 5.0}
 
 _SHUT = frozenset(
@@ -204,10 +206,10 @@ def _count(tags: Tags, key: str, *, unread: list[str]) -> float | None:
 
 def _lanes(tags: Tags, highway: str, *, direction: int, unread: list[str]) -> tuple[tuple[float, float], str]:
     total = _count(tags, "lanes", unread=unread)
-    ahead = _count(tags, "lanes:forward", unread=unread)
-    back = _count(tags, "lanes:backward", unread=unread)
+    ahead = _count(tags, "lanes:forward", unread=unread) or _lanes_with_arrows(tags, "forward")
+    back = _count(tags, "lanes:backward", unread=unread) or _lanes_with_arrows(tags, "backward")
     if direction:
-        side = ahead if direction == 1 else back
+        side = (ahead if direction == 1 else back) or _lanes_with_arrows(tags)
         given = total if total is not None else side
         count = _LANES.get(highway, 1.0) if given is None else given
         count = max(count, 1.0)
@@ -224,6 +226,12 @@ def _lanes(tags: Tags, highway: str, *, direction: int, unread: list[str]) -> tu
     if back is not None and total > back:
         return (total - back - middle / 2, back + middle / 2), "lanes"
     return (total / 2, total / 2), "lanes"
+
+
+def _lanes_with_arrows(tags: Tags, direction: str = "") -> float | None:
+    """Lanes that ``turn:lanes`` lists, where no tag has their number."""
+    values = tags.get(f"turn:lanes:{direction}" if direction else "turn:lanes", "").split("|")
+    return float(len(values)) if 2 <= len(values) <= 8 else None
 
 
 def _width(tags: Tags, direction: int, *, counted: tuple[float, str], unread: list[str]) -> tuple[float, str]:
@@ -247,16 +255,29 @@ def _cycle_and_parking_width(tags: Tags) -> float:
     """Metres of the carriageway that mapped cycle lanes and rows of parked cars take up."""
     extra = 0.0
     for side in ("left", "right"):
-        cycleway = tags.get(f"cycleway:{side}", tags.get("cycleway:both", tags.get("cycleway", "")))
-        extra += _CYCLE_LANE if cycleway == "lane" and side in _sides(tags, "cycleway") else 0.0
-        where = tags.get(f"parking:{side}", tags.get("parking:both", "lane"))
-        stand = tags.get(f"parking:{side}:orientation", tags.get("parking:both:orientation", ""))
-        older = tags.get(f"parking:lane:{side}", tags.get("parking:lane:both", ""))
-        extra += _PARKED.get(stand or older, 0.0) if where == "lane" else 0.0
+        lane = sided(tags, "cycleway", side=side) == "lane" and side in _sides(tags, "cycleway")
+        extra += (CYCLE_LANE if lane else 0.0) + parking_width(tags, side)
     return extra
+
+
+def sided(tags: Tags, key: str, *, side: str) -> str:
+    """Value of a tag such as ``cycleway`` on a side of the way, "" if there is none."""
+    return tags.get(f"{key}:{side}", tags.get(f"{key}:both", tags.get(key, "")))
+
+
+def is_plain(tags: Tags, key: str) -> bool:
+    """Whether a tag such as ``cycleway`` does not say on which side of the way."""
+    return key in tags and not any(f"{key}:{side}" in tags for side in ("left", "right", "both"))
+
+
+def parking_width(tags: Tags, side: str) -> float:
+    """Metres of the carriageway that a row of parked cars takes up on a side of the way."""
+    where = tags.get(f"parking:{side}", tags.get("parking:both", "lane"))
+    stand = tags.get(f"parking:{side}:orientation", tags.get("parking:both:orientation", ""))
+    older = tags.get(f"parking:lane:{side}", tags.get("parking:lane:both", ""))
+    return _PARKED.get(stand or older, 0.0) if where == "lane" else 0.0
 
 
 def _sides(tags: Tags, key: str) -> tuple[str, ...]:
     """Sides that a tag applies to: on one-way streets a plain ``cycleway=lane`` means one side."""
-    plain = key in tags and not any(f"{key}:{side}" in tags for side in ("left", "right", "both"))
-    return ("right",) if plain and _direction(tags) else ("left", "right")
+    return ("right",) if is_plain(tags, key) and _direction(tags) else ("left", "right")

@@ -13,7 +13,7 @@ from geoscene.roadgraph import build_road_graph, write_graphml
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.lanes import WIDEST_LANE, graph_lanes, lane_layout
-from geoscene.roadgraph.markings import _offsets
+from geoscene.roadgraph.markings import _offsets, painted_stretches
 from geoscene.sources.data import OsmData, Way
 from lidar.planning.route import lane_route
 from lidar.traffic.lanes import lane_shift, lanes_of
@@ -95,7 +95,7 @@ def test_lane_markings_lie_between_driven_lanes(side: Side, tags):
     frame = Frame.at(0.001, 0.0)
     left_hand = side == "left"
     roads = read_carriageways(osm, frame, sidewalks="mapped", left_hand=left_hand)
-    _, painted, _ = _offsets(roads, np.array([0]), left_hand=left_hand)
+    _, painted, _, _ = _offsets(roads, painted_stretches(roads), left_hand=left_hand)
     graph, _ = build_road_graph(osm, frame)
     lanes = graph_lanes(graph)
     ahead = graph.geometry[0][-1, 0] > graph.geometry[0][0, 0]
