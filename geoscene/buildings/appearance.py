@@ -28,6 +28,9 @@ _MATERIALS: dict[str, str] = {
 }  # fmt: skip
 """Name in `geoscene.classes.materials` of each value of building:material and roof:material."""
 
+_FACES = ("building:facade:{}", "building:cladding:{}", "building:{}", "{}")
+"""Keys of what walls show, from that of the face to that of the whole building."""
+
 
 @dataclass(frozen=True, slots=True)
 class Appearance:
@@ -52,10 +55,12 @@ def _material(value: str | None) -> Material | None:
 
 
 def read_walls(tags: Tags) -> Appearance:
-    """The tagged colour and material of the walls."""
+    """The tagged colour and material of the walls: of their face, else of what they are built of."""
+    colors = [key.format(word) for key in _FACES for word in ("colour", "color")]
+    substances = [key.format("material") for key in _FACES]
     return Appearance(
-        parse_color(_first(tags, "building:colour", "building:color", "colour", "color")),
-        _material(_first(tags, "building:material", "building:facade:material", "material")),
+        parse_color(_first(tags, *colors)),
+        _material(_first(tags, "building:cladding", *substances)),
     )
 
 

@@ -67,24 +67,30 @@ def put_mapped_doors(sheet: Sheet, at: Elevations) -> dict[str, int]:
     walls, grids = at.walls, at.grids
     mine = at.setting.entrances.take(np.isin(at.setting.entrances.building, walls.feature))
     placed = 0
-    for building, xy, kind in zip(mine.building.tolist(), mine.xy, mine.kind.tolist(), strict=True):
+    for building, xy, kind, size in zip(
+        mine.building.tolist(), mine.xy, mine.kind.tolist(), mine.size, strict=True
+    ):
         own = np.flatnonzero((walls.feature == building) & (grids.storey == 0))
         away = xy - walls.foot[own, :2]
         off = np.einsum("ij,ij->i", away, walls.outwards[own])
         u = np.einsum("ij,ij->i", away, walls.tangent[own])
         near = np.hypot(off, np.maximum(np.maximum(-u, u - walls.size[own, 0]), 0.0))
         for k in np.argsort(near, kind="stable")[: np.count_nonzero(near < _AT_DOOR)].tolist():
-            if _put_mapped_door(sheet, at, wall=int(own[k]), u=float(u[k]), kind=kind):
+            if _put_mapped_door(sheet, at, wall=int(own[k]), u=float(u[k]), kind=kind, mapped=size):
                 placed += 1
                 break
     return {"entrances_mapped": placed, "entrances_left_out": len(mine) - placed}
 
 
-def _put_mapped_door(sheet: Sheet, at: Elevations, *, wall: int, u: float, kind: str) -> bool:
-    """Put a door as near as can be to ``u`` metres along a wall, 1.5 m away at most; whether it fits."""
+def _put_mapped_door(sheet: Sheet, at: Elevations, *, wall: int, u: float, kind: str, mapped: Float) -> bool:
+    """Put a door as near as can be to ``u`` metres along a wall, 1.5 m away at most; whether it fits.
+
+    mapped : (2,) width and height, NaN where the map has none
+    """
     code = GATE if kind == "garage" else DOOR
     usual = at.styles.door[wall] if at.styles.door[wall].all() else np.array(_DOOR)
     size = np.array(_GATE) if code == GATE else usual * ((1.2, 1.05) if kind == "main" else 1.0)
+    size = np.where(np.isnan(mapped), size, mapped)
     width, half = float(at.grids.cell[wall, 0]), size[0] / 2 + 0.05
     if width < 2 * half:
         return False

@@ -20,10 +20,16 @@ from geoscene.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Height, Ints
 
 _PLINTH = 0.35
-"""Metres from the floor to the glass of a shop front; assumed."""
+"""Metres from the floor, or from higher ground in front, to the glass of a shop front; assumed."""
+
+_GLASS = (1.2, 2.85)
+"""Metres, least and greatest height of the glass of a shop front; assumed."""
 
 _SIGN = 0.7
 """Metres from the glass of a shop front to the ceiling, where its sign is; assumed."""
+
+_FRONT = 4.0
+"""Metres of shop front to both sides of the place nearest to a mapped shop; assumed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +92,7 @@ def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Mesh, dict[str, int
     sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
     facing = facing_street(at)
     _put_windows(sheet, at)
-    _put_shops(sheet, at, facing=facing)
-    mapped = put_mapped_doors(sheet, at)
+    mapped = _put_shops(sheet, at, facing=facing) | put_mapped_doors(sheet, at)
     put_guessed_doors(sheet, at, facing=facing)
     parts, attached = attach(sheet, at, facing=facing, guess=guess)
     place = nth(_sizes(at.walls.feature))[wall] * 65536 + cells.storey * 256 + cells.column
@@ -108,15 +113,43 @@ def _put_windows(sheet: Sheet, at: Elevations) -> None:
     sheet.put(cell[fits], WINDOW, box=box[fits])
 
 
-def _put_shops(sheet: Sheet, at: Elevations, *, facing: Bools) -> None:
-    """Put shop fronts into the ground floors of shops to a street."""
+def _put_shops(sheet: Sheet, at: Elevations, *, facing: Bools) -> dict[str, int]:
+    """Put shop fronts into ground floors to a street; returns how many mapped shops have one or none.
+
+    Buildings with shops in the map have them there, others of their type by chance, on the whole street.
+    """
     middle, height = at.grids.middle[at.cells.wall], at.cells.height
-    cell = np.flatnonzero((at.cells.storey == 0) & (at.styles.shop & facing)[at.cells.wall] & (middle >= 0.8))
+    mapped = np.isin(at.walls.feature, at.setting.shops.building)
+    whole = at.styles.shop_tagged | (at.styles.shop & ~mapped)
+    room = np.flatnonzero((at.cells.storey == 0) & facing[at.cells.wall] & (middle >= 0.8))
+    fronts = _fronts_of_shops(at, room)
+    chosen = whole[at.cells.wall[room]] | np.isin(room, np.concatenate([room[:0], *fronts]))
+    cell = room[chosen]
     middle, half = middle[cell], np.minimum(middle[cell] - 0.15, 2.0)
-    top = np.floor(np.minimum(height[cell] - _SIGN, 3.2) * 20) / 20
-    box = np.column_stack([middle - half, np.full(len(cell), _PLINTH), middle + half, top])
-    fits = sheet.fits(cell, SHOP, box=box, above=0.1)
+    lift = at.cells.ground[at.cells.upright[cell]] - at.cells.floor[cell]
+    low = _PLINTH + np.ceil(np.maximum(lift, 0.0) * 10 - 1e-6) / 10
+    top = np.floor(np.minimum(height[cell] - _SIGN, low + _GLASS[1]) * 20 + 1e-6) / 20
+    box = np.column_stack([middle - half, low, middle + half, top])
+    fits = sheet.fits(cell, SHOP, box=box, above=0.1) & (top - low >= _GLASS[0])
     sheet.put(cell[fits], SHOP, box=box[fits])
+    shown = sum(bool((sheet.kind[front] == SHOP).any()) for front in fronts)
+    return {"shops_mapped": shown, "shops_left_out": len(fronts) - shown}
+
+
+def _fronts_of_shops(at: Elevations, room: Ints) -> list[Ints]:
+    """The cells of each mapped shop of these buildings, among those with room for a shop front."""
+    shops, wall = at.setting.shops, at.cells.wall[room]
+    place = at.walls.points(wall, at.cells.middle[room])
+    building = at.walls.feature[wall]
+    fronts = []
+    for row in np.flatnonzero(np.isin(shops.building, at.walls.feature)).tolist():
+        own = np.flatnonzero(building == shops.building[row])
+        if len(own):
+            nearest = own[np.hypot(*(place[own] - shops.xy[row]).T).argmin()]
+            own = own[wall[own] == wall[nearest]]
+            own = own[np.hypot(*(place[own] - place[nearest]).T) <= _FRONT]
+        fronts.append(room[own])
+    return fronts
 
 
 def _sizes(sorted_keys: NDArray[np.integer]) -> Ints:

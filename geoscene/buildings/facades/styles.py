@@ -113,6 +113,7 @@ class Styles(Columns):
     door     : (n, 2) width and height of a door, zeros for none
     gate     : (n, 2) likewise of a gate
     shop     : (n,) bool, the ground floor has shop fronts to the street
+    shop_tagged : (n,) bool, the building's tags say so
     deep     : (n,) bool, openings without glass
     balcony  : (n,) bool
     balcony_tagged : (n,) bool, the map says so
@@ -140,6 +141,7 @@ class Styles(Columns):
     door: Float
     gate: Float
     shop: Bools
+    shop_tagged: Bools
     deep: Bools
     balcony: Bools
     balcony_tagged: Bools
@@ -224,7 +226,7 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         ],
         axis=1,
     )
-    shop_tag = np.array(["shop" in t for t in given], np.bool_)
+    shop_tag = np.array([t.get("shop", "no") != "no" or _trades(t) for t in given], np.bool_)
     balcony = np.array([_yes_or_no(t.get("balcony", t.get("building:balcony", ""))) for t in given], "U3")
     return Styles(
         type=type_,
@@ -245,6 +247,7 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         door=_pairs("door", type_),
         gate=_pairs("gate", type_),
         shop=shop_tag | (draw[14] < _shares("shop", type_)),
+        shop_tagged=shop_tag,
         deep=type_ == TYPES.index("parking"),
         balcony=np.where(balcony != "", balcony == "yes", draw[15] < _shares("balcony", type_)),
         balcony_tagged=balcony != "",
@@ -261,8 +264,11 @@ def _types(buildings: Buildings, given: Sequence[Tags], *, area: Float, eaves: F
     name = np.full(len(use), "", object)
     for kind, uses in _USES.items():
         name[np.isin(use, uses)] = kind
+    types = {value: kind for kind, values in _USES.items() for value in values}
     for k in np.flatnonzero((name == "") | np.isin(use, _PLAIN)).tolist():
         tags = given[k]
+        kind = types.get(first_value(tags.get("building:use", "")), "")
+        name[k] = name[k] or (kind if kind != "apartments" else "")  # of homes the size tells more
         amenity = _AMENITIES.get(first_value(tags.get("amenity", "")), "")
         if amenity:
             name[k] = amenity
@@ -318,6 +324,12 @@ def _pairs(name: str, type_: Ints) -> Float:
 
 def _shares(name: str, type_: Ints) -> Float:
     return np.array([usual_facades()[t][name] for t in TYPES], float)[type_]
+
+
+def _trades(tags: Tags) -> bool:
+    """Whether people live in a building over shops: ``building:use`` is ``residential;commercial``."""
+    uses = [value.strip() for value in tags.get("building:use", "").split(";")]
+    return "residential" in uses and bool({"commercial", "retail"} & set(uses))
 
 
 def _yes_or_no(text: str) -> str:

@@ -15,6 +15,7 @@ from shapely import affinity
 from shapely.errors import GEOSException
 
 from geoscene.buildings import BuildingOptions, build_solids, parts, read_buildings
+from geoscene.buildings.appearance import read_walls
 from geoscene.buildings.footprints import subtract
 from geoscene.buildings.heights import infer_heights
 from geoscene.buildings.shells import prisms
@@ -192,6 +193,21 @@ def test_an_uncovered_tenth_of_an_outline_stays_unless_it_is_a_strip():
         ("way/1", "partly-covered", "parts cover 88%; 116.8 m2 of the outline stay as a part"),
         ("way/3", "uncovered-strips", "69.0 m2 of the outline that no part covers, narrower than 1 m"),
     ]
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"building:facade:colour": "#102030"},
+        {"building:cladding": "brick"},
+        {"building:facade:material": "brick"},
+    ],
+)
+def test_walls_look_as_their_face_not_as_what_is_behind_it(tags):
+    behind = read_walls({"building:colour": "red", "building:material": "concrete"})
+    walls = read_walls({"building:colour": "red", "building:material": "concrete", **tags})
+    changed = walls.color != behind.color, walls.material != behind.material
+    assert changed == ("building:facade:colour" in tags, "building:facade:colour" not in tags)
 
 
 def test_parts_inherit_missing_height_and_colour_from_their_building():

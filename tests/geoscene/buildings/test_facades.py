@@ -16,7 +16,7 @@ from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.frames import Frame
 from geoscene.mesh import DOOR, WALL, WINDOW, concatenate
-from geoscene.sources.data import Area, OsmData, Point
+from geoscene.sources.data import Area, OsmData, Point, Way
 from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(8.7, 49.4)
@@ -33,14 +33,18 @@ def house(number, shape, **tags):
     return Area(f"way/{number}", tags, shapely.transform(shape, lonlat), np.empty(0, np.int64))
 
 
-def entrance(xy, kind="yes"):
+def node(xy, number=1, **tags):
     lon, lat = lonlat([xy])[0]
-    return Point("node/1", {"entrance": kind}, lon, lat)
+    return Point(f"node/{number}", {key.replace("__", ":"): value for key, value in tags.items()}, lon, lat)
 
 
-def facades_of(*areas, points=(), street=None, height=None, guess=False):
+def entrance(xy, kind="yes"):
+    return node(xy, entrance=kind)
+
+
+def facades_of(*areas, points=(), ways=(), street=None, height=None, guess=False):
     """Table, mesh and layout of a map, whose only street is a line of scene coordinates."""
-    osm = OsmData((8.6, 49.3, 8.8, 49.5), [], list(areas), list(points), [])
+    osm = OsmData((8.6, 49.3, 8.8, 49.5), list(ways), list(areas), list(points), [])
     table, _ = read_buildings(osm, FRAME)
     mesh, _ = build_solids(table, base=np.zeros(table.count))
     lines = np.array([] if street is None else [shapely.LineString(street)], object)
@@ -157,6 +161,80 @@ def test_a_door_is_at_each_mapped_entrance_and_nowhere_else():
     foot, tangent = layout.relief.facades.foot[door[0]], layout.relief.facades.tangent[door[0]]
     place = foot[:2] + door[1][[0, 2]].mean() * tangent
     assert np.abs(place - [6.3, 0.0]).max() < 0.35
+
+
+def openings_from(layout, low, high):
+    """Middles in plan, sizes and kinds of openings whose lower edge is between two heights."""
+    f = layout.relief.facades
+    return [
+        (f.foot[w, :2] + box[[0, 2]].mean() * f.tangent[w], box[2:] - box[:2], kind)
+        for w, _, _, box, kind in panels_of(layout.relief, part="opening")
+        if low <= f.foot[w, 2] + box[1] <= high
+    ]
+
+
+def test_doors_have_their_mapped_size_and_wide_ones_are_gates():
+    shape = shapely.box(0, 0, 24, 10)
+    street = [(-10, -8), (40, -8)]
+    block = house(1, shape, building="retail", height="6", shop="no")
+    points = [
+        node((4.0, 0.0), 1, door="yes", width="0.9", height="1.9"),
+        node((20.0, 0.0), 2, entrance="yes", width="2.4", height="2.2"),
+        node((12.0, 10.0), 3, door="yes", width="80"),  # no door is so wide
+        node((8.0, 0.0), 4, door="yes", indoor="room"),
+    ]
+    _, _, layout = facades_of(block, points=points, street=street)
+    found = {kind: layout.counts[kind] for kind in ("entrances_mapped", "doors", "gates")}
+    assert found == {"entrances_mapped": 3, "doors": 2, "gates": 1}
+    doors = [
+        (middle, size) for middle, size, k in openings_from(layout, 0, 0.2) if layout.relief.openings.door[k]
+    ]
+    sizes = {tuple(np.round(middle / 4).astype(int) * 4): size for middle, size in doors}
+    assert sizes[4, 0] == pytest.approx([0.9, 1.9])
+    assert sizes[20, 0] == pytest.approx([2.4, 2.2])
+    assert sizes[12, 8][0] < 2.0
+
+
+def test_shop_fronts_are_where_shops_are_mapped():
+    shape = shapely.box(0, 0, 60, 12)
+    block = house(5, shape, building="apartments", height="16")
+    street = [(-10, -9), (70, -9)]
+    shop = node((50.0, 4.0), shop="bakery")
+    _, _, layout = facades_of(block, points=[shop], street=street)
+    fronts = [middle for middle, _, _ in openings_from(layout, 0.3, 0.4)]
+    assert fronts
+    assert all(abs(x - 50) <= 6 and abs(y) < 0.01 for x, y in fronts)
+    assert layout.counts["shops_mapped"] == 1
+    upstairs = node((50.0, 4.0), shop="tailor", level="1")
+    assert facades_of(block, points=[upstairs], street=street)[2].counts["shops_mapped"] == 0
+    away = facades_of(block, points=[shop], street=[(-10, 90), (70, 90)])[2].counts
+    assert (away["shop_fronts"], away["shops_left_out"]) == (0, 1)
+
+
+def test_shop_fronts_face_pedestrian_streets_and_stand_above_ground_that_rises():
+    street = Way("way/9", {"highway": "pedestrian"}, np.arange(2), lonlat([(-10, -9), (70, -9)]))
+    block = house(5, shapely.box(0, 0, 60, 12), building="apartments", height="16")
+    shop = node((50.0, 4.0), shop="bakery")
+    _, _, layout = facades_of(block, points=[shop], ways=[street], height=lambda x, y: 0.6 + 0 * x * y)
+    fronts = openings_from(layout, 0.6 + 0.35 - 0.01, 0.6 + 0.35 + 0.11)
+    assert layout.counts["shops_mapped"] == 1
+    assert layout.counts["shop_fronts"] == len(fronts) > 0
+
+
+@pytest.mark.parametrize("tags", [{"shop": "books"}, {"building__use": "residential; commercial"}])
+def test_the_ground_floor_of_a_shop_has_shop_fronts_on_its_street(tags):
+    block = house(5, shapely.box(0, 0, 20, 12), height="16", **tags)
+    counts = facades_of(block, street=[(-10, -9), (30, -9)])[2].counts
+    assert counts["shop_fronts"] >= 3
+
+
+def test_facades_with_a_shop_or_door_of_the_map_are_tagged():
+    blocks_ = [house(k, shapely.box(40 * k, 0, 40 * k + 20, 12), height="16") for k in (1, 2, 3)]
+    points = [node((50, 5), 1, amenity="cafe"), node((90, 0), 2, door="hinged")]
+    osm = OsmData((8.6, 49.3, 8.8, 49.5), [], blocks_, points, [])
+    table, _ = read_buildings(osm, FRAME)
+    setting = read_setting(osm, FRAME, buildings=table, streets=np.array([], object))
+    assert setting.source.tolist() == ["tag", "tag", "guess"]
 
 
 def test_doors_are_guessed_where_a_street_is():
