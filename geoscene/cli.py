@@ -461,6 +461,13 @@ def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _guessed(relief: dict[str, Any]) -> dict[str, int]:
+    """What is guessed besides the openings of facades, by kind."""
+    furniture = sum(relief.get("furniture_guessed", {}).values())
+    found = relief.get("parts_guessed", {}) | relief.get("roofs_guessed", {}) | {"furniture": furniture}
+    return {name: count for name, count in found.items() if count}
+
+
 def _print_scene(report: dict[str, Any]) -> None:
     counts, frame, ground = report["counts"], report["frame"], report["ground"]
     water = ground.get("water_area", 0.0) / 1e6
@@ -487,8 +494,9 @@ def _print_scene(report: dict[str, Any]) -> None:
         f" direction{steep}",
         "heights": _listed(report["heights"]),
         "roofs": _listed(report["roofs"]),
+        "relief": report["options"].get("relief", "off"),
         "facades": _listed(report.get("relief", {}).get("facades", {})),
-        "guessed": _listed(report.get("relief", {}).get("parts_guessed", {})),
+        "guessed": _listed(_guessed(report.get("relief", {}))),
     }
     for_drives = "area" in report
     if for_drives or report["options"].get("along"):

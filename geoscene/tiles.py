@@ -34,9 +34,9 @@ from geoscene.plan import Plan, take_buildings
 from geoscene.processes import run_tasks
 from geoscene.report import Problem, described, make_without_failures, unexpected
 from geoscene.scene import SceneFiles
-from geoscene.scene.tile_files import Tile, read_tile, write_tile
+from geoscene.scene.tile_files import Extras, Tile, read_tile, write_tile
 from geoscene.structures import StructureOptions, built_structures
-from geoscene.typing import Ints
+from geoscene.typing import Bools, Ints
 from geoscene.watertight import validate_mesh
 
 T = TypeVar("T")
@@ -137,12 +137,14 @@ class Surroundings:
 
     mesh      : ground, barriers and structures, scene metres
     instances : trees and furniture, scene metres
+    equipment : (m,) bool, faces of the equipment of tunnels
     problems  : features that were dropped
     guessed   : number of guessed parts by kind
     """
 
     mesh: Mesh
     instances: Instances
+    equipment: Bools
     problems: list[Problem]
     guessed: Counter[str]
 
@@ -182,12 +184,13 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
             plan.structures, rows, height=height, openings=plan.openings, options=options
         ),
     )
-    guessed = Counter[str]()
+    guessed, equipment = Counter[str](), [np.zeros(sum(map(len, meshes)), np.bool_)]
     for built in (built for some in structures for built in some):
         meshes.append(built.mesh)
+        equipment.append(built.equipment)
         guessed.update(built.guessed)
     instances = Instances.concatenate([Instances.empty(), *copies])
-    return Surroundings(concatenate(meshes), instances, problems, guessed)
+    return Surroundings(concatenate(meshes), instances, np.concatenate(equipment), problems, guessed)
 
 
 def build_tile(
@@ -209,26 +212,33 @@ def build_tile(
         old, guessed = read_tile(file), report.guessed
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
         origin, rest = old.origin, old.mesh.take(~is_building)
+        equipment = np.zeros(len(rest), np.bool_) if old.extras is None else old.extras.faces[~is_building]
         of = old.instances.feature
         copies = old.instances.take((of < 0) | (of >= plan.buildings.count))  # without those on roofs
     else:
         around = make_ground(plan, tile)
         ground, copies, guessed = around.mesh, around.instances, dict(sorted(around.guessed.items()))
-        problems += around.problems
+        equipment, problems = around.equipment, problems + around.problems
         low = float(np.floor(ground.vertices[:, 2].min(initial=0.0)))
         origin = np.array([tile[0] * size, tile[1] * size, low])
         # Without unused vertices, as when the ground is taken from a former scene.
         rest = ground.take(np.arange(len(ground))).shifted(-origin)
         copies = copies.shifted(-origin)
     on_roofs, roofs = _roof_objects(plan, solids, lod=lod, problems=problems)
+    added = np.isin(copies.feature, plan.furniture.feature[plan.furniture.source != "mapped"])
     copies = Instances.concatenate([copies, on_roofs.shifted(-origin)])
     layout = None if plan.facades is None else _facades(plan, plan.facades, solids=solids, problems=problems)
-    attached = [layout.parts.shifted(-origin)] if layout else []
+    attached = [layout.parts.mesh.shifted(-origin)] if layout else []
     mesh = concatenate([solids.shifted(-origin), *attached, rest])
     if not plan.use.colors:
         mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
     relief = layout.relief.placed(-origin, faces=len(mesh)) if layout else None
-    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief))
+    extras = None
+    if plan.relief == "full":
+        guesses = layout.parts.guessed if layout else np.empty(0, np.bool_)
+        faces = np.concatenate([np.zeros(len(solids), np.bool_), guesses, equipment])
+        extras = Extras(faces, np.concatenate([added, np.ones(len(on_roofs), np.bool_)]))
+    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief, extras))
     forest_trees = 0
     if plan.forests is not None:
         box = tile_box(plan.ground, tile[0], j=tile[1])

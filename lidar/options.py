@@ -17,7 +17,7 @@ from cyclopts import Group, Parameter, Token
 
 from geoscene.classes import Class
 from geoscene.console import SEVERAL, WORDS, degrees, whole
-from geoscene.options import KINDS, BuildOptions, Degrees
+from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
@@ -269,7 +269,7 @@ _EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 _ROADS = ("dry", "by-weather", "wet", "snow", "ice")
 """What vehicles drive on."""
 
-_NOT_IN_RECIPE = ("stages", "weather", "attacks", "road", "workers", "scheduler")
+_NOT_IN_RECIPE = ("relief", "stages", "weather", "attacks", "road", "workers", "scheduler")
 """Options that the recipe states otherwise, or on which no byte depends."""
 
 
@@ -360,6 +360,11 @@ class DriveOptions:
     ] = ()
     """One setting that differs from the fidelity level; repeat for more. lidar settings lists them."""
 
+    relief: str = ""
+    """What is used of the relief of surfaces, short for --set relief: off (walls are planes and the ground is
+    smooth), plain (windows and doors in depth, kerbs, rough ground), full (also guessed small parts), or mesh
+    (openings as triangles). By default what the scene holds; the scene of a map is built plain."""
+
     stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or
     a TOML file with tables [[stage]]; repeat for more. lidar stages lists them."""
@@ -385,7 +390,12 @@ class DriveOptions:
     need the scene's and the output folder under the same paths. The bytes do not depend on it."""
 
     def __post_init__(self) -> None:
-        """Validate the options."""
+        """Validate the options, and enter ``relief`` among the settings."""
+        if self.relief:
+            if any(name == "relief" for name, _ in self.settings):
+                raise InputError(f"`relief` {self.relief}: `settings` relief is given, too; give one of both")
+            object.__setattr__(self, "settings", (*self.settings, ("relief", self.relief)))
+            object.__setattr__(self, "relief", "")
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
             raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
         if self.side not in ("", "left", "right"):
@@ -597,10 +607,10 @@ class AccuracyOptions:
         return self.picks or self.spot_check
 
 
-_MAP = Group("Map instead of a scene", sort_key=2)
+MAP = Group("Map instead of a scene", sort_key=2)
 
 
-@Parameter(name="*", group=_MAP)
+@Parameter(name="*", group=MAP)
 @dataclass(frozen=True, slots=True)
 class PlaceOptions:
     """The map that a drive's scene is built of, and how; what the drive needs of it is built and cached."""
@@ -630,9 +640,14 @@ class PlaceOptions:
     scene_cache: Path | None = None
     """Folder of the scenes that drives build; ~/.cache/geoscene/scenes by default."""
 
-    def build_options(self, name: str) -> BuildOptions:
-        """Options of the build, with a title of the scene; raises InputError for invalid ones."""
+    def build_options(self, name: str, *, relief: str) -> BuildOptions:
+        """Options of the build, with a title of the scene; raises InputError for invalid ones.
+
+        relief : setting of the drive, of `lidar.world.settings.RELIEFS`; the default of builds unless it is
+                 one of theirs
+        """
         return BuildOptions(
+            relief=relief if relief in RELIEFS else BuildOptions().relief,
             crs=self.scene_crs,
             lod=self.lod,
             dem=self.dem,
@@ -651,8 +666,8 @@ class TradeoffOptions:
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
     """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample,
     edge_rays, blur, shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach,
-    forests, trees, furniture, barriers, scene, traffic; georeferencing, files (formats), voxel (of maps) and
-    frame (projections); all by default. Cheap ones are also tried together. lidar settings
+    forests, trees, furniture, barriers, relief, scene, traffic; georeferencing, files (formats), voxel (of
+    maps) and frame (projections); all by default. Cheap ones are also tried together. lidar settings
     explains them."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()

@@ -40,7 +40,7 @@ from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
-from lidar.world.settings import origin_limit
+from lidar.world.settings import check_relief, origin_limit
 
 if TYPE_CHECKING:
     from lidar.planning.flight_planning import FlightOptions
@@ -208,6 +208,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
 
     Raises InputError (also as RouteError, RigError) for what cannot be driven.
     """
+    check_relief(scene, options.contents().world)
     start = options.start or solar_start(scene)
     check_start(start, 0)
     rig = load_rig(options.rig)

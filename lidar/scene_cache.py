@@ -18,7 +18,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,10 +26,11 @@ from typing import Any
 import shapely
 
 from geoscene import __version__ as builder_version
+from geoscene.clouds.survey import with_clouds
 from geoscene.errors import FrameError, NetworkError, SceneFormatError
 from geoscene.errors import InputError as SceneInputError
 from geoscene.files import digest, digest_of, exclusive, write_atomically
-from geoscene.options import BuildOptions
+from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build, elevation_digests
 from geoscene.progress import Progress, silent
 from geoscene.reach import RoadMap
@@ -69,6 +70,7 @@ def open_scene_or_map(
     drive: DriveOptions,
     *,
     place: PlaceOptions = PlaceOptions(),
+    clouds: CloudOptions = CloudOptions(),
     servers: Servers | None = None,
     progress: Progress = silent,
 ) -> OpenedScene:
@@ -76,6 +78,7 @@ def open_scene_or_map(
 
     path    : a scene directory or a map file; None for the name of a place
     place   : that name, and how the scene of a map is built
+    clouds  : point clouds in which heights, roofs and trees of the map are measured
     servers : of maps, for a place
 
     Raises InputError (also as RouteError) for what is neither and for a drive that cannot be planned, and
@@ -86,12 +89,14 @@ def open_scene_or_map(
     if path is not None and not path.is_file():
         if not (path.exists() or url_of(path)):
             raise InputError(f"{path}: no such scene or map; give a map file, or the directory of a scene")
-        changed = [f.name for f in fields(place) if getattr(place, f.name) != f.default]
+        given: tuple[PlaceOptions | CloudOptions, ...] = (place, clouds)
+        changed = [f.name for of in given for f in fields(of) if getattr(of, f.name) != f.default]
         if changed:
             raise InputError(f"`{changed[0]}`: is for maps, and {path} is a directory; leave it out")
         return OpenedScene(open_scene(path))
-    source = _Map(path, place, servers=servers or Servers(), progress=progress)
-    folder = _folder(source, place)
+    chosen = place.build_options("", relief=drive.contents().world.relief)
+    source = _Map(path, place, clouds=clouds, options=chosen, servers=servers or Servers(), progress=progress)
+    folder = _folder(source)
     with _turn(folder, progress):
         return _CachedScene(folder, source, drive, progress).opened()
 
@@ -99,15 +104,27 @@ def open_scene_or_map(
 class _Map:
     """A map that is read when it is needed.
 
-    name   : of its file or place
-    digest : of the file's bytes; of a place's features
+    name    : of its file or place
+    place   : how it is read
+    clouds  : what is measured in point clouds
+    options : of the build
+    digest  : of the file's bytes; of a place's features
     """
 
     def __init__(
-        self, path: Path | None, options: PlaceOptions, *, servers: Servers, progress: Progress
+        self,
+        path: Path | None,
+        place: PlaceOptions,
+        *,
+        clouds: CloudOptions,
+        options: BuildOptions,
+        servers: Servers,
+        progress: Progress,
     ) -> None:
-        self._path, self._options, self._servers, self._progress = path, options, servers, progress
-        self.name = re.sub(r"\.(osm|pbf|gz|bz2|json|o5m)\b", "", path.name) if path else options.place
+        self._path, self._servers, self._progress = path, servers, progress
+        self.place, self.clouds = place, clouds
+        self.name = re.sub(r"\.(osm|pbf|gz|bz2|json|o5m)\b", "", path.name) if path else place.place
+        self.options = replace(options, name=self.name)
         self.digest = digest_of(path) if path else self.data.digest
 
     @cached_property
@@ -115,28 +132,34 @@ class _Map:
         """Its features."""
         self._progress("reading the map", 0, total=0)
         if self._path is not None:
-            return read_osm(self._path, bounds=self._options.bbox)
+            return read_osm(self._path, bounds=self.place.bbox)
         try:
-            return fetch_place(self._options.place, cache_dir=cache_folder(), servers=self._servers)
+            return fetch_place(self.place.place, cache_dir=cache_folder(), servers=self._servers)
         except NetworkError as error:
             cause = str(error).split("; without a network")[0]
             raise NetworkError(f"{cause}; without a network, give a map file instead of `place`") from error
 
-    def build_options(self, progress: Progress) -> BuildOptions:
-        """Options of the build, with the path of fetched elevation."""
-        options = self._options.build_options(self.name)
-        if not options.elevation_tiles:  # the map need not be read
-            return options
-        return with_elevation(options, self.data, cache_dir=cache_folder(), progress=progress)
+    def measured(self, *, workers: int) -> tuple[OsmData, BuildOptions]:
+        """Its features with what is measured in clouds, and the options with files of heights."""
+        cache, options = cache_folder(), self.options
+        if options.elevation_tiles:
+            options = with_elevation(options, self.data, cache_dir=cache, progress=self._progress)
+        return with_clouds(
+            self.data, options, cloud=self.clouds, cache_dir=cache, workers=workers, progress=self._progress
+        )
 
 
-def _folder(source: _Map, options: PlaceOptions) -> Path:
+def _folder(source: _Map) -> Path:
     """Folder of the cache for a map and options, by digests of both."""
-    chosen = asdict(options.build_options("")) | {"bbox": options.bbox, "dem": elevation_digests(options.dem)}
+    place, clouds = source.place, source.clouds
+    chosen = asdict(replace(source.options, name=""))
+    chosen |= {"bbox": place.bbox, "dem": elevation_digests(place.dem)}
+    if clouds.cloud:
+        chosen |= asdict(clouds) | {"cloud": [digest_of(Path(name)) for name in clouds.cloud]}
     key = digest(
-        json.dumps([builder_version, SCHEMA, source.digest, options.dem == ("tiles",), chosen]).encode()
+        json.dumps([builder_version, SCHEMA, source.digest, place.dem == ("tiles",), chosen]).encode()
     )
-    cache = options.scene_cache or cache_folder() / "scenes"
+    cache = place.scene_cache or cache_folder() / "scenes"
     slug = re.sub(r"[^\w.-]+", "-", source.name).strip("-.")[:32] or "map"
     return next(iter(sorted(cache.glob(f"*-{key}"))), cache / f"{slug}-{key}")
 
@@ -211,10 +234,11 @@ class _CachedScene:
 
         new = self.folder / "scene.new"
         try:
+            data, options = self.source.measured(workers=self.drive.workers)
             build(
-                self.source.data,
+                data,
                 new,
-                options=self.source.build_options(self.progress),
+                options=options,
                 overwrite=True,
                 workers=self.drive.workers,
                 needed=needed,

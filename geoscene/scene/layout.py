@@ -258,19 +258,24 @@ class Scene:
         """
         tile = read_tile(self.files.tile(i, j))
         if self.modelled and tile.relief is not None:
-            tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None)
+            tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None, extras=None)
         if self.forests is None or not forests:
             return tile
         box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
         low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
         return with_forests(tile, self.forests, box=(*low, *high))
 
+    @property
+    def relief(self) -> str:
+        """Relief of its surfaces, of `geoscene.options.RELIEFS`."""
+        return str(self.manifest.get("options", {}).get("relief", "off"))
+
     def with_relief_mesh(self) -> Scene:
         """The scene whose tiles have openings of walls as geometry; solids stay closed.
 
         Raises InputError if the scene was built without relief.
         """
-        if self.manifest.get("options", {}).get("relief", "off") == "off":
+        if self.relief == "off":
             raise InputError(f"{self.location}: has no relief; build it with `relief` plain or full")
         return replace(self, modelled=True)
 

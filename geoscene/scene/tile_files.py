@@ -18,8 +18,20 @@ from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import digest, write_atomically
 from geoscene.mesh import Instances, Mesh
 from geoscene.objects.forests import Forests, forest_instances
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 from geoscene.untrusted import read_arrays
+
+
+@dataclass(frozen=True, slots=True)
+class Extras:
+    """What full relief adds to plain, and drives can leave out.
+
+    faces     : (m,) bool, of the tile's mesh
+    instances : (k,) bool, of the instances of the tile's file
+    """
+
+    faces: Bools
+    instances: Bools
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +42,14 @@ class Tile:
     mesh      : in tile coordinates
     instances : in tile coordinates; trees of forests are not in files (see `with_forests`)
     relief    : openings of the walls, in tile coordinates; None in scenes without relief
+    extras    : None in scenes without full relief
     """
 
     origin: Float
     mesh: Mesh
     instances: Instances = field(default_factory=Instances.empty)
     relief: WallRelief | None = None
+    extras: Extras | None = None
 
 
 def with_forests(tile: Tile, forests: Forests, *, box: Sequence[float]) -> Tile:
@@ -67,7 +81,8 @@ def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
     instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
     relief = {} if tile.relief is None else _relief_arrays(tile.relief)
-    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief})
+    extras = {} if tile.extras is None else _extra_arrays(tile.extras)
+    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief, **extras})
     write_atomically(path, data)
     return digest(data)
 
@@ -82,13 +97,27 @@ def read_tile(path: Path) -> Tile:
         instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(Instances)}
         mesh = _mesh(arrays)
         relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
-        return Tile(arrays["origin"], mesh, Instances(**instances), relief)
+        copies = Instances(**instances)
+        extras = _extras(arrays, faces=len(mesh), copies=len(copies)) if "extra_faces" in arrays else None
+        return Tile(arrays["origin"], mesh, copies, relief, extras)
 
 
 def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
     facades = {f"facade_{f.name}": getattr(relief.facades, f.name) for f in fields(Facades)}
     openings = {f"opening_{f.name}": getattr(relief.openings, f.name) for f in fields(Openings)}
     return {**facades, **openings, "relief_cells": relief.cells, "relief_wall": relief.wall}
+
+
+def _extra_arrays(extras: Extras) -> dict[str, NDArray[Any]]:
+    return {"extra_faces": extras.faces, "extra_instances": extras.instances}
+
+
+def _extras(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) -> Extras:
+    """The extras in a tile's arrays; raises ValueError if they do not fit the mesh and the instances."""
+    extras = Extras(_column(arrays, "extra_faces"), _column(arrays, "extra_instances"))
+    if len(extras.faces) != faces or len(extras.instances) != copies:
+        raise ValueError("extras do not fit the faces or the instances")
+    return extras
 
 
 def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:

@@ -15,12 +15,21 @@ from geoscene.structures.tubes import has_walkway
 from geoscene.typing import Bools
 from geoscene.watertight import grid_cells, weld
 
+_LINING = {"portals": portals, "ribs": ribs}
+"""Makers of the bodies that tunnels have without equipment, too."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fittings:
-    """Bodies in a tunnel piece, and how many there are of each kind."""
+    """Bodies in a tunnel piece.
+
+    mesh      : of all bodies
+    equipment : (m,) bool, faces of lamps, signs, jet fans and cable trays
+    counts    : how many there are of each kind
+    """
 
     mesh: Mesh
+    equipment: Bools
     counts: dict[str, int]
 
 
@@ -29,7 +38,7 @@ def tunnel_fittings(table: Structures, k: int, *, tube: Mesh, equipment: bool) -
 
     tube : the piece's own solid; what would cross it, or something before it in this order, is left out
     """
-    makers = {"portals": portals, "ribs": ribs}
+    makers = dict(_LINING)
     if equipment and has_walkway(table, k):
         makers |= {"lamps": lamps, "signs": signs, "fans": fans, "cable_trays": trays}
     bodies, kinds = list[Mesh](), list[str]()
@@ -38,10 +47,13 @@ def tunnel_fittings(table: Structures, k: int, *, tube: Mesh, equipment: bool) -
         bodies += made
         kinds += [kind] * len(made)
     clear = _clear(tube, bodies)
-    kept = [kind for kind, free in zip(kinds, clear.tolist(), strict=True) if free]
+    kept = [row for row, free in enumerate(clear.tolist()) if free]
+    kinds = [kinds[row] for row in kept]
+    sizes = [len(bodies[row]) for row in kept]
     return Fittings(
-        concatenate([mesh for mesh, free in zip(bodies, clear.tolist(), strict=True) if free]),
-        {kind: kept.count(kind) for kind in makers if kind in kept},
+        concatenate([bodies[row] for row in kept]),
+        np.repeat([kind not in _LINING for kind in kinds], sizes).astype(np.bool_),
+        {kind: kinds.count(kind) for kind in makers if kind in kinds},
     )
 
 

@@ -39,9 +39,14 @@ def structure_meshes(
 
 @dataclass(frozen=True, slots=True)
 class Built:
-    """A piece as a mesh, and how many guessed parts of each kind it has."""
+    """A piece as a mesh.
+
+    equipment : (m,) bool, faces of a tunnel's equipment
+    guessed   : how many guessed parts of each kind it has
+    """
 
     mesh: Mesh
+    equipment: Bools
     guessed: dict[str, int]
 
 
@@ -81,7 +86,7 @@ def _solid(
     lining = read_lining(table, k) if options.lining and table.tunnel[k] else None
     plan = cut_plan(table.polygon[k], _linework(table, k, openings=openings, lining=lining))
     if not len(plan.faces):
-        return Built(Mesh.empty(), {})
+        return Built(Mesh.empty(), np.empty(0, np.bool_), {})
     z = surface_heights(table, k, xy=plan.xy)
     ground = np.zeros(len(z)) if height is None else np.asarray(height(*plan.xy.T), float)
     middle = plan.middle
@@ -104,13 +109,15 @@ def _solid(
         floor = 2
     shell = raise_shell(plan, levels, solid=solid)
     body = _with_surfaces(table, k, plan=plan, shell=shell, floor=floor, rim=rim)
+    plain = np.zeros(len(body), np.bool_)
     if lining is None:
-        return Built(body, {})
+        return Built(body, plain, {})
     fittings = tunnel_fittings(table, k, tube=body, equipment=options.equipment)
     areas = {"walkways": lining.walkway, "niches": lining.niches}
     parts = {name: 0 if area.is_empty else len(shapely.get_parts(area)) for name, area in areas.items()}
     guessed = {name: count for name, count in (parts | fittings.counts).items() if count}
-    return Built(concatenate([body, fittings.mesh]), guessed)
+    mesh = concatenate([body, fittings.mesh])
+    return Built(mesh, np.concatenate([plain, fittings.equipment]), guessed)
 
 
 def _bridge(

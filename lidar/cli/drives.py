@@ -21,9 +21,10 @@ from geoscene.console import (
     progress_bar,
     whole,
 )
+from geoscene.options import CloudOptions
 from lidar.cli.program import Out, Reporting, print_effects
 from lidar.errors import InputError, LidarError
-from lidar.options import OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
+from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
 
 if TYPE_CHECKING:
     from lidar.scene_cache import OpenedScene
@@ -35,6 +36,7 @@ def drive(
     *,
     options: DriveOptions | None = None,
     place: PlaceOptions = PlaceOptions(),
+    clouds: Annotated[CloudOptions, Parameter(group=MAP)] = CloudOptions(),
     wanted: AccuracyOptions = AccuracyOptions(),
     out: Out,
     live: Annotated[tuple[str, ...] | None, SEVERAL, Parameter(group=OUTPUT, metavar="[FILE.rrd]")] = None,
@@ -89,7 +91,7 @@ def drive(
         note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
     with bar() as progress:
-        found = open_scene_or_map(scene, options, place=place, progress=progress)
+        found = open_scene_or_map(scene, options, place=place, clouds=clouds, progress=progress)
     if not report.json:
         _print_built(found)
     with (
@@ -270,6 +272,7 @@ def tradeoff(
     *,
     options: DriveOptions | None = None,
     place: PlaceOptions = PlaceOptions(),
+    clouds: Annotated[CloudOptions, Parameter(group=MAP)] = CloudOptions(),
     compared: TradeoffOptions = TradeoffOptions(),
     others: Annotated[tuple[Path, ...], Parameter(name="--scene", n_tokens=1)] = (),
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
@@ -315,7 +318,7 @@ def tradeoff(
         ExitStack() as opened,
     ):
         needing = replace(options, traffic=options.traffic or TrafficOptions())  # it compares traffic, too
-        found_scene = open_scene_or_map(scene, needing, place=place, progress=progress).scene
+        found_scene = open_scene_or_map(scene, needing, place=place, clouds=clouds, progress=progress).scene
         scenes = [found_scene, *map(open_scene, others)]
         first, *rest = [opened.enter_context(using(s, known=LidarError)) for s in scenes]
         found = measured(first, options, compared=compared, others=rest, progress=progress)

@@ -35,7 +35,8 @@ def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     )
     traffic = ", ".join(f"{k} {_short(v)}" for k, v in d["traffic"].items() if v not in (None, ""))
     route, fidelity = str(recipe.get("route", ""))[:60], recipe.get("fidelity", "")
-    yield "options", f"route {route}, seed {d['seed']}, fidelity {fidelity}"
+    changed = "".join(f", {name}={value}" for name, value in recipe.get("settings", ()))
+    yield "options", f"route {route}, seed {d['seed']}, fidelity {fidelity}{changed}"
     yield "traffic", traffic or "none"
     for stage in d["stages"]:
         yield stage["group"], _stage_text(stage)
@@ -47,7 +48,8 @@ def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         yield "extent", f"{lon}, {lat}, h {low:.1f} to {high:.1f} m"
     yield "CRS", f"scene {crs['scene']}, heights {crs['vertical']}; LAS and maps {crs['export']}"
     digest = f", digest {scene['digest']}" if scene.get("digest") else ""
-    yield "scene", f"{scene.get('name') or scene.get('path', '')}{digest}"
+    relief = f", relief {scene['relief']}" if scene.get("relief") else ""
+    yield "scene", f"{scene.get('name') or scene.get('path', '')}{relief}{digest}"
     for source in d["sources"]:
         words = (source.get(key, "") for key in ("kind", "from", "timestamp", "licence"))
         yield "source", " ".join(str(word) for word in words if word)

@@ -38,7 +38,7 @@ def versions() -> dict[str, str]:
 
 
 def scene_provenance(scene: Scene) -> dict[str, Any]:
-    """Entries of ``dataset.json`` about a drive's scene: its digests, sources, licences and attribution.
+    """Entries of ``dataset.json`` about a drive's scene: digests, relief, sources, licences and attribution.
 
     The digest of a scene that grows with further drives is not stated: it is not the same when a drive is
     repeated. That of its map is.
@@ -52,6 +52,7 @@ def scene_provenance(scene: Scene) -> dict[str, Any]:
             "path": scene.location,
             **digest,
             "map": manifest.get("map", ""),
+            **({} if scene.relief == "off" else {"relief": scene.relief}),
         },
         "attribution": manifest.get("attribution", ""),
         "licence": "; ".join(dict.fromkeys(s["licence"] for s in sources if s.get("licence"))),

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from geoscene.limits import Limit
 from geoscene.typing import Float
 from lidar.errors import InputError
+
+if TYPE_CHECKING:
+    from geoscene.scene import Scene
 
 _FAR = 10_000.0
 """Metres from their origin up to which rays at edges are tested (docs/extremes.md)."""
@@ -18,8 +22,11 @@ ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""
 
 
-RELIEFS = ("off", "full", "mesh")
+RELIEFS = ("scene", "off", "plain", "full", "mesh")
 """What is used of the relief of a scene."""
+
+_BUILT = {"plain": ("plain", "full"), "mesh": ("plain", "full"), "full": ("full",)}
+"""Reliefs of scenes that hold what a setting asks for; no row for settings that any scene satisfies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +41,9 @@ class WorldSettings:
     trees     : single trees and those of rows
     furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
     barriers  : walls, fences and hedges
-    relief    : of `RELIEFS`: ``full``, what the scene holds; ``off``: walls are planes and the ground is
-                smooth, in a scene with relief, too; ``mesh``: openings of walls as triangles
+    relief    : of `RELIEFS`: ``scene``, what the scene holds; ``off``: walls are planes and the ground is
+                smooth; ``plain``: without the small parts that full relief adds; ``full``: only of a
+                scene that has them; ``mesh``: openings of walls as triangles
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
     """
@@ -46,7 +54,7 @@ class WorldSettings:
     trees: bool = True
     furniture: bool = True
     barriers: bool = True
-    relief: str = "full"
+    relief: str = "scene"
     wetness: float = 0.0
     snow: float = 0.0
 
@@ -70,6 +78,16 @@ class WorldSettings:
 
 PLAIN = WorldSettings()
 """The whole scene within range."""
+
+
+def check_relief(scene: Scene, settings: WorldSettings) -> None:
+    """Raise InputError if the settings ask for relief that a scene does not hold."""
+    built, enough = scene.relief, _BUILT.get(settings.relief)
+    if enough and built not in enough:
+        raise InputError(
+            f"`relief` {settings.relief}: {scene.location} was built with relief {built}; build it again with"
+            f" `relief` {' or '.join(enough)}, or leave the option out"
+        )
 
 
 def origin_limit(position: Float) -> list[Limit]:

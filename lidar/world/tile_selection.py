@@ -1,11 +1,12 @@
-"""The tiles of a scene without the kinds of objects that the settings of a world leave out."""
+"""The tiles of a scene without what the settings of a world leave out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.mesh import Instances, Mesh
@@ -27,27 +28,43 @@ _CLASSES = {
 }
 
 
-def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: Sequence[Mesh]) -> Tile:
+_WITHOUT_EXTRAS = {"bicycle_stand_1": "bicycle_stand", "bicycle_stand_2": "bicycle_stand"}
+"""Shapes of mapped objects to which full relief adds something, here bicycles, and those without it."""
+
+
+def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: Mapping[str, Mesh]) -> Tile:
     """A tile, by its number in the scene, with what the settings ask for.
 
-    shapes : of the scene; an instance has the class of the first face of its shape
+    shapes : of the scene by name; an instance has the class of the first face of its shape
     """
     i, j = scene.tile_indices[rank]
     tile = scene.tile(i, j, forests=settings.forests)
     without = [code for name, codes in _CLASSES.items() if not getattr(settings, name) for code in codes]
-    if not without:
+    extras = tile.extras if settings.relief == "plain" else None
+    if not without and extras is None:
         return tile
     mapped = tile.instances
-    if settings.forests:  # the trees of forests follow those of the file
+    if extras is not None:  # the trees of forests follow those of the file
+        mapped = mapped.take(np.arange(len(extras.instances)))
+    elif settings.forests:
         mapped = mapped.take(np.arange(len(scene.tile(i, j, forests=False).instances)))
     forest = tile.instances.take(np.arange(len(mapped), len(tile.instances)))
-    classes = np.array([mesh.klass[0] for mesh in shapes], np.uint8)
-    mapped = mapped.take(np.flatnonzero(~np.isin(classes[mapped.shape], without)))
-    keep = ~np.isin(tile.mesh.klass, without)
+    classes = np.array([mesh.klass[0] for mesh in shapes.values()], np.uint8)
+    keep, kept = ~np.isin(tile.mesh.klass, without), ~np.isin(classes[mapped.shape], without)
+    if extras is not None:
+        keep, kept = keep & ~extras.faces, kept & ~extras.instances
+        mapped = replace(mapped, shape=_plain_shapes(shapes)[mapped.shape])
     relief = tile.relief
     return replace(
         tile,
         mesh=tile.mesh.take(keep),
         relief=None if relief is None else replace(relief, wall=relief.wall[keep]),
-        instances=Instances.concatenate([mapped, forest]),
+        extras=None,
+        instances=Instances.concatenate([mapped.take(np.flatnonzero(kept)), forest]),
     )
+
+
+def _plain_shapes(shapes: Mapping[str, Mesh]) -> NDArray[np.int32]:
+    """The shape without extras of each shape."""
+    number = {name: k for k, name in enumerate(shapes)}
+    return np.array([number[_WITHOUT_EXTRAS.get(name, name)] for name in shapes], np.int32)

@@ -28,7 +28,7 @@ from lidar.relief import (
     joined_ground,
 )
 from lidar.world.openings import openings_of
-from lidar.world.settings import PLAIN, WorldSettings
+from lidar.world.settings import PLAIN, WorldSettings, check_relief
 from lidar.world.shelter import CELL, Shelter, shelter_of
 from lidar.world.surfaces import (
     GLASS,
@@ -104,10 +104,10 @@ class World:
         settings: WorldSettings = PLAIN,
         backend: str = "auto",
     ) -> None:
-        named = scene.shapes()
-        self._meshes = shapes = list(named.values())
+        check_relief(scene, settings)
+        self._named = scene.shapes()
+        shapes = list(self._named.values())
         self.scene = scene.with_relief_mesh() if settings.relief == "mesh" else scene
-        self._names = tuple(named)
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
         self.margin = min(margin, settings.reach)
         self.settings = settings
@@ -122,8 +122,7 @@ class World:
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
         self._walls = WallRefiner(NO_WALLS)
-        relief = scene.manifest.get("options", {}).get("relief", "off")
-        self._rough = relief != "off" and settings.relief != "off"
+        self._rough = scene.relief != "off" and settings.relief != "off"
         self._concatenate_tables()
 
     @classmethod
@@ -273,7 +272,7 @@ class World:
         return refiners
 
     def _read(self, rank: int) -> _Tile:
-        tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._meshes)
+        tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._named)
         mesh, copies = tile.mesh, tile.instances
         parts = split(
             mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=mask_bits(mesh.material)
@@ -327,9 +326,9 @@ class World:
     def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Kinds of leaves of all rows of the tables; ``starts`` are those of the shapes."""
         kinds, found = list(self._leaves), np.zeros(len(self._surfaces.klass), np.uint8)
-        for k, name in enumerate(self._names):
+        for k, (name, mesh) in enumerate(self._named.items()):
             if name in kinds:
-                leafy = self._meshes[k].klass == Class.TREE_CROWN  # limbs in a crown let no ray pass
+                leafy = mesh.klass == Class.TREE_CROWN  # limbs in a crown let no ray pass
                 found[starts[k] : starts[k + 1]][leafy] = 1 + kinds.index(name)
         if "hedge" in kinds:
             found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")

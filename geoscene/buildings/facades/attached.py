@@ -6,6 +6,7 @@ Each is a closed solid that ends 5 mm before the wall, so that it is a body of i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -43,10 +44,22 @@ _AWNINGS, _PIPES = 0.5, 0.5
 _CLOTHS = np.array([[122, 44, 40], [38, 74, 60], [44, 62, 96], [196, 186, 160]], np.uint8)
 
 
-def attach(sheet: Sheet, at: Elevations, *, facing: Bools, guess: bool) -> tuple[Mesh, dict[str, int]]:
-    """Solids that stand out of the facades, in scene metres, and how many buildings' parts there are by kind.
+@dataclass(frozen=True, slots=True)
+class Attached:
+    """Solids that stand out of facades.
 
-    Windows behind balconies reach down to the floor.
+    mesh    : in scene metres
+    guessed : (m,) bool, faces of parts that the map does not have
+    counts  : number of parts by kind
+    """
+
+    mesh: Mesh
+    guessed: Bools
+    counts: dict[str, int]
+
+
+def attach(sheet: Sheet, at: Elevations, *, facing: Bools, guess: bool) -> Attached:
+    """The solids that stand out of the facades; windows behind balconies reach down to the floor.
 
     facing : (k,) whether walls face a street
     guess  : also parts that the map does not have
@@ -56,16 +69,23 @@ def attach(sheet: Sheet, at: Elevations, *, facing: Bools, guess: bool) -> tuple
         made["cornices"] = _cornices(at, facing=facing)
         made["awnings"] = _awnings(sheet, at)
         made["downpipes"] = _pipes(sheet, at, facing=facing)
-    meshes = [mesh for mesh, _ in made.values()]
-    return concatenate(meshes), {name: count for name, (_, count) in made.items()}
+    mesh = concatenate([mesh for mesh, _ in made.values()])
+    guessed = np.ones(len(mesh), np.bool_)
+    balconies = made["balconies"][0].feature
+    guessed[: len(balconies)] = ~np.isin(balconies, at.walls.feature[at.styles.balcony_tagged])
+    return Attached(mesh, guessed, {name: count for name, (_, count) in made.items()})
 
 
-def without_touching(parts: Mesh, solids: Mesh) -> tuple[Mesh, int]:
-    """The parts without those of buildings in which they touch each other or the walls, and their number."""
-    own = solids.take(np.isin(solids.feature, parts.feature))
-    verdict = validate_mesh(concatenate([own, parts]))
+def without_touching(parts: Attached, solids: Mesh) -> tuple[Attached, int]:
+    """The parts without those of buildings in which they touch each other or the walls.
+
+    Also returns the number of these buildings; the counts of the parts stay.
+    """
+    own = solids.take(np.isin(solids.feature, parts.mesh.feature))
+    verdict = validate_mesh(concatenate([own, parts.mesh]))
     bad = verdict.feature[~verdict.ok]
-    return parts.take(~np.isin(parts.feature, bad)), len(bad)
+    kept = ~np.isin(parts.mesh.feature, bad)
+    return replace(parts, mesh=parts.mesh.take(kept), guessed=parts.guessed[kept]), len(bad)
 
 
 def _free(at: Elevations, wall: Ints, *, along: Float, out: Float, span: Float) -> Bools:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.buildings.facades.attached import attach, without_touching
+from geoscene.buildings.facades.attached import Attached, attach, without_touching
 from geoscene.buildings.facades.description import Facades, WallRelief
 from geoscene.buildings.facades.doors import facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.fit import Sheet
@@ -36,12 +36,12 @@ _FRONT = 4.0
 class Layout:
     """The relief of a tile's walls, and what was counted.
 
-    parts  : solids that stand out of the walls, in scene metres
+    parts  : solids that stand out of the walls
     counts : walls with openings, openings and parts by what they are, entrances mapped and left out
     """
 
     relief: WallRelief
-    parts: Mesh
+    parts: Attached
     counts: dict[str, int]
 
 
@@ -60,7 +60,7 @@ def wall_relief(
     number = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
     number[some] = np.arange(len(some))
     walls, grids, cells = at.walls, at.grids, at.cells
-    chosen, parts, counts = _choose(at, guess=guess)
+    chosen, parts = _choose(at, guess=guess)
     parts, touching = without_touching(parts, mesh)
     openings, index = make_openings(chosen, at.styles, wall=cells.wall)
     kept = np.zeros(len(walls), np.bool_)
@@ -82,24 +82,25 @@ def wall_relief(
         grids.count.astype(np.int32),
         (np.cumsum(sizes) - sizes).astype(np.int32),
     )
-    counts = {"walls": len(walls), **counts, "parts_left_out": touching}
+    counts = {"walls": len(walls), **parts.counts, "parts_left_out": touching}
     relief = WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32))
     return Layout(relief, parts, counts)
 
 
-def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Mesh, dict[str, int]]:
-    """What each cell holds, what stands out of walls, and how many there are of each."""
+def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Attached]:
+    """What each cell holds, and what stands out of walls with the counts of both."""
     sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
     facing = facing_street(at)
     _put_windows(sheet, at)
     mapped = _put_shops(sheet, at, facing=facing) | put_mapped_doors(sheet, at)
     put_guessed_doors(sheet, at, facing=facing)
-    parts, attached = attach(sheet, at, facing=facing, guess=guess)
+    parts = attach(sheet, at, facing=facing, guess=guess)
     place = nth(_sizes(at.walls.feature))[wall] * 65536 + cells.storey * 256 + cells.column
     draw = uniform_at(styles.seed[wall], place, count=2, seed=1)
     closed = (sheet.kind == WINDOW) & (draw[0] < styles.closed[wall])
-    counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped | attached
-    return Chosen(sheet.kind, sheet.place, closed, draw[1], cells.height), parts, counts
+    counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped | parts.counts
+    chosen = Chosen(sheet.kind, sheet.place, closed, draw[1], cells.height)
+    return chosen, replace(parts, counts=counts)
 
 
 def _put_windows(sheet: Sheet, at: Elevations) -> None:

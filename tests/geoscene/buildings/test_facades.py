@@ -353,24 +353,37 @@ def test_what_stands_out_of_facades_is_closed_and_clear_of_its_walls_and_of_neig
         street=[(-60, -40), (60, -40)],
         guess=True,
     )
-    verdict = validate_mesh(concatenate([mesh, layout.parts]))
+    parts = layout.parts.mesh
+    verdict = validate_mesh(concatenate([mesh, parts]))
     assert verdict.ok.all()
-    corners = shapely.points(layout.parts.vertices[:, :2])
+    assert layout.parts.guessed.all()
+    corners = shapely.points(parts.vertices[:, :2])
     assert shapely.distance(table.footprint[1], corners).min(initial=9.0) > 0.5
-    assert (layout.parts.vertices[:, 2] > 0).all()
+    assert (parts.vertices[:, 2] > 0).all()
 
 
 def test_balconies_stand_where_they_are_mapped_and_windows_behind_them_reach_the_floor():
     shape = shapely.box(0, 0, 30, 12)
     tags = {"building": "apartments", "building__levels": "5"}
     none = facades_of(house(1, shape, **tags))[2]
-    assert not len(none.parts)
+    assert not len(none.parts.mesh)
     _, _, layout = facades_of(house(1, shape, balcony="yes", **tags))
     assert layout.counts["balconies"] >= 4
-    assert len(layout.parts)
+    assert len(layout.parts.mesh)
     floors = [box[1] for _, r, _, box, _ in panels_of(layout.relief, part="opening") if r > 0]
     storey = layout.relief.facades.cell[0, 1]
     ground = layout.relief.facades.ground[0]
     low = [y for y in floors if (y - ground) % storey < 0.3]
     assert len(low) == layout.counts["balconies"]
     assert facades_of(house(1, shape, balcony="no", **tags), guess=True)[2].counts["balconies"] == 0
+
+
+def test_of_what_stands_out_of_facades_mapped_balconies_alone_are_not_guessed():
+    shape = shapely.box(0, 0, 30, 12)
+    given = {"building": "apartments", "building__levels": "5", "balcony": "yes"}
+    mapped = facades_of(house(1, shape, **given))[2].parts
+    parts = facades_of(house(1, shape, **given), street=[(-30, -8), (60, -8)], guess=True)[2].parts
+    assert parts.counts["cornices"] + parts.counts["downpipes"] > 0
+    assert not mapped.guessed.any()
+    left = parts.mesh.take(~parts.guessed)
+    np.testing.assert_array_equal(left.vertices[left.faces], mapped.mesh.vertices[mapped.mesh.faces])

@@ -147,6 +147,17 @@ def test_only_full_relief_hangs_equipment_in_a_tunnel():
     assert sum(Tube("off").guessed(kind) for kind in ("ribs", "niches", "walkways")) == 0
 
 
+def test_without_its_equipment_a_tunnel_of_full_relief_is_one_of_plain_relief():
+    plain, full = Tube("plain"), Tube("full")
+    assert any(built.equipment.any() for built in full.built)
+    for few, many in zip(plain.built, full.built, strict=True):
+        left = many.mesh.take(~many.equipment)
+        assert not few.equipment.any()
+        np.testing.assert_array_equal(
+            left.vertices[left.faces], few.mesh.vertices[few.mesh.faces], strict=True
+        )
+
+
 def test_lining_depends_on_the_osm_id_and_not_on_the_order_of_the_map():
     others = {11: (-400, 900), 12: (-60, 900), 13: (60, 900), 14: (400, 900)}
     more = [(tags, [n + 10 for n in nodes]) for tags, nodes in UNDER]
