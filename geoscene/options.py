@@ -149,7 +149,8 @@ class TradeoffOptions:
     """Options of a comparison of builds."""
 
     settings: Annotated[tuple[str, ...], WORDS] = ()
-    """Settings to compare, separated by commas: lod, only, terrain (with --dem), for; all by default."""
+    """Settings to compare, separated by commas: lod, relief, only, terrain (with --dem), for; all by
+    default."""
 
     resolution: float = 1.0
     """Cell size in metres of the surface models that are compared; enlarged where there would be more than 16

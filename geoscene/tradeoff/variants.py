@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geoscene.errors import InputError
-from geoscene.options import KINDS, BuildOptions
+from geoscene.options import KINDS, RELIEFS, BuildOptions
 from geoscene.uses import USES
 
-SETTINGS = ("lod", "only", "terrain", "for")
+SETTINGS = ("lod", "relief", "only", "terrain", "for")
 """Names of the settings that are compared."""
 
 FULL = "full scene"
@@ -40,7 +40,7 @@ class Variant:
 
 
 def full(options: BuildOptions) -> Variant:
-    """The reference: everything, at the highest level of detail."""
+    """The reference: everything, at the highest level of detail, with the relief of the options."""
     return Variant(FULL, replace(options, lod=2, only=KINDS, use="all"))
 
 
@@ -60,6 +60,9 @@ def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
     found: list[Variant] = []
     if "lod" in chosen:
         found += [Variant(f"lod={lod}", replace(base, lod=lod)) for lod in (1, 0)]
+    if "relief" in chosen:
+        others = (relief for relief in RELIEFS if relief != base.relief)
+        found += [Variant(f"relief={relief}", replace(base, relief=relief)) for relief in others]
     if "only" in chosen:
         found += [Variant(label, replace(base, only=kinds)) for label, kinds in _KINDS.items()]
     if "terrain" in chosen and base.dem:

@@ -47,7 +47,7 @@ def compared_camera(
     """The comparison of a camera; ``scenes`` are labels of the scenes after the first."""
     plan, contents = bench.plan, bench.plan.options.contents()
     exposed = camera.spec.exposure_ns > 0
-    basis = camera_basis(contents.camera, exposed=exposed, world=contents.world)
+    basis = camera_basis(contents.camera, exposed=exposed, world=contents.world, built=plan.scene.relief)
     variants = camera_variants(
         basis, compared=compared.compare, scenes=scenes, traffic=plan.actors is not None
     )

@@ -128,6 +128,8 @@ def _check_applicable(plan: DrivePlan, names: Sequence[str], *, others: Sequence
             raise InputError(f"`compare` {name}: needs a scanner, and none is compared")
     if "scene" in names and not others:
         raise InputError("`compare` scene: no other scene is given with `others`")
+    if "relief" in names and plan.scene.relief == "off":
+        raise InputError(f"`compare` relief: {plan.scene.location} was built without; build it with `relief`")
     if "traffic" in names and plan.actors is None:
         raise InputError("`compare` traffic: the drive has none; give `traffic`")
 

@@ -37,7 +37,9 @@ def compared_scanner(
 ) -> Comparison:
     """The comparison of a scanner; ``scenes`` are labels of the scenes after the first."""
     plan, contents = bench.plan, bench.plan.options.contents()
-    basis = scanner_basis(contents.scanner, rays=compared.reference_rays, world=contents.world)
+    basis = scanner_basis(
+        contents.scanner, rays=compared.reference_rays, world=contents.world, built=plan.scene.relief
+    )
     variants = scanner_variants(
         basis, compared=compared.compare, scenes=scenes, traffic=plan.actors is not None
     )

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar
 
+from geoscene.options import RELIEFS
 from lidar.camera.settings import CameraSettings
 from lidar.physics.settings import MOST_RAYS, POSES, ScannerSettings
 from lidar.raycast import PRECISIONS
@@ -46,6 +47,7 @@ WORLD_VALUES: dict[str, tuple[Any, ...]] = {
     "trees": (True, False),
     "furniture": (True, False),
     "barriers": (True, False),
+    "relief": ("off", "plain"),
 }
 """Values of the world's settings that are compared, by setting."""
 
@@ -55,7 +57,7 @@ KINDS = ("forests", "trees", "furniture", "barriers")
 OF_EMBREE = frozenset({"precision", "retrace", "origin"})
 """Settings that act on Embree's float32 rays only: alone, they are cast by Embree."""
 
-MODELS = frozenset({"mirrors", "foliage", "haze"})
+MODELS = frozenset({"mirrors", "foliage", "haze", "relief"})
 """Settings that change what is modelled: the difference that they make is no error."""
 
 CHEAPER: tuple[tuple[tuple[str, Any], ...], ...] = (
@@ -125,11 +127,13 @@ class Basis(Generic[S]):
     used  : the user's settings, without random effects
     exact : the reference's
     world : the user's settings of the world
+    built : relief of the scene, of `geoscene.options.RELIEFS`
     """
 
     used: S
     exact: S
     world: WorldSettings = WHOLE
+    built: str = "off"
 
     def variant(
         self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
@@ -149,10 +153,18 @@ class Basis(Generic[S]):
 
     def value(self, name: str) -> Any:
         """The user's value of a setting of the sensor or of the world."""
+        if name == "relief" and self.world.relief == "scene":
+            return self.built
         for group in (self.used, self.world):
             if hasattr(group, name):
                 return getattr(group, name)
         return 1  # resolution
+
+    def others(self, name: str, values: Sequence[Any]) -> list[Any]:
+        """The values of a setting that differ from the user's; of relief, those that the scene holds."""
+        if name == "relief":
+            values = [value for value in values if value in RELIEFS[: RELIEFS.index(self.built) + 1]]
+        return [value for value in values if value != self.value(name)]
 
     def described(self, values: Mapping[str, Any]) -> str:
         """The user's values: of the sensor's settings all, of the world's those that leave something out."""
@@ -204,10 +216,10 @@ def next_step(rays: int) -> int:
 
 
 def scanner_basis(
-    settings: ScannerSettings, *, rays: int, world: WorldSettings = WHOLE
+    settings: ScannerSettings, *, rays: int, world: WorldSettings = WHOLE, built: str = "off"
 ) -> Basis[ScannerSettings]:
-    """The basis of variants of a scanner; ``rays`` are the reference's."""
-    return Basis(noiseless(settings), reference(settings, rays=rays), world)
+    """The basis of variants of a scanner; ``rays`` are the reference's, ``built`` is the scene's relief."""
+    return Basis(noiseless(settings), reference(settings, rays=rays), world, built)
 
 
 def scanner_variants(
@@ -230,14 +242,18 @@ def scanner_variants(
 
 
 def camera_basis(
-    settings: CameraSettings, *, exposed: bool, world: WorldSettings = WHOLE
+    settings: CameraSettings, *, exposed: bool, world: WorldSettings = WHOLE, built: str = "off"
 ) -> Basis[CameraSettings]:
-    """The basis of variants of a camera; ``exposed`` is whether its exposure lasts some time."""
+    """The basis of variants of a camera.
+
+    exposed : whether its exposure lasts some time
+    built   : relief of the scene
+    """
     used = replace(settings, camera_noise=False)
     exact = replace(used, precision="exact", retrace=True, shadows=True, detail=True)
     if exposed:
-        return Basis(used, replace(exact, supersample=BLURRED, blur=MOMENTS), world)
-    return Basis(used, replace(exact, supersample=SAMPLES), world)
+        return Basis(used, replace(exact, supersample=BLURRED, blur=MOMENTS), world, built)
+    return Basis(used, replace(exact, supersample=SAMPLES), world, built)
 
 
 def coarser(settings: CameraSettings) -> CameraSettings:
@@ -278,8 +294,7 @@ def _variants(
     rows += [
         basis.variant([(name, value)])
         for name, known in chosen.items()
-        for value in known
-        if value != basis.value(name)
+        for value in basis.others(name, known)
     ]
     if not compared or "scene" in compared:
         rows += [basis.variant([("scene", text)], scene=k + 1) for k, text in enumerate(scenes)]

@@ -76,7 +76,8 @@ def test_variants_change_one_setting_of_the_full_scene():
     assert not [v for v in variants(base, ()) if v.label.startswith("terrain")]
     labels = [v.label for v in variants(replace(base, dem=("a.tif",)), ("terrain",))]
     assert labels == ["terrain=2 x 2 posts", "terrain=4 x 4 posts", "terrain=8 x 8 posts", "terrain=level"]
-    with pytest.raises(InputError, match="`settings` rays: unknown; choose from lod, only, terrain, for"):
+    assert [v.label for v in variants(base, ("relief",))] == ["relief=off", "relief=full"]
+    with pytest.raises(InputError, match="rays: unknown; choose from lod, relief, only, terrain, for"):
         variants(base, ("rays",))
     with pytest.raises(InputError, match="terrain: needs `dem`"):
         variants(base, ("terrain",))
