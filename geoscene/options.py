@@ -32,7 +32,7 @@ class BuildOptions:
     lod: Annotated[int, Parameter(converter=whole)] = 2
     """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
 
-    relief: str = "off"
+    relief: str = "plain"
     """Relief of surfaces: off (walls, roads and tunnels are smooth); plain (windows and doors are set back,
     kerbs drop at crossings, tunnels are lined, surfaces are rough); full (also small parts: balconies,
     cornices, chimneys, dormers, branches, bins). What the map does not hold is guessed and marked so."""

@@ -32,8 +32,10 @@ def relief(osm, tmp_path_factory):
     return build(osm, tmp_path_factory.mktemp("relief") / "scene", options=FULL)
 
 
-def test_scenes_without_relief_have_no_facades(scene):
-    assert all(tile.relief is None for tile in scene.tiles())
+def test_scenes_without_relief_have_no_facades(osm, tmp_path):
+    options = BuildOptions(relief="off", lod=1, tile_size=100, use="lidar")
+    scene = build(osm, tmp_path / "scene", options=options)
+    assert all(tile.relief is None and tile.extras is None for tile in scene.tiles())
     with pytest.raises(InputError, match="has no relief"):
         scene.with_relief_mesh()
 
@@ -74,6 +76,8 @@ def test_a_tile_file_returns_its_relief_and_a_damaged_one_is_named(relief, tmp_p
         {"facade_first": arrays["facade_first"] - np.int32(5)},
         {"opening_bar": arrays["opening_bar"][:-1]},
         {"relief_wall": arrays["relief_wall"][:-1]},
+        {"extra_faces": arrays["extra_faces"][:-1]},
+        {"extra_instances": np.zeros(len(arrays["extra_instances"]) + 1, np.bool_)},
     ):
         (tmp_path / "bad.npz").write_bytes(pack(arrays | damage))
         with pytest.raises(SceneFormatError, match=r"bad\.npz"):
