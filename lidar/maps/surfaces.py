@@ -26,14 +26,16 @@ class _Triangles(NamedTuple):
 
 
 class TrueSurfaces:
-    """The surfaces of a scene, with all copies of its shapes.
+    """The surfaces of a scene, with openings of walls and all copies of its shapes.
+
+    Rough ground counts as its planes, which lie above it by the depth of the roughness at most.
 
     limit : metres, beyond which distances are not sought
     """
 
     def __init__(self, scene: Scene, *, limit: float) -> None:
         self.limit = limit
-        self._scene = scene
+        self._scene = scene if scene.relief == "off" else scene.with_relief_mesh()
         self._shapes = [mesh.vertices[mesh.faces] for mesh in scene.shapes().values()]
         self._tiles: OrderedDict[int, _Triangles] = OrderedDict()
 
