@@ -185,6 +185,7 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
+        "camber_km": round(plan.ground.camber.metres / 1000, 3) if plan.ground.camber else 0.0,
         "kerbs_lowered": count_lowered(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
         "wires": _tally(plan.wires.kind),

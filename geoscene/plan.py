@@ -35,6 +35,7 @@ from geoscene.ground import (
     tile_span,
     water_levels,
 )
+from geoscene.ground.camber import Camber
 from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.kerbs import lowered_kerbs
 from geoscene.ground.relief import Relief
@@ -60,6 +61,7 @@ from geoscene.progress import Progress
 from geoscene.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.driving_side import driving_side as found_side
@@ -457,10 +459,18 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     if len(wires):
         wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
-    relief = options.relief != "off"
-    covers = Layers.concatenate([cover, surfaces, pads, low, *([lowered_kerbs(surfaces)] if relief else [])])
+    camber, extra = None, []
+    if options.relief != "off":
+        crowns = find_crowns(roads.carriageways)
+        camber = camber_of(roads.carriageways, crowns)
+        first = ranges["road_surfaces"][0] + made.first
+        extra = [
+            lowered_kerbs(surfaces),
+            crown_rows(roads.carriageways, crowns, surfaces=surfaces, first=first),
+        ]
+    covers = Layers.concatenate([cover, surfaces, pads, low, *extra])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
-    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options)
+    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options, camber=camber)
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
         for name, table in _sited(
@@ -520,7 +530,13 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
 
 
 def _plan_ground(
-    layers: Layers, roads: _Roads, *, extent: Bounds, terrain: Terrain, options: BuildOptions
+    layers: Layers,
+    roads: _Roads,
+    *,
+    extent: Bounds,
+    terrain: Terrain,
+    options: BuildOptions,
+    camber: Camber | None,
 ) -> GroundPlan:
     size, tolerance = options.tile_size, options.dem_tolerance
     if tolerance is None:
@@ -534,6 +550,7 @@ def _plan_ground(
         coarse=terrain.lines,
         relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
         kerbs=options.relief != "off",
+        camber=camber,
     )
 
 

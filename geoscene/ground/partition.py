@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
+from geoscene.ground.camber import Camber
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.typing import Bools, Float, Ints
@@ -63,6 +64,8 @@ class GroundPlan:
     tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
                 `geoscene.ground.joined` has joined it to others
     span      : (t,) int64, squares along a side of the tile that each square is part of: 1, or a power of two
+    kerbs     : whether sidewalks of carriageways are raised above them
+    camber    : by which the middles of carriageways are, None for level ones
     """
 
     extent: tuple[float, float, float, float]
@@ -82,6 +85,7 @@ class GroundPlan:
     tiles: Ints
     span: Ints
     kerbs: bool = False
+    camber: Camber | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +125,7 @@ def plan_ground(
     relief: Relief | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
     kerbs: bool = False,
+    camber: Camber | None = None,
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
 
@@ -132,6 +137,7 @@ def plan_ground(
     relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
     base   : class and material where no polygon lies
     kerbs  : whether sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
+    camber : of carriageways; their halves must be layers of their own (`geoscene.roadgraph.camber`)
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
     """
@@ -170,6 +176,7 @@ def plan_ground(
         np.stack([i, j], axis=1) + low,
         np.ones(len(i), np.int64),
         kerbs,
+        camber,
     )
 
 

@@ -15,7 +15,7 @@ from geoscene.report import Problem
 from geoscene.roadgraph.build import read_runs
 from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
-from geoscene.roadgraph.tags import Street, drivable, read_street
+from geoscene.roadgraph.tags import CLASSES, Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Ints
@@ -97,6 +97,12 @@ class Carriageways:
             [place_of(s.layer, s.layer_source, bridge=s.bridge, tunnel=s.tunnel) for s in self.street],
             np.int8,
         )
+
+    @property
+    def importance(self) -> Ints:
+        """Rank of each stretch by its class: the higher wins where carriageways overlap."""
+        ranks = {name: len(CLASSES) - k for k, name in enumerate(CLASSES)}
+        return np.array([ranks.get(s.highway, 0) for s in self.street], np.int64)
 
     @property
     def layer(self) -> NDArray[np.int8]:

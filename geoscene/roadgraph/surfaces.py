@@ -21,7 +21,6 @@ from geoscene.roadgraph.markings import marking_rows, painted_stretches, stop_ro
 from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
-from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import OsmData
 from geoscene.typing import Float, Ints
 
@@ -49,10 +48,12 @@ class RoadSurfaces(SurfaceRows):
 
     raised : the surfaces on bridges and in tunnels: their carriageways, kerbs, sidewalks and markings, and
              (class BRIDGE, lowest) the outline of the deck
+    first  : number of the first carriageway; that of carriageway k is ``first + k``
     count  : of numbers, which neither depend on how shapes are cut nor on the area
     """
 
     raised: SurfaceRows
+    first: int
     count: int
 
 
@@ -92,7 +93,9 @@ def road_surfaces(
     rows = SurfaceRows.concatenate([paths, *carriageways, others])
     ground = rows.take(rows.place == 0)
     columns = {f.name: getattr(ground, f.name) for f in fields(ground)}
-    return RoadSurfaces(**columns, raised=rows.take(rows.place != 0), count=count + len(others))
+    return RoadSurfaces(
+        **columns, raised=rows.take(rows.place != 0), first=len(paths), count=count + len(others)
+    )
 
 
 def carriageway_boxes(roads: Carriageways) -> Float:
@@ -141,9 +144,7 @@ def _carriageway_rows(
     """Surfaces of carriageways that are raised or near the area, numbered from ``first``; the next number."""
     if not len(roads):
         return [], first
-    importance = np.array(
-        [len(CLASSES) - CLASSES.index(s.highway) if s.highway in CLASSES else 0 for s in roads.street]
-    )
+    importance = roads.importance
     place, level = roads.place, roads.layer
     half = roads.width / 2
     common = {"osm_id": roads.osm_id, "place": place, "level": level, "edge": edge}

@@ -1,0 +1,59 @@
+"""The camber of carriageways: middles that stand above the edges, so that water runs off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+
+from geoscene.typing import Float
+
+CAMBER = 0.025
+"""Fall from the middle of a carriageway to its edges, m/m (RASt 06, RAL: the least crossfall is 2.5 %)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camber:
+    """Gable roofs over straight pieces of centre lines; where several overlap the highest counts.
+
+    start, end : (m, 2) float64 scene metres, ends of the pieces
+    half  : (m,) float64 metres, half the width of the carriageway
+    crown : (m, 2) float64 metres by which the middle stands above the edges at start and end
+    tree  : STRtree of the pieces
+    """
+
+    start: Float
+    end: Float
+    half: Float
+    crown: Float
+    tree: shapely.STRtree
+
+    @classmethod
+    def of(cls, start: Float, end: Float, *, half: Float, crown: Float) -> Camber:
+        """The camber of pieces; columns as above."""
+        pieces = shapely.linestrings(np.stack([start, end], axis=1)) if len(start) else np.empty(0, object)
+        return cls(start, end, half, crown, shapely.STRtree(pieces))
+
+    @property
+    def metres(self) -> float:
+        """Length of all pieces."""
+        return float(np.hypot(*(self.end - self.start).T).sum())
+
+    def height(self, xy: Float) -> Float:
+        """Metres (n,) by which the surface stands above the edges of its carriageway at points (n, 2).
+
+        0 on edges and outside. It depends on the place alone and has no steps.
+        """
+        z = np.zeros(len(xy))
+        if not len(self.start):
+            return z
+        reach = float(self.half.max())
+        point, piece = self.tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
+        along = self.end[piece] - self.start[piece]
+        square = np.maximum((along**2).sum(axis=1), 1e-12)
+        share = np.clip(((xy[point] - self.start[piece]) * along).sum(axis=1) / square, 0.0, 1.0)
+        away = np.hypot(*(xy[point] - self.start[piece] - share[:, None] * along).T)
+        crown = self.crown[piece, 0] * (1.0 - share) + self.crown[piece, 1] * share
+        np.maximum.at(z, point, crown * np.maximum(1.0 - away / self.half[piece], 0.0))
+        return z
