@@ -12,7 +12,7 @@ import shapely
 from geoscene import __version__
 from geoscene.frames import wrapped
 from geoscene.ground import tile_span
-from geoscene.ground.kerbs import count_lowered
+from geoscene.ground.kerbs import count_kerbs
 from geoscene.limits import height_limit, places, scale_limit
 from geoscene.objects.shapes import leaf_area_density
 from geoscene.plan import Plan
@@ -186,7 +186,7 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
         "camber_km": round(plan.ground.camber.metres / 1000, 3) if plan.ground.camber else 0.0,
-        "kerbs_lowered": count_lowered(plan.ground.layers),
+        **count_kerbs(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
         "wires": _tally(plan.wires.kind),
         "roofs_guessed": dict(sorted(roofs.items())),

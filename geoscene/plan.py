@@ -35,10 +35,11 @@ from geoscene.ground import (
     tile_span,
     water_levels,
 )
-from geoscene.ground.camber import Camber
+from geoscene.ground.camber import Camber, Kerbs
 from geoscene.ground.foundations import foundation_heights
-from geoscene.ground.kerbs import lowered_kerbs
+from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
 from geoscene.ground.relief import Relief
+from geoscene.ground.standing import standing_height
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
@@ -66,6 +67,7 @@ from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.driving_side import driving_side as found_side
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.kerbs import mapped_kerbs, sidewalk_ends
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.scene.geopackage import Layer
@@ -239,6 +241,7 @@ def make_plan(
     facades = None
     if options.relief != "off":
         facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
+    standing = standing_height(ground, local.height)
     layers = [
         *building_layers(
             buildings, base, parapet=None if rooftops is None else rooftops.parapet, facades=facades
@@ -246,8 +249,8 @@ def make_plan(
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
-        tree_layer(trees, _foot(trees.xy, local.height), relief=options.relief != "off"),
-        furniture_layer(furniture, _foot(furniture.xy, local.height), relief=options.relief != "off"),
+        tree_layer(trees, _foot(trees.xy, standing), relief=options.relief != "off"),
+        furniture_layer(furniture, _foot(furniture.xy, standing), relief=options.relief != "off"),
         barrier_layer(barriers),
         structure_layer(structures),
     ]
@@ -459,18 +462,23 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     if len(wires):
         wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
-    camber, extra = None, []
+    camber, kerbs, extra = None, None, []
     if options.relief != "off":
+        ends = sidewalk_ends(roads.carriageways)
+        kerbs = Kerbs.of(ends)
         crowns = find_crowns(roads.carriageways)
         camber = camber_of(roads.carriageways, crowns)
         first = ranges["road_surfaces"][0] + made.first
         extra = [
-            lowered_kerbs(surfaces),
+            lowered_kerbs(surfaces, mapped=mapped_kerbs(_only_roads(osm, options), frame)),
+            kerb_ends(surfaces, ends),
             crown_rows(roads.carriageways, crowns, surfaces=surfaces, first=first),
         ]
     covers = Layers.concatenate([cover, surfaces, pads, low, *extra])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
-    ground = _plan_ground(covers, roads, extent=extent, terrain=terrain, options=options, camber=camber)
+    ground = _plan_ground(
+        covers, roads, extent=extent, terrain=terrain, options=options, kerbs=kerbs, camber=camber
+    )
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
         for name, table in _sited(
@@ -536,6 +544,7 @@ def _plan_ground(
     extent: Bounds,
     terrain: Terrain,
     options: BuildOptions,
+    kerbs: Kerbs | None,
     camber: Camber | None,
 ) -> GroundPlan:
     size, tolerance = options.tile_size, options.dem_tolerance
@@ -549,7 +558,7 @@ def _plan_ground(
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
         coarse=terrain.lines,
         relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
-        kerbs=options.relief != "off",
+        kerbs=kerbs,
         camber=camber,
     )
 

@@ -23,6 +23,7 @@ from geoscene.classes import Class
 from geoscene.cluster import Cluster
 from geoscene.files import digest_of, naming, write_atomically
 from geoscene.ground import ground_tile, tile_box, tile_place
+from geoscene.ground.standing import standing_height
 from geoscene.mesh import Instances, Mesh, concatenate
 from geoscene.objects.barriers import barrier_meshes
 from geoscene.objects.forests import forest_tree_count
@@ -161,20 +162,21 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
         return make_without_failures(make, plan.of_tile(kind, i, j=j), failed=failed)
 
     covered = tile_place(plan.ground, i, j=j) is not None
-    meshes = []
+    meshes, foot = [], standing_height(plan.ground, height)
     if covered:
         ground = ground_tile(plan.ground, i, j=j, height=height, levels=plan.levels)
+        foot = standing_height(plan.ground, height, ground=ground)
         kept = ground.klass != Class.TUNNEL  # the ground is open at tunnel mouths
         meshes.append(ground if kept.all() else ground.take(kept))
     trees, furniture, barriers = plan.trees, plan.furniture, plan.barriers
     copies = [
-        *made(trees, "trees", make=lambda rows: tree_instances(trees.take(rows), height=height)),
+        *made(trees, "trees", make=lambda rows: tree_instances(trees.take(rows), height=foot)),
         *made(
-            furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=height)
+            furniture, "furniture", make=lambda rows: furniture_instances(furniture.take(rows), height=foot)
         ),
-        *made(plan.wires, "wires", make=lambda rows: wire_instances(plan.wires.take(rows), height=height)),
+        *made(plan.wires, "wires", make=lambda rows: wire_instances(plan.wires.take(rows), height=foot)),
     ]
-    solids = made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=height))
+    solids = made(barriers, "barriers", make=lambda rows: barrier_meshes(barriers.take(rows), height=foot))
     meshes += [mesh for some in solids for mesh in some]
     options = StructureOptions.of_relief(plan.relief)
     structures = made(

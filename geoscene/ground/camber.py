@@ -1,8 +1,10 @@
-"""The camber of carriageways: middles that stand above the edges, so that water runs off."""
+"""What the ground knows of roads with relief: the camber of carriageways, and where raised sidewalks end."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -11,6 +13,21 @@ from geoscene.typing import Float
 
 CAMBER = 0.025
 """Fall from the middle of a carriageway to its edges, m/m (RASt 06, RAL: the least crossfall is 2.5 %)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kerbs:
+    """Sidewalks that stand above carriageways.
+
+    ends : STRtree of lines across roads at which they come down, as bridges and tunnels are level
+    """
+
+    ends: shapely.STRtree
+
+    @classmethod
+    def of(cls, ends: Iterable[Any] = ()) -> Kerbs:
+        """Kerbs with such lines."""
+        return cls(shapely.STRtree(np.fromiter(ends, object)))
 
 
 @dataclass(frozen=True, slots=True)

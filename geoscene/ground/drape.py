@@ -109,8 +109,8 @@ def drape(
     """
     x, y = triangles.points.T
     z = np.zeros(len(x)) if height is None else np.array(height(x, y), float)
-    if plan.kerbs:
-        z += kerb_heights(plan, cells, triangles=triangles)
+    if plan.kerbs is not None:
+        z += kerb_heights(plan, plan.kerbs, cells=cells, triangles=triangles)
     if plan.camber is not None:
         z += plan.camber.height(triangles.points)
     if levels is not None:

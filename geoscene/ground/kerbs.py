@@ -2,13 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.ground.layers import KERBS, LOWERED, RAMPS, SIDEWALKS, Layers
+from geoscene.columns import Columns
+from geoscene.ground.camber import Kerbs
+from geoscene.ground.layers import (
+    FLUSH,
+    KERB_ENDS,
+    KERBS,
+    LOWERED,
+    RAISED,
+    RAMPS,
+    SIDEWALK_ENDS,
+    SIDEWALKS,
+    Layers,
+)
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
 from geoscene.typing import Bools, Float
@@ -22,9 +35,15 @@ _BESIDE = 0.5
 _RAMP = 1.0
 """Metres over which a kerb comes down."""
 
+_END = 2.0
+"""Metres over which sidewalks come down to the decks of bridges and the floors of tunnels."""
+
+_MAPPED = 1.5
+"""Metres around a mapped kerb that are as it says. Assumed: half the width of a crossing."""
+
 _AROUND = 2.0**-6
 _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
-_FLUSH = (
+_LEVEL = (
     Class.ROAD,
     Class.LANE_MARKING,
     Class.CROSSING,
@@ -35,21 +54,75 @@ _FLUSH = (
 )
 
 
-def lowered_kerbs(surfaces: Layers) -> Layers:
+@dataclass(frozen=True, slots=True)
+class MappedKerbs(Columns):
+    """Kerbs that the map describes.
+
+    point : (n,) shapely Point, scene metres
+    kind  : (n,) str: ``raised``, ``lowered`` or ``flush``
+    crossing : (n,) bool, the point is the node of a crossing, whose two kerbs it describes
+    """
+
+    point: NDArray[np.object_]
+    kind: NDArray[np.str_]
+    crossing: Bools
+
+    @classmethod
+    def empty(cls) -> MappedKerbs:
+        """None."""
+        return cls(np.empty(0, object), np.empty(0, "U8"), np.empty(0, np.bool_))
+
+
+_KINDS = {"raised": RAISED, "lowered": LOWERED, "flush": FLUSH}
+
+
+def lowered_kerbs(surfaces: Layers, *, mapped: MappedKerbs | None = None) -> Layers:
     """Rows for the parts of kerbs beside crossings, and for the ramps up from there and from driveways.
 
-    They lie above the kerbs themselves and have their features.
+    They lie above the kerbs themselves and have their features. Kerbs are lowered at crossings, unless they
+    are mapped otherwise.
     """
+    mapped = mapped or MappedKerbs.empty()
     kerbs = surfaces.take(np.flatnonzero(surfaces.priority == KERBS))
     crossings = surfaces.take(np.flatnonzero(surfaces.klass == Class.CROSSING))
     roads = surfaces.take(np.flatnonzero(surfaces.klass == Class.ROAD))
-    return Layers.concatenate(
-        [
-            _near(kerbs, crossings, metres=_BESIDE, priority=LOWERED),
-            _near(kerbs, crossings, metres=_BESIDE + _RAMP, priority=RAMPS),
-            _near(kerbs, roads, metres=_RAMP, priority=RAMPS),
-        ]
-    )
+    rows = [
+        _near(kerbs, crossings, metres=_BESIDE, priority=LOWERED),
+        _near(kerbs, crossings, metres=_BESIDE + _RAMP, priority=RAMPS),
+        _near(kerbs, roads, metres=_RAMP, priority=RAMPS),
+    ]
+    crossing_tree = shapely.STRtree(crossings.polygon)
+    for kind, priority in _KINDS.items():
+        of_crossing = mapped.point[(mapped.kind == kind) & mapped.crossing]
+        beside = crossings.take(
+            np.unique(crossing_tree.query(of_crossing, predicate="dwithin", distance=1.0)[1])
+        )
+        local = shapely.buffer(mapped.point[(mapped.kind == kind) & ~mapped.crossing], _MAPPED - _BESIDE)
+        spots = Layers.of(local, klass=Class.CROSSING, material=0, priority=0.0)
+        for places in (beside, spots):
+            rows.append(_near(kerbs, places, metres=_BESIDE, priority=priority))
+            if kind != "raised":
+                rows.append(_near(kerbs, places, metres=_BESIDE + _RAMP, priority=RAMPS))
+    return Layers.concatenate(rows)
+
+
+def kerb_ends(surfaces: Layers, ends: NDArray[np.object_]) -> Layers:
+    """Rows for the ends of sidewalks and kerbs, which come down to level decks.
+
+    They lie above the sidewalks and kerbs themselves and have their features.
+
+    ends : (n,) lines across roads where bridges and tunnels begin, scene metres
+    """
+    rows = []
+    near = shapely.buffer(ends, _END, cap_style="flat")
+    for priority, above in ((SIDEWALKS, SIDEWALK_ENDS), (KERBS, KERB_ENDS)):
+        bands = surfaces.take(np.flatnonzero(surfaces.priority == priority))
+        end, band = shapely.STRtree(bands.polygon).query(near, predicate="intersects")
+        parts = shapely.buffer(shapely.intersection(near[end], bands.polygon[band]), 0.0)
+        some = shapely.area(parts) > 0.0
+        n = int(some.sum())
+        rows.append(replace(bands.take(band[some]), polygon=parts[some], priority=np.full(n, above)))
+    return Layers.concatenate(rows)
 
 
 def _near(kerbs: Layers, others: Layers, *, metres: float, priority: float) -> Layers:
@@ -64,7 +137,7 @@ def _near(kerbs: Layers, others: Layers, *, metres: float, priority: float) -> L
     return replace(kerbs.take(kerb[some]), polygon=parts[some], priority=np.full(int(some.sum()), priority))
 
 
-def kerb_heights(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Float:
+def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles: Triangles) -> Float:
     """Metres (n,) by which vertices of triangles are raised: on sidewalks and on the outside of kerbs.
 
     What touches a carriageway, water or a tunnel's mouth is not raised. The height of a vertex on a tile's
@@ -85,11 +158,18 @@ def kerb_heights(plan: GroundPlan, cells: Partition, *, triangles: Triangles) ->
 
     priority = values_at(plan.layers.priority, row, base=-1.0)
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
-    raised = touched(np.isin(priority, (SIDEWALKS, KERBS, RAMPS, LOWERED)))
+    raised = touched(((priority >= SIDEWALKS) & (priority <= SIDEWALK_ENDS)) | _is_kerb(priority))
     height = np.where(raised, KERB, 0.0)
     height[touched(priority == LOWERED)] = KERB_LOWERED
-    height[touched(np.isin(klass, _FLUSH))] = 0.0
+    height[touched((priority == FLUSH) | np.isin(klass, _LEVEL))] = 0.0
+    vertex, end = kerbs.ends.query(shapely.points(triangles.points), predicate="dwithin", distance=_END)
+    away = shapely.distance(shapely.points(triangles.points[vertex]), kerbs.ends.geometries[end])
+    np.minimum.at(height, vertex, KERB * away / _END)
     return height
+
+
+def _is_kerb(priority: Float) -> Bools:
+    return (priority >= KERBS) & (priority <= RAISED)
 
 
 def on_border(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Bools:
@@ -103,6 +183,10 @@ def on_border(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Bo
     return edge
 
 
-def count_lowered(layers: Layers) -> int:
-    """The number of lowered kerbs."""
-    return int((layers.priority == LOWERED).sum())
+def count_kerbs(layers: Layers) -> dict[str, int]:
+    """The numbers of kerbs that are lowered at crossings, or are what the map says."""
+    return {
+        "kerbs_lowered": int((layers.priority == LOWERED).sum()),
+        "kerbs_flush": int((layers.priority == FLUSH).sum()),
+        "kerbs_raised": int((layers.priority == RAISED).sum()),
+    }

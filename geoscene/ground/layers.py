@@ -17,8 +17,12 @@ from geoscene.typing import Float
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0
 """Lowest priorities of land cover, of road surfaces and of building pads."""
 
-SIDEWALKS, KERBS, RAMPS, LOWERED = 112.0, 120.0, 120.5, 121.0
-"""Priorities of the sidewalks and kerbs of carriageways, of kerbs that come down, and of lowered ones."""
+SIDEWALKS, SIDEWALK_ENDS = 112.0, 112.25
+"""Priorities of the sidewalks of carriageways, and of their ends before bridges and tunnels."""
+
+KERBS, KERB_ENDS, RAMPS, LOWERED, FLUSH, RAISED = 120.0, 120.25, 120.5, 121.0, 121.25, 121.5
+"""Priorities of kerbs: of carriageways, of ends before bridges and tunnels, of kerbs that come down, and of
+those that are lowered, flush, or mapped as raised."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
-from geoscene.ground.camber import Camber
+from geoscene.ground.camber import Camber, Kerbs
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.typing import Bools, Float, Ints
@@ -64,7 +64,7 @@ class GroundPlan:
     tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
                 `geoscene.ground.joined` has joined it to others
     span      : (t,) int64, squares along a side of the tile that each square is part of: 1, or a power of two
-    kerbs     : whether sidewalks of carriageways are raised above them
+    kerbs     : by which sidewalks are raised above carriageways, None for level ones
     camber    : by which the middles of carriageways are, None for level ones
     """
 
@@ -84,7 +84,7 @@ class GroundPlan:
     offset: Ints
     tiles: Ints
     span: Ints
-    kerbs: bool = False
+    kerbs: Kerbs | None = None
     camber: Camber | None = None
 
 
@@ -124,7 +124,7 @@ def plan_ground(
     coarse: float = 0.0,
     relief: Relief | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
-    kerbs: bool = False,
+    kerbs: Kerbs | None = None,
     camber: Camber | None = None,
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
@@ -136,7 +136,7 @@ def plan_ground(
     coarse : spacing of the lines in other tiles, 0 for none
     relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
     base   : class and material where no polygon lies
-    kerbs  : whether sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
+    kerbs  : by which sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
     camber : of carriageways; their halves must be layers of their own (`geoscene.roadgraph.camber`)
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.ground import Layers, ground_tile, plan_ground
-from geoscene.ground.camber import CAMBER
+from geoscene.ground.camber import CAMBER, Kerbs
 from geoscene.ground.kerbs import lowered_kerbs
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
@@ -39,7 +39,7 @@ def meshes(places, ways, *, tile_size=60.0, height=None):
     crowns = find_crowns(table)
     halves = crown_rows(table, crowns, surfaces=layers, first=made.first)
     layers = Layers.concatenate([layers, lowered_kerbs(layers), halves])
-    plan = plan_ground(EXTENT, layers, tile_size=tile_size, kerbs=True, camber=camber_of(table, crowns))
+    plan = plan_ground(EXTENT, layers, tile_size=tile_size, kerbs=Kerbs.of(), camber=camber_of(table, crowns))
     return [ground_tile(plan, int(i), j=int(j), height=height) for i, j in plan.tiles]
 
 

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
 from geoscene.ground import ground_tile, plan_ground
-from geoscene.ground.kerbs import KERB, KERB_LOWERED, lowered_kerbs
+from geoscene.ground.camber import Kerbs
+from geoscene.ground.kerbs import KERB, KERB_LOWERED, MappedKerbs, kerb_ends, lowered_kerbs
 from geoscene.ground.layers import KERBS, SIDEWALKS, Layers
 
 EXTENT = (0.0, 0.0, 120.0, 60.0)
@@ -23,7 +24,7 @@ def rows(shape, klass, material, priority):
     return Layers.of([shape], klass=klass, material=code, priority=priority, feature=int(priority))
 
 
-def street(line=STREET, path=PATH):
+def street(line=STREET, path=PATH, *, mapped=None, ends=()):
     """A street with a crossing, and a footway away from it."""
     here, there = line.interpolate(CROSSING_AT), line.interpolate(CROSSING_AT + 3.0)
     strip = shapely.LineString([here, there]).buffer(HALF, cap_style="flat")
@@ -36,11 +37,12 @@ def street(line=STREET, path=PATH):
             rows(strip, Class.CROSSING, "asphalt", 160.0),
         ]
     )
-    return Layers.concatenate([surfaces, lowered_kerbs(surfaces)])
+    ends = np.fromiter(ends, object)
+    return Layers.concatenate([surfaces, lowered_kerbs(surfaces, mapped=mapped), kerb_ends(surfaces, ends)])
 
 
-def tiles(layers, *, kerbs, height=None):
-    plan = plan_ground(EXTENT, layers, tile_size=40.0, kerbs=kerbs)
+def tiles(layers, *, kerbs, height=None, ends=()):
+    plan = plan_ground(EXTENT, layers, tile_size=40.0, kerbs=Kerbs.of(ends) if kerbs else None)
     return [ground_tile(plan, int(i), j=int(j), height=height) for i, j in plan.tiles]
 
 
@@ -103,3 +105,33 @@ def test_tiles_meet_on_their_borders_and_have_no_holes(seed):
 def test_relief_decides_on_kerbs(kerbs):
     z = np.concatenate([m.vertices[:, 2] for m in tiles(street(), kerbs=kerbs)])
     assert (z.max() > 0) == kerbs
+
+
+@pytest.mark.parametrize(("kind", "rise"), [("raised", KERB), ("lowered", KERB_LOWERED), ("flush", 0.0)])
+@pytest.mark.parametrize("crossing", [True, False])
+def test_mapped_kerbs_have_the_height_of_their_tag(kind, rise, crossing):
+    at = CROSSING_AT + (1.5 if crossing else 30.0)
+    middle = STREET if crossing else shapely.offset_curve(STREET, HALF + BAND / 2)
+    spot = middle.interpolate(at)  # the node of the crossing, or a kerb away from crossings
+    mapped = MappedKerbs(np.array([spot], object), np.array([kind]), np.array([crossing]))
+    kerb = heights(tiles(street(mapped=mapped), kerbs=True), Class.KERB)
+    places = shapely.points(kerb[:, :2])
+    outside = shapely.distance(STREET, places) > HALF + BAND - 0.01
+    near = outside & (shapely.distance(spot, places) < (5.0 if crossing else 1.6))
+    near &= np.abs(shapely.line_locate_point(STREET, places) - STREET.project(spot)) < 2.1
+    assert near.sum() >= 2
+    np.testing.assert_allclose(kerb[near, 2], rise, atol=1e-9)
+
+
+def test_sidewalks_come_down_to_level_decks():
+    x = 80.0
+    end = shapely.LineString([(x, 20.0), (x, 38.0)])
+    meshes = tiles(street(ends=[end]), kerbs=True, ends=[end])
+    walk = heights(meshes, Class.SIDEWALK)
+    walk = walk[shapely.distance(STREET, shapely.points(walk[:, :2])) < HALF + BAND + WALK + 0.01]
+    away = np.abs(walk[:, 0] - x)
+    assert (walk[away < 0.01, 2] < 1e-3).all()
+    assert (away < 0.01).sum() >= 2
+    far = (away > 1.99) & (away < 15.0)
+    np.testing.assert_allclose(walk[far, 2], KERB, atol=1e-3)
+    assert ((away > 1.99) & (away < 2.01)).sum() >= 4

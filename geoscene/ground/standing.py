@@ -1,0 +1,51 @@
+"""Heights of the surface that objects stand on: sidewalks and crowns included."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from geoscene.classes import Class
+from geoscene.ground.kerbs import KERB
+from geoscene.ground.layers import SIDEWALKS
+from geoscene.ground.partition import GroundPlan, rows_at, values_at
+from geoscene.mesh import Mesh
+from geoscene.typing import Float, Height
+
+_NO_FLOOR = (Class.WATER, Class.TUNNEL)
+
+
+def standing_height(plan: GroundPlan, height: Height | None, *, ground: Mesh | None = None) -> Height | None:
+    """Metres of z (n,) at which objects stand at places x, y (n,); ``height`` itself without kerbs.
+
+    On the ground of a tile it is that of its faces, save in water; elsewhere it is ``height``, on raised
+    sidewalks higher by a kerb.
+
+    height : of the ground at the edges of carriageways, None if it is 0 everywhere
+    ground : faces of the tile's ground, scene metres
+    """
+    if plan.kerbs is None:
+        return height
+    floor = None if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
+    corners = np.empty((0, 3, 3)) if floor is None else floor.vertices[floor.faces]
+    tree = shapely.STRtree(shapely.polygons(corners[..., :2]) if len(corners) else [])
+
+    def standing(x: Float, y: Float) -> Float:
+        xy = np.column_stack([x, y])
+        z = np.zeros(len(xy)) if height is None else np.array(height(x, y), float)
+        point, face = tree.query(shapely.points(xy), predicate="intersects")
+        beyond = np.setdiff1d(np.arange(len(xy)), point)
+        priority = values_at(plan.layers.priority, rows_at(plan, xy[beyond]), base=-1.0)
+        z[beyond] += np.where(priority == SIDEWALKS, KERB, 0.0)
+        z[point] = _heights(corners[face], xy[point])
+        return z
+
+    return standing
+
+
+def _heights(corners: Float, xy: Float) -> Float:
+    """Height (n,) of each face (n, 3, 3) at a point (n, 2)."""
+    a = corners[:, 0]
+    normal = np.cross(corners[:, 1] - a, corners[:, 2] - a)
+    z: Float = a[:, 2] - ((xy - a[:, :2]) * normal[:, :2]).sum(axis=1) / normal[:, 2]
+    return z
