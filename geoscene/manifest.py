@@ -12,7 +12,7 @@ import shapely
 from geoscene import __version__
 from geoscene.frames import wrapped
 from geoscene.ground import tile_span
-from geoscene.ground.kerbs import count_kerbs
+from geoscene.ground.kerbs import count_covers, count_kerbs
 from geoscene.limits import height_limit, places, scale_limit
 from geoscene.objects.shapes import leaf_area_density
 from geoscene.plan import Plan
@@ -185,14 +185,21 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
-        "camber_km": round(plan.ground.camber.metres / 1000, 3) if plan.ground.camber else 0.0,
+        "camber_km": _camber_km(plan),
         **count_kerbs(plan.ground.layers),
+        **count_covers(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
         "wires": _tally(plan.wires.kind),
         "roofs_guessed": dict(sorted(roofs.items())),
         "facades": dict(sorted(facades.items())),
         **_facade_tallies(plan),
     }
+
+
+def _camber_km(plan: Plan) -> float:
+    """Kilometres of carriageway in the extent that have a camber."""
+    camber = plan.ground.camber
+    return 0.0 if camber is None else round(camber.metres(plan.extent) / 1000, 3)
 
 
 def _facade_tallies(plan: Plan) -> dict[str, dict[str, int]]:

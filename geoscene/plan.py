@@ -96,6 +96,11 @@ _TOLERANCE = 0.01  # of the distance between heights: maximum error of bare grou
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
 _ARM = 10.0  # metres, maximum horizontal extent of lamps and signals from their position
+_COVERS: dict[str, Literal["none", "mapped", "guessed"]] = {
+    "off": "none",
+    "plain": "mapped",
+    "full": "guessed",
+}
 _MOVED = 40.0  # metres, more than trees and furniture are moved by and keep from other features
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
@@ -241,7 +246,7 @@ def make_plan(
     facades = None
     if options.relief != "off":
         facades = read_setting(osm, frame, buildings=buildings, streets=edge_lines(roads.graph))
-    standing = standing_height(ground, local.height)
+    surface = standing_height(ground, local.height)
     layers = [
         *building_layers(
             buildings, base, parapet=None if rooftops is None else rooftops.parapet, facades=facades
@@ -249,8 +254,8 @@ def make_plan(
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
-        tree_layer(trees, _foot(trees.xy, standing), relief=options.relief != "off"),
-        furniture_layer(furniture, _foot(furniture.xy, standing), relief=options.relief != "off"),
+        tree_layer(trees, _foot(trees.xy, surface), relief=options.relief != "off"),
+        furniture_layer(furniture, _foot(furniture.xy, surface), relief=options.relief != "off"),
         barrier_layer(barriers),
         structure_layer(structures),
     ]
@@ -415,7 +420,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
         roads.graph,
         frame=frame,
         roads=roads.carriageways,
-        options=SurfaceOptions(left_hand=roads.side == "left"),
+        options=SurfaceOptions(left_hand=roads.side == "left", covers=_COVERS[options.relief]),
         area=area,
     )
     structures = _collect(

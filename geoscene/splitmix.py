@@ -25,3 +25,9 @@ def uniform_at(
         state = mix(state ^ (row.astype(np.uint64) * GOLDEN))
         draws = [mix(state + GOLDEN * np.uint64(k + 1)) >> np.uint64(11) for k in range(count)]
     return np.stack(draws) * 2.0**-53
+
+
+def number_of(osm_id: str) -> int:
+    """The number of an OSM id, by which guesses are drawn."""
+    digits = "".join(c for c in osm_id if c.isdigit())
+    return int(digits[-18:] or 0)

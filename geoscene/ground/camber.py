@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,10 +52,11 @@ class Camber:
         pieces = shapely.linestrings(np.stack([start, end], axis=1)) if len(start) else np.empty(0, object)
         return cls(start, end, half, crown, shapely.STRtree(pieces))
 
-    @property
-    def metres(self) -> float:
-        """Length of all pieces."""
-        return float(np.hypot(*(self.end - self.start).T).sum())
+    def metres(self, box: Sequence[float]) -> float:
+        """Length of the pieces whose middle lies in a box (xmin, ymin, xmax, ymax)."""
+        middle = (self.start + self.end) / 2
+        within = ((middle >= box[:2]) & (middle <= box[2:])).all(axis=1)
+        return float(np.hypot(*(self.end - self.start)[within].T).sum())
 
     def height(self, xy: Float) -> Float:
         """Metres (n,) by which the surface stands above the edges of its carriageway at points (n, 2).

@@ -12,10 +12,13 @@ from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.ground.camber import Kerbs
 from geoscene.ground.layers import (
+    COVERS,
     FLUSH,
+    GULLIES,
     KERB_ENDS,
     KERBS,
     LOWERED,
+    PATCHES,
     RAISED,
     RAMPS,
     SIDEWALK_ENDS,
@@ -85,7 +88,7 @@ def lowered_kerbs(surfaces: Layers, *, mapped: MappedKerbs | None = None) -> Lay
     mapped = mapped or MappedKerbs.empty()
     kerbs = surfaces.take(np.flatnonzero(surfaces.priority == KERBS))
     crossings = surfaces.take(np.flatnonzero(surfaces.klass == Class.CROSSING))
-    roads = surfaces.take(np.flatnonzero(surfaces.klass == Class.ROAD))
+    roads = surfaces.take(np.flatnonzero((surfaces.klass == Class.ROAD) & (surfaces.priority < PATCHES)))
     rows = [
         _near(kerbs, crossings, metres=_BESIDE, priority=LOWERED),
         _near(kerbs, crossings, metres=_BESIDE + _RAMP, priority=RAMPS),
@@ -190,3 +193,15 @@ def count_kerbs(layers: Layers) -> dict[str, int]:
         "kerbs_flush": int((layers.priority == FLUSH).sum()),
         "kerbs_raised": int((layers.priority == RAISED).sum()),
     }
+
+
+def count_covers(layers: Layers) -> dict[str, int]:
+    """The numbers of manhole covers, gullies and patches in carriageways, mapped and guessed."""
+    guessed = np.char.startswith(layers.source.astype(np.str_), "guess")
+    kinds = {"manholes": COVERS, "gullies": GULLIES, "patches": PATCHES}
+    counts = {}
+    for name, priority in kinds.items():
+        here = layers.priority == priority
+        counts[f"{name}_mapped"] = int((here & ~guessed).sum())
+        counts[f"{name}_guessed"] = int((here & guessed).sum())
+    return {name: count for name, count in counts.items() if count}

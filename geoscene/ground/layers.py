@@ -24,6 +24,9 @@ KERBS, KERB_ENDS, RAMPS, LOWERED, FLUSH, RAISED = 120.0, 120.25, 120.5, 121.0, 1
 """Priorities of kerbs: of carriageways, of ends before bridges and tunnels, of kerbs that come down, and of
 those that are lowered, flush, or mapped as raised."""
 
+PATCHES, COVERS, GULLIES = 152.0, 172.0, 172.5
+"""Priorities of patches in carriageways, which crossings and paint cover, of manhole covers and gullies."""
+
 
 @dataclass(frozen=True, slots=True)
 class Layers(Columns):

@@ -15,7 +15,7 @@ from geoscene.columns import Columns
 from geoscene.frames import Frame
 from geoscene.objects.siting import UNUSABLE, Sites
 from geoscene.sources.data import OsmData, Tags
-from geoscene.splitmix import uniform_at
+from geoscene.splitmix import number_of, uniform_at
 from geoscene.tags import parse_number
 from geoscene.typing import Bools, Float, Ints
 
@@ -122,12 +122,6 @@ def stands(tags: Tags, *, place: Float, heading: float, most: int) -> Float:
     along = (np.arange(count) - (count - 1) / 2) * 0.9
     row: Float = place + along[:, None] * [-np.sin(heading), np.cos(heading)]
     return row
-
-
-def number_of(osm_id: str) -> int:
-    """The number of an OSM id, by which guesses are drawn."""
-    digits = "".join(c for c in osm_id if c.isdigit())
-    return int(digits[-18:] or 0)
 
 
 @dataclass(frozen=True, slots=True)

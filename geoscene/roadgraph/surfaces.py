@@ -13,6 +13,7 @@ from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
+from geoscene.roadgraph.covers import cover_rows
 from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import JOINT, build_junctions, carriageway
@@ -36,10 +37,12 @@ class SurfaceOptions:
     sidewalks : ``urban`` gives paved streets in built-up areas (up to 60 km/h) sidewalks where the map has
                 neither a sidewalk tag nor a footway beside them; ``mapped`` gives them none
     left_hand : traffic keeps left
+    covers    : manhole covers and the like: none, the ``mapped`` ones, or also what is ``guessed``
     """
 
     sidewalks: Literal["mapped", "urban"] = "urban"
     left_hand: bool = False
+    covers: Literal["none", "mapped", "guessed"] = "none"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,10 @@ def road_surfaces(
     stops = stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand)
     taken = np.concatenate([strips, stops.polygon])
     symbols = symbol_rows(roads, stretches, edge=edge, taken=taken, left_hand=options.left_hand)
-    others = SurfaceRows.concatenate([crossings, lines, stops, rail_surfaces(osm, frame), symbols])
+    covers = []
+    if options.covers != "none":
+        covers = [cover_rows(osm, roads, frame=frame, guess=options.covers == "guessed")]
+    others = SurfaceRows.concatenate([crossings, lines, stops, rail_surfaces(osm, frame), symbols, *covers])
     paths.number[:] = np.arange(len(paths))
     others.number[:] = count + np.arange(len(others))
     rows = SurfaceRows.concatenate([paths, *carriageways, others])
