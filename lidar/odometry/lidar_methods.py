@@ -7,10 +7,10 @@ has if it moves on as in the sweep before (the motion compensation of Vizzo et a
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,8 +24,14 @@ from lidar.odometry.scans import Scans
 from lidar.odometry.settings import OdometrySettings
 
 _LEAST = 50  # points of a sweep, below which the vehicle moves on as before
-_SPEEDS = np.arange(0.0, 41.0, 2.0)  # m/s ahead, with which the first sweeps are tried
+_SPEEDS = np.arange(0.0, 41.0, 10.0)  # m/s ahead, from which the first motion is sought
+_ROUNDS = 4  # of de-skewing and alignment from each, at most
+_SAME = 0.02  # metres between motions that are the same
+_FIRST_VOXEL = 0.25  # metres: in larger ones, rings of two sweeps match wherever the vehicle is
+_CLEARLY = 1.05  # times as many points match at a greater speed that is preferred
 _OPEN = (0.1, 10.0)  # rad/s and m/s: standard deviations of the motion about these
+_UNSURE = 0.3  # metres: error of the expected motion with which KISS-ICP and GenZ-ICP begin
+_GENZ_POINTS = 4000  # of a sweep, which GenZ-ICP aligns: its 2000 are too few for the 64 rings of a street
 
 
 class _Registration(Protocol):
@@ -40,6 +46,15 @@ class _Registration(Protocol):
         """
 
 
+class _Method(Protocol):
+    """Begins the alignment of sweeps.
+
+    first : (4, 4) motion of the vehicle in the first sweep
+    """
+
+    def __call__(self, scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration: ...
+
+
 def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, progress: Progress) -> Estimate:
     """Poses of the vehicle at the ends of sweeps, relative to the first.
 
@@ -49,8 +64,8 @@ def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, pro
 
     Raises MissingExtraError without the package, and FormatError or DatasetError for damaged clouds.
     """
-    first = first_motion(scans, settings)
-    register = LIDAR_METHODS[method](scans, settings)
+    first = first_motion(scans)
+    register = LIDAR_METHODS[method](scans, settings, first=first)
     poses, information, counts, step = [np.eye(4)], [], [], first
     for k in range(len(scans)):
         points = _still_sweep(scans, k, motion=step)
@@ -93,24 +108,37 @@ def _report(scans: Scans, method: str, *, counts: Ints) -> dict[str, object]:
     }
 
 
-def first_motion(scans: Scans, settings: OdometrySettings) -> Float:
+def first_motion(scans: Scans) -> Float:
     """Motion (4, 4) of the vehicle in the first sweep.
 
-    The first two sweeps are de-skewed and aligned with several speeds ahead; that counts with which most
-    points match. An alignment without one errs by the skew of the sweeps, which is as long as the way.
+    The second sweep is aligned to the first with the motion by which both are de-skewed; what is found
+    de-skews them again, until it is the motion that it was found with. Such motions are sought from several
+    speeds ahead. That with which most points match counts, and of about equal ones the slowest: on a plane
+    all match.
+
+    An alignment without de-skewing errs by the skew of the sweeps, which is as long as the way.
 
     Raises MissingExtraError without small_gicp, and FormatError or DatasetError for damaged clouds.
     """
-    seconds, best, most = _seconds(scans), np.eye(4), 0.0
+    seconds = _seconds(scans)
     sigma = np.repeat(_OPEN, 3) * seconds
+    best, most, known = np.eye(4), 0.0, list[Float]()
     for speed in _SPEEDS:
-        step, local = np.eye(4), LocalMap("odometry", **_voxels(settings))
-        step[0, 3] = speed * seconds
-        first, second = (local.thinned(_still_sweep(scans, k, motion=step)) for k in (0, 1))
-        local.add(first, np.eye(4))
-        found = local.aligned(second, step, sigma=sigma)
-        if found is not None and found.matched > most:
-            best, most = found.pose, found.matched
+        motion, matched = np.eye(4), 0.0
+        motion[0, 3] = speed * seconds
+        for _ in range(_ROUNDS):
+            local = LocalMap("odometry", source_voxel=_FIRST_VOXEL, target_voxel=_FIRST_VOXEL)
+            first, second = (local.thinned(_still_sweep(scans, row, motion=motion)) for row in (0, 1))
+            local.add(first, np.eye(4))
+            found = local.aligned(second, motion, sigma=sigma)
+            if found is None:
+                break
+            known.append(motion[:3, 3])
+            motion, matched = found.pose, found.matched
+            if np.linalg.norm(motion[:3, 3] - known, axis=1).min() < _SAME:
+                break
+        if matched > _CLEARLY * most:
+            best, most = motion, matched
     return best
 
 
@@ -123,12 +151,18 @@ def _still_sweep(scans: Scans, row: int, *, motion: Float) -> Float:
     return still(points, share, motion=motion) if scans.period_ns else points
 
 
-def _kiss_icp(scans: Scans, settings: OdometrySettings) -> _Registration:
-    """Point to point with an adaptive threshold (Vizzo et al. 2023)."""
+def _kiss_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+    """Point to point with an adaptive threshold (Vizzo et al. 2023).
+
+    The threshold begins at what is open once the first motion is known. The package's own, 2 m, holds as
+    long as a vehicle moves evenly, and draws sweeps to the rings of the one before.
+    """
+    del first  # each sweep has its expected motion
     package, config_of = need("kiss_icp.kiss_icp", "odometry"), need("kiss_icp.config", "odometry")
     config = config_of.KISSConfig()
     config.data.max_range, config.data.min_range, config.data.deskew = scans.farthest, 0.0, False
     config.mapping.voxel_size = settings.voxel or scans.farthest / 100
+    config.adaptive_threshold.initial_threshold = _UNSURE
     config.registration.max_num_threads = 1  # sums of several threads differ from run to run
     odometry = package.KissICP(config)
 
@@ -140,23 +174,53 @@ def _kiss_icp(scans: Scans, settings: OdometrySettings) -> _Registration:
     return register
 
 
-def _genz_icp(scans: Scans, settings: OdometrySettings) -> _Registration:
-    """Point to point and point to plane, weighted by what surfaces are planar (Lee et al. 2025)."""
+def _genz_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+    """Point to point and point to plane, weighted by what surfaces are planar (Lee et al. 2025).
+
+    Its motion model is within it and begins at rest. So the first sweep goes before itself, as seen from
+    where the vehicle was a sweep earlier.
+    """
     package, config_of = need("genz_icp.genz_icp", "odometry"), need("genz_icp.config", "odometry")
     config = config_of.GenZConfig()
     config.data.max_range, config.data.min_range, config.data.deskew = scans.farthest, 0.0, False
     config.mapping.map_cleanup_radius = scans.farthest
+    config.mapping.desired_num_voxelized_points = _GENZ_POINTS
+    config.adaptive_threshold.initial_threshold = _UNSURE
     if settings.voxel:
         config.mapping.voxel_size = settings.voxel
+    _set_voxel(package.GenZICP, config_of.GenZConfig(), metres=config.mapping.voxel_size)
     odometry = package.GenZICP(config)
+    begin: list[Float] = []  # pose of the package's map
 
     def register(points: Float, last: Float, *, step: Float) -> tuple[Float, None]:
-        del last, step  # its motion model is within it
         with _one_core():
+            if not begin:
+                odometry.register_frame(points @ first[:3, :3].T + first[:3, 3], np.empty(0))
             odometry.register_frame(points, np.empty(0))
-        return np.array(odometry.last_pose), None
+        found = np.array(odometry.last_pose)
+        if not begin:
+            begin.append(last @ step @ np.linalg.inv(found))
+        return begin[0] @ found, None
 
     return register
+
+
+def _set_voxel(odometry_of: Any, config: Any, *, metres: float) -> None:
+    """Let GenZ-ICP begin with voxels of a size.
+
+    The package keeps their size in the process (a static variable), so that a run would depend on those
+    before it. It multiplies the size by the occupied voxels over those wanted, and keeps it above 2 cm: a
+    single point brings it there, and a lattice of points to where it should be.
+    """
+    least, wanted = 0.02, 50
+    config.data.min_range, config.data.deskew = 0.0, False
+    config.mapping.desired_num_voxelized_points = wanted
+    count = round(metres / least * wanted)
+    lattice = np.stack(np.unravel_index(np.arange(count), (20, 20, 1 + count // 400)), axis=1) * 0.05
+    with _one_core():
+        odometry = odometry_of(config)
+        for points in (lattice[:1], lattice[:1], lattice):
+            odometry.register_frame(points, np.empty(0))
 
 
 @contextmanager
@@ -177,9 +241,12 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _small_gicp(scans: Scans, settings: OdometrySettings) -> _Registration:
+def _small_gicp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
     """Point to plane to a map of planes, with the motion before as a prior (`lidar.odometry.local_map`)."""
-    local, sigma = LocalMap("odometry", **_voxels(settings)), _usual(scans, settings)
+    del first  # each sweep has its expected motion
+    side = settings.voxel or 0.25
+    local = LocalMap("odometry", source_voxel=2 * side, target_voxel=side)
+    sigma = _usual(scans, settings)
 
     def register(points: Float, last: Float, *, step: Float) -> tuple[Float, Float | None]:
         sweep, pose = local.thinned(points), last @ step
@@ -192,11 +259,6 @@ def _small_gicp(scans: Scans, settings: OdometrySettings) -> _Registration:
     return register
 
 
-def _voxels(settings: OdometrySettings) -> dict[str, float]:
-    side = settings.voxel or 0.5
-    return {"source_voxel": 2 * side, "target_voxel": side}
-
-
 def _usual(scans: Scans, settings: OdometrySettings) -> Float:
     """Standard deviations (6,) of the motion from a sweep to the next about that of the sweep before."""
     return np.repeat([settings.turn_acceleration, settings.acceleration], 3) * _seconds(scans) ** 2
@@ -206,7 +268,7 @@ def _seconds(scans: Scans) -> float:
     return 1.0 / float(scans.streams[0].sensor["rate_hz"])
 
 
-LIDAR_METHODS: dict[str, Callable[[Scans, OdometrySettings], _Registration]] = {
+LIDAR_METHODS: dict[str, _Method] = {
     "kiss-icp": _kiss_icp,
     "genz-icp": _genz_icp,
     "small_gicp": _small_gicp,

@@ -32,7 +32,7 @@ class OdometrySettings:
     )
     voxel: float = _setting(
         0.0,
-        "metres, of the map; 0: max_range / 100 (kiss-icp), 0.3 (genz-icp), 0.5 (small_gicp)",
+        "metres, of the map; 0: max_range / 100 (kiss-icp), 0.3 (genz-icp), 0.25 (small_gicp)",
         low=0,
         high=100,
     )

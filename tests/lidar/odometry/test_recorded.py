@@ -10,6 +10,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.trajectory_tum import write_tum
+from lidar.odometry.lidar_methods import first_motion
 from lidar.odometry.run import estimate_motion
 from lidar.odometry.scans import scans_of
 from lidar.options import OdometryOptions
@@ -97,6 +98,24 @@ def errors_by_evo(drive, estimate, tmp_path):
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data((reference, found))
     return error.error, reference.path_length
+
+
+@pytest.mark.parametrize("seed", [4, 7, 8])
+def test_the_first_motion_is_that_of_the_vehicle_not_of_its_rings(scene, tmp_path, seed):
+    """Rings of 64 lasers on level ground match at any speed; the vehicle is under way at the first sweep."""
+    lidar = '[[lidar]]\nname = "top"\npreset = "hdl64e_s3"\ntranslation = [0.8, 0.0, 1.7]\nrate_hz = 10.0\n'
+    (tmp_path / "rig.toml").write_text('name = "rings"\nvehicle = "car"\n' + lidar)
+    words = ("--route", "random", "--duration", 0.3, "--seed", seed, "--format", "pcd", "-q")
+    done = run_program(
+        "lidar", "drive", scene.path, *words, "--rig", tmp_path / "rig.toml", "-o", tmp_path / "d"
+    )
+    assert done.returncode == 0, done.stderr
+    drive = open_dataset(tmp_path / "d")
+    scans = scans_of(drive)
+    true = drive.trajectory().at(scans.time_ns[:2])
+    ahead = (true.position[1] - true.position[0]) @ true.rotation[0]
+    found = first_motion(scans)
+    np.testing.assert_allclose(found[:3, 3], ahead, atol=0.05)
 
 
 @pytest.mark.parametrize(("method", "share"), [("small_gicp", 0.01), ("orb+depth", 0.05), ("stereo", 0.05)])
