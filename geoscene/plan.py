@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings, read_buildings
 from geoscene.buildings.facades import Setting, read_setting
+from geoscene.buildings.tops import with_measured_tops
 from geoscene.errors import InputError
 from geoscene.features import (
     barrier_layer,
@@ -235,6 +236,7 @@ def make_plan(
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
     base[standing] = base_heights(footprints[standing], local.height)
+    buildings = with_measured_tops(buildings, base)
     foot[standing] = foundation_heights(
         footprints[standing], base[standing], height=local.height, layers=ground.layers, levels=local.levels
     )

@@ -12,7 +12,7 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.appearance import choose_appearance, read_roof, read_walls
 from geoscene.buildings.footprints import clean, groups, project
-from geoscene.buildings.heights import read_heights
+from geoscene.buildings.heights import CLOUD_TOP, read_heights
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
 from geoscene.buildings.resolve import Heights, Row, resolve_heights, texts
 from geoscene.buildings.roof_tags import read_roof_tags
@@ -234,6 +234,7 @@ def _table(
         roof_shape=texts([r.roof.shape for r in rows]),
         roof_direction=np.pi / 2 - azimuth,
         roof_across=np.array([r.roof.across for r in rows], np.bool_),
+        top=np.array([_measured_top(r, s) for r, s in zip(rows, heights.source, strict=True)], float),
         height_source=heights.source,
         height_sigma=heights.sigma,
         min_height_source=heights.low_source,
@@ -248,6 +249,11 @@ def _table(
         wall_source=texts([w.source for w in walls]),
         roof_look_source=texts([t.source for t in tops]),
     )
+
+
+def _measured_top(row: Row, source: str) -> float:
+    """Height z of the top of a row where a point cloud gave its height, else NaN."""
+    return float(row.tags.get(CLOUD_TOP, "nan")) if source == "cloud" else np.nan
 
 
 def _ranks(rows: Sequence[Row], heights: Heights) -> Ints:

@@ -55,6 +55,9 @@ CLOUD_ROOF = "cloud:roof"
 CLOUD_SIGMA = "cloud:height_sigma"
 """Tag of a height that was measured in a point cloud: its standard deviation in metres."""
 
+CLOUD_TOP = "cloud:top"
+"""Tag of a height that was measured in a point cloud: z of the top, metres in the datum of the scene."""
+
 SIGMA_TAG, SIGMA_EST, SIGMA_STOREYS = 0.5, 0.2, 0.15
 """Assumed standard deviations: metres for a tagged height, shares of it for est_height and storeys."""
 

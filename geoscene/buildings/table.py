@@ -59,6 +59,8 @@ class Buildings(Columns):
     roof_direction   : (n,) downslope direction of the roof's face, radians counter-clockwise from x, NaN if
                        not tagged
     roof_across      : (n,) bool, whether the ridge runs across the longer side
+    top              : (n,) z in metres of the top where a point cloud gave it, NaN elsewhere; ``height`` is
+                       then the top less the base (`geoscene.buildings.tops`)
     height_source    : (n,) str: cloud, tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)
@@ -86,6 +88,7 @@ class Buildings(Columns):
     roof_shape: Texts
     roof_direction: Float
     roof_across: Bools
+    top: Float
     height_source: Texts
     height_sigma: Float
     min_height_source: Texts

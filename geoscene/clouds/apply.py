@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import shapely
 
-from geoscene.buildings.heights import CLOUD_ROOF, CLOUD_SIGMA, THINNEST, read_heights
+from geoscene.buildings.heights import CLOUD_ROOF, CLOUD_SIGMA, CLOUD_TOP, THINNEST, read_heights
 from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.table import BuildingOptions
+from geoscene.clouds.levels import Body
 from geoscene.clouds.measure import Measured
 from geoscene.clouds.roofs import Roof
 from geoscene.errors import InputError
 from geoscene.frames import Frame
 from geoscene.objects.vegetation import CLOUD_TREE
 from geoscene.report import Problem
-from geoscene.sources.data import OsmData, Point, Tags
+from geoscene.sources.data import Area, OsmData, Point, Tags
 from geoscene.typing import Float, Ints
 
 _DISAGREES = 2.0  # metres between a tagged and a measured height that are reported
@@ -28,6 +30,7 @@ _MATCH = 2.0  # metres between a mapped and a found tree that are one, or half t
 _FEET = (2.9, 3.6)  # ratio of measured to tagged heights if feet were taken for metres
 _LEAST_COMPARED = 10  # buildings with tagged heights by which the unit is judged
 
+_NO_NODES: Ints = np.empty(0, np.int64)
 _HEIGHT_TAGS = ("building:height", "est_height")
 _ROOF_TAGS = (
     "building:roof:shape", "building:roof:height", "roof:direction", "roof:slope:direction",
@@ -54,23 +57,25 @@ def _with_buildings(
 ) -> tuple[OsmData, dict[str, Any], list[Problem]]:
     """The map with measured buildings, counts, and disagreements."""
     names = measured.buildings.osm_id[measured.rows].tolist()
-    found: dict[str, tuple[Roof, float]] = {}
-    for name, roof, base in zip(names, measured.roofs, measured.base.tolist(), strict=True):
-        if roof is not None and np.isfinite(base) and roof.top - base > THINNEST:
-            found.setdefault(name, (roof, base))
-    areas, problems, differences, ratios = list(osm.areas), [], [], []
+    found: dict[str, tuple[tuple[Body, ...], float]] = {}
+    for name, bodies, base in zip(names, measured.bodies, measured.base.tolist(), strict=True):
+        high = tuple(body for body in bodies if body.roof.top - base > THINNEST)
+        if len(high) == len(bodies) > 0 and np.isfinite(base):
+            found.setdefault(name, (bodies, base))
+    areas, added = list(osm.areas), []  # type: list[Area], list[Area]
+    problems, differences, ratios = [], [], []
     west, south, east, north = osm.bounds
     turn = float(measured.frame.convergence((west + east) / 2, (south + north) / 2))
     counts: Counter[str] = Counter(sought=len(names))
     for k, area in enumerate(areas):
         if area.osm_id not in found or not ({"building", "building:part"} & area.tags.keys()):
             continue
-        roof, base = found[area.osm_id]
-        height = roof.top - base
+        (first, *others), base = found[area.osm_id]
+        roof, height = first.roof, first.roof.top - base
         tagged = read_heights(area.tags, options=BuildingOptions())
         shape = read_roof_tags(area.tags)
-        keeps_height = prefer_tags and tagged.source in ("tag", "est_height")
-        keeps_roof = prefer_tags and not shape.assumed
+        keeps_height = (prefer_tags or not roof.shape) and tagged.source in ("tag", "est_height")
+        keeps_roof = not roof.shape or (prefer_tags and not shape.assumed)
         if tagged.source == "tag":
             differences.append(height - tagged.height)
             ratios.append(height / tagged.height)
@@ -78,33 +83,53 @@ def _with_buildings(
                 used = "tag" if keeps_height else "cloud"
                 detail = f"height {tagged.height:.1f} m tagged, {height:.1f} m measured; {used} used"
                 problems.append(Problem(area.osm_id, "building", "repaired", "cloud-height-differs", detail))
-        if not shape.assumed and shape.shape != roof.shape:
+        if roof.shape and not shape.assumed and shape.shape != roof.shape:
             counts["other_shape_than_tagged"] += 1
-        if roof.levels and roof.shape == "flat":
+        if roof.levels and roof.shape == "flat" and not others:
             levels = ", ".join(f"{z - base:.1f}" for z in roof.levels)
             detail = f"flat at {height:.1f} m, also at {levels} m; kept one body"
             problems.append(Problem(area.osm_id, "building", "repaired", "several-levels", detail))
+        if not roof.shape:
+            counts["without_shape"] += 1
+            made = "tagged height kept" if keeps_height else f"height {height:.1f} m"
+            detail = f"no roof shape explains the points; {made}"
+            problems.append(Problem(area.osm_id, "building", "repaired", "no-roof-shape", detail))
+        if others and not keeps_height:
+            counts["split"] += 1
+            added += _parts(area.osm_id, others, base=base, frame=measured.frame, turn=turn)
         counts["heights"] += not keeps_height
         counts["roofs"] += not keeps_roof
         tags = area.tags
         if not keeps_height:
             tags = _with_height(tags, height, roof=roof)
-        if not keeps_roof:
+        if not keeps_roof or (others and not keeps_height):
             tags = _with_roof(tags, roof, turn=turn)
         areas[k] = replace(area, tags=tags)
+    counts["parts_added"] = len(added)
     check_unit(ratios)
     counts["not_measured"] = len(names) - len(found)
-    sigma = [roof.sigma for roof, _ in found.values()]
+    roofs = [body.roof for bodies, _ in found.values() for body in bodies]
+    sigma = [roof.sigma for roof in roofs if roof.shape]
     about = {
         **dict(sorted(counts.items())),
-        "shapes": dict(sorted(Counter(roof.shape for roof, _ in found.values()).items())),
+        "shapes": dict(sorted(Counter(roof.shape for roof in roofs if roof.shape).items())),
         "sigma_m_median": _rounded(sigma, 50),
         "sigma_m_95": _rounded(sigma, 95),
         "tagged_compared": len(differences),
         "cloud_minus_tag_m_median": _rounded(differences, 50),
         "cloud_minus_tag_m_abs_95": _rounded(np.abs(differences).tolist(), 95),
     }
-    return replace(osm, areas=areas), about, problems
+    return replace(osm, areas=areas + added), about, problems
+
+
+def _parts(name: str, bodies: Sequence[Body], *, base: float, frame: Frame, turn: float) -> list[Area]:
+    """Areas of the bodies of a building besides its highest, as parts of it."""
+    areas = []
+    for k, (polygon, roof) in enumerate(bodies, 1):
+        tags = _with_height({"building:part": "yes"}, roof.top - base, roof=roof)
+        shape = shapely.transform(polygon, lambda xy: np.column_stack(frame.to_geographic(*xy.T)))
+        areas.append(Area(f"cloud:{name}_{k}", _with_roof(tags, roof, turn=turn), shape, _NO_NODES))
+    return areas
 
 
 def check_unit(ratios: list[float]) -> None:
@@ -123,7 +148,11 @@ def check_unit(ratios: list[float]) -> None:
 
 def _with_height(tags: Tags, height: float, *, roof: Roof) -> Tags:
     kept = {key: value for key, value in tags.items() if key not in _HEIGHT_TAGS}
-    return kept | {"height": f"{height:.3f}", CLOUD_SIGMA: f"{max(roof.sigma, 0.001):.3f}"}
+    return kept | {
+        "height": f"{height:.3f}",
+        CLOUD_SIGMA: f"{max(roof.sigma, 0.001):.3f}",
+        CLOUD_TOP: f"{roof.top:.3f}",
+    }
 
 
 def _with_roof(tags: Tags, roof: Roof, *, turn: float) -> Tags:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from geoscene.clouds.read import GROUND
@@ -130,9 +131,13 @@ def bridged(heights: Float) -> Float:
     filled = heights[row, column]
     rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
     if len(rim) > 3 and np.ptp(rim, axis=0).all():
-        holes = np.nonzero(gap)
-        linear = LinearNDInterpolator(rim, heights[tuple(rim.T)])(np.column_stack(holes))
-        filled[holes] = np.where(np.isnan(linear), filled[holes], linear)
+        holes = np.column_stack(np.nonzero(gap))
+        hull = shapely.convex_hull(shapely.multipoints(rim))
+        shapely.prepare(hull)
+        holes = holes[shapely.intersects_xy(hull, *holes.T)]  # beyond it the search would be exhaustive
+        linear = LinearNDInterpolator(rim, heights[tuple(rim.T)])(holes)
+        inside = ~np.isnan(linear)
+        filled[tuple(holes[inside].T)] = linear[inside]
     return np.asarray(filled, float)
 
 

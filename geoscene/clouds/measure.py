@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import shapely
@@ -13,14 +14,17 @@ from geoscene.buildings import Buildings
 from geoscene.clouds import shift as shifts
 from geoscene.clouds import trees as canopy
 from geoscene.clouds.ground import MARGIN, Grid, ground_heights
+from geoscene.clouds.levels import Body, split_bodies
 from geoscene.clouds.read import GROUND, VEGETATION
-from geoscene.clouds.roofs import Roof, fit_roof, roof_points
+from geoscene.clouds.roofs import block_of, fit_roof, roof_points
 from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
 from geoscene.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
 from geoscene.processes import run_tasks
 from geoscene.progress import Progress
 from geoscene.typing import Bools, Float
+
+T = TypeVar("T")
 
 _INSET = 0.5  # metres from a wall within which points are not taken for the roof: georeferencing, walls
 _HIGH = 2.5  # metres above the ground that buildings are told by when the shift is sought
@@ -47,10 +51,10 @@ class GroundOf(NamedTuple):
 
 
 class _Objects(NamedTuple):
-    """Roofs by row of the buildings, and trees, of a square."""
+    """Bodies by row of the buildings, and trees, of a square."""
 
     square: Square
-    roofs: list[tuple[int, Roof | None]]
+    bodies: list[tuple[int, tuple[Body, ...]]]
     trees: canopy.Found
 
 
@@ -61,7 +65,8 @@ class Measured:
     frame     : of the scene
     buildings : table of the map before the measurement
     rows      : (k,) rows of buildings that were sought
-    roofs     : of those rows, None where too few points lie on the roof or no shape fits
+    bodies    : of those rows: one, or several where the roof steps, the highest first; none where too few
+                points lie on the roof
     base      : (k,) z of the lowest ground along their outlines
     trees     : all that were found
     """
@@ -69,7 +74,7 @@ class Measured:
     frame: Frame
     buildings: Buildings
     rows: list[int]
-    roofs: list[Roof | None]
+    bodies: list[tuple[Body, ...]]
     base: Float
     trees: canopy.Found
 
@@ -124,6 +129,11 @@ def _points(work: Work, square: Square, *, margin: float) -> tuple[Points, int]:
     return kept.take((x >= x0) & (x < x1) & (y >= y0) & (y < y1)), int(within[0] - within[1])
 
 
+def _run(work: Callable[[Square], T], squares: Sequence[Square], *, workers: int) -> Iterator[T]:
+    """The results of all squares; with one worker by this process, as starting another takes seconds."""
+    return run_tasks(work, squares, workers=workers) if workers > 1 else map(work, squares)
+
+
 def grounds_of(work: Work, *, workers: int, progress: Progress) -> list[GroundOf]:
     """The ground of all squares, sorted."""
     low, high = (
@@ -132,7 +142,7 @@ def grounds_of(work: Work, *, workers: int, progress: Progress) -> list[GroundOf
     )
     squares = [(i, j) for i in range(low[0], high[0] + 2) for j in range(low[1], high[1] + 2)]
     found = []
-    for done, ground in enumerate(run_tasks(partial(_ground_of, work), squares, workers=workers), 1):
+    for done, ground in enumerate(_run(partial(_ground_of, work), squares, workers=workers), 1):
         found.append(ground)
         progress("ground of the cloud", done, total=len(squares))
     return sorted(found, key=lambda ground: ground.square)
@@ -191,21 +201,22 @@ def measure(
         whole=buildings.footprint[rows],
         base=base,
         names=buildings.osm_id[rows],
+        single=~buildings.is_part[rows],
         mine=mine,
         terrain=terrain,
     )
     found: list[_Objects] = []
-    for done, some in enumerate(run_tasks(shape, tasks, workers=workers), 1):
+    for done, some in enumerate(_run(shape, tasks, workers=workers), 1):
         found.append(some)
         progress("buildings and trees of the cloud", done, total=len(tasks))
     found.sort(key=lambda some: some.square)
-    roofs = dict(pair for some in found for pair in some.roofs)
+    bodies = dict(pair for some in found for pair in some.bodies)
     trees = [some.trees for some in found]
     return Measured(
         frame,
         buildings,
         rows.tolist(),
-        [roofs.get(k) for k in range(len(rows))],
+        [bodies.get(k, ()) for k in range(len(rows))],
         base,
         canopy.Found(
             *(np.concatenate([getattr(t, name) for t in trees]) for name in ("xy", "height", "crown"))
@@ -237,6 +248,7 @@ def _objects_of(
     whole: Any,
     base: Float,
     names: Any,
+    single: Bools,
     mine: dict[Square, list[int]],
     terrain: Terrain,
 ) -> _Objects:
@@ -253,15 +265,29 @@ def _objects_of(
     points, _ = _points(work, square, margin=max(reach, canopy.MARGIN))
     order = np.argsort(points.xyz[:, 0], kind="stable")
     points = points.take(order)
-    roofs = []
+    bodies = []
     solid = ~np.isin(points.klass, _NO_ROOF)
     for k in own:
         xmin, _, xmax, _ = shapely.bounds(outlines[k])
         a, b = np.searchsorted(points.xyz[:, 0], (xmin, xmax))
         some = points.xyz[a:b][solid[a:b] & (points.xyz[a:b, 2] > base[k] + _LOWEST_ROOF)]
         some = some[roof_points(outlines[k], some, inset=_INSET)]
-        roofs.append((k, fit_roof(whole[k], some, seed=str(names[k]))))
-    return _Objects(square, roofs, _trees_of(work, square, points=points, terrain=terrain))
+        bodies.append((k, _bodies_of(whole[k], some, seed=str(names[k]), split=bool(single[k]))))
+    return _Objects(square, bodies, _trees_of(work, square, points=points, terrain=terrain))
+
+
+def _bodies_of(polygon: Any, xyz: Float, *, seed: str, split: bool) -> tuple[Body, ...]:
+    """Bodies of a footprint by the points (n, 3) above it: one where a roof explains them, else pieces.
+
+    split : whether it may be cut: a part of the map, or what parts leave of an outline, stays whole
+    """
+    roof = fit_roof(polygon, xyz, seed=seed)
+    if split and polygon.geom_type == "Polygon" and (roof is None or roof.levels):
+        bodies = split_bodies(polygon, xyz, inset=_INSET / 2, seed=seed)
+        if bodies:
+            return bodies
+    roof = roof or block_of(polygon, xyz)
+    return () if roof is None else (Body(polygon, roof),)
 
 
 def _trees_of(work: Work, square: Square, *, points: Points, terrain: Terrain) -> canopy.Found:

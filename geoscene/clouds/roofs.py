@@ -27,6 +27,7 @@ _PAIRS = 60  # hypotheses of two points for each shape
 _OFF = 0.3  # metres from which a point does not count: chimneys, dormers, trees
 _NOISE = 0.03  # metres of noise that are always assumed, so that no shape wins by fitting noise
 _INDEPENDENT = 150  # points that count as independent at most: neighbours have their errors in common
+_BLOCK = 70.0  # percentile of the points on a roof without a shape that is its height
 _LEAST_ROOF, _MOST_ROOF = 0.4, 40.0  # metres of a pitched roof
 _STEEPEST = 3.0  # height of a roof over the radius of the footprint, at most
 
@@ -45,7 +46,7 @@ class Roof:
 
     top       : z of its highest point, metres
     height    : metres of the roof alone, 0 if flat
-    shape     : one of `geoscene.buildings.table.SHAPES`
+    shape     : one of `geoscene.buildings.table.SHAPES`; "" if no shape explains the points (`block_of`)
     direction : radians counter-clockwise from x, downslope; NaN for shapes without a direction
     across    : the ridge runs across the longer side
     sigma     : metres, standard deviation of the points about the fit
@@ -99,6 +100,22 @@ def fit_roof(polygon: Any, xyz: Float, *, seed: str) -> Roof | None:
     if best is flat and not _covers(flat, xyz[np.abs(z - flat.top) < _OFF], polygon=polygon, among=len(xyz)):
         return None
     return best
+
+
+def block_of(polygon: Any, xyz: Float) -> Roof | None:
+    """The height alone of points (n, 3) that no roof shape explains; None if they are too few or on one side.
+
+    The top is their 70th percentile, as that of the blocks of the 3D BAG (Peters et al. 2022); ``sigma`` is
+    their root mean square distance from it.
+    """
+    if len(xyz) < FEWEST:
+        return None
+    top = float(np.percentile(xyz[:, 2], _BLOCK))
+    error = xyz[:, 2] - top
+    sigma = float(np.sqrt(np.square(error).mean()))
+    share = float((np.abs(error) < _OFF).mean())
+    block = Roof(top, 0.0, "", np.nan, False, sigma, share)
+    return block if _covers(block, xyz, polygon=polygon, among=len(xyz)) else None
 
 
 def _score(roof: Roof, error: Float, *, parameters: int) -> float:

@@ -1,8 +1,10 @@
 """A village measured in a cloud: heights, roofs, trees and ground, by any number of processes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
+import pyogrio
 import pytest
 import shapely
 from helpers.clouds import write_las
@@ -15,7 +17,7 @@ from geoscene.frames import Frame
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build
-from geoscene.sources.data import Area, OsmData, Point
+from geoscene.sources.data import Area, OsmData, Point, Way
 
 CENTRE = (9.5, 47.1)
 FRAME = Frame.at(*CENTRE)
@@ -155,6 +157,67 @@ def test_a_shift_between_map_and_cloud_is_reported_and_removed_on_request(tmp_pa
         assert shift["applied"] is align
     assert tags_of(osm)["way/1"]["roof:shape"] == "gabled"
     assert float(tags_of(osm)["way/1"]["height"]) == pytest.approx(9.0, abs=0.15)
+
+
+def test_tops_lie_where_the_cloud_saw_them_on_ground_that_a_road_has_moved(cloud_file, tmp_path):
+    # the road levels the slope across its width and on its shoulders, where way/1 stands
+    lon, lat = FRAME.to_geographic(np.array([-41.0, -41.0]), np.array([-45.0, 45.0]))
+    road = Way("way/9", {"highway": "residential"}, np.arange(2), np.column_stack([lon, lat]))
+    osm, options = measured(village_map(), cloud_file, tmp_path)
+    scene = build(replace(osm, ways=[road]), tmp_path / "scene", options=options)
+    rows = pyogrio.read_dataframe(scene.files.features, layer="buildings").set_index("osm_id")
+    moved = []
+    for name in ("way/1", "way/2", "way/3"):
+        _, _, eaves, rise, _ = HOUSES[name]
+        top = rows.base[name] + rows.height[name]
+        assert top == pytest.approx(float(tags_of(osm)[name]["cloud:top"]), abs=0.002)
+        assert top == pytest.approx(base(name) + eaves + rise, abs=0.1)
+        moved.append(abs(rows.base[name] - base(name)))
+    assert max(moved) > 0.1
+
+
+def two_level_village():
+    """The map with way/5, a tower of 12 m and a hall of 5 m in one outline, and points of it."""
+    rng = np.random.default_rng(4)
+    corners = np.array([(0, -40), (0, -30), (24, -30), (24, -40)], float)
+    shape = shapely.Polygon(np.column_stack(FRAME.to_geographic(*corners.T)))
+    osm = village_map()
+    xyz = village_cloud()
+    inside = ((xyz[:, :2] > (0, -40)) & (xyz[:, :2] < (24, -30))).all(axis=1)
+    xy = rng.uniform((0, -40), (24, -30), (2500, 2))
+    z = ground(0.0) + np.where(xy[:, 0] < 8, 12.0, 5.0) + rng.normal(0, 0.02, len(xy))
+    points = np.concatenate([xyz[~inside], np.column_stack([xy, z])])
+    return replace(osm, areas=[*osm.areas, Area("way/5", {"building": "yes"}, shape, NO_NODES)]), points
+
+
+def test_an_outline_over_a_tower_and_a_hall_becomes_two_parts(tmp_path):
+    osm, points = two_level_village()
+    osm, options = measured(osm, las_of(points, tmp_path / "two.laz"), tmp_path)
+    assert osm.cloud["buildings"]["split"] == osm.cloud["buildings"]["parts_added"] == 1
+    scene = build(osm, tmp_path / "scene", options=options)
+    rows = pyogrio.read_dataframe(scene.files.features, layer="building_parts")
+    heights = dict(zip(rows.osm_id, rows.height, strict=True))
+    assert heights == pytest.approx({"way/5": 12.0, "cloud:way/5_1": 5.0}, abs=0.1)
+    assert set(rows.height_source) == {"cloud"}
+    areas = rows.to_crs(FRAME.crs.to_wkt()).area.tolist()
+    assert sorted(areas) == pytest.approx([80.0, 160.0], rel=0.05)
+    assert scene.manifest["counts"]["watertight"] == scene.manifest["counts"]["closed_objects"]
+
+
+def test_points_that_no_roof_explains_give_heights_only_where_tags_give_none(tmp_path):
+    osm, points = two_level_village()
+    rng = np.random.default_rng(5)
+    heap = (points[:, :2] > (0, -40)).all(axis=1) & (points[:, :2] < (24, -30)).all(axis=1)
+    points[heap, 2] = ground(0.0) + 5.0 + 4.0 * rng.random(heap.sum())
+    path = las_of(points, tmp_path / "heap.laz")
+    for tags, height in (({}, 5 + 4 * 0.7), ({"height": "8.5", "roof:shape": "hipped"}, 8.5)):
+        areas = [replace(a, tags=a.tags | tags) if a.osm_id == "way/5" else a for a in osm.areas]
+        made, _ = measured(replace(osm, areas=areas), path, tmp_path)
+        found = tags_of(made)["way/5"]
+        assert float(found["height"]) == pytest.approx(height, abs=0.15)
+        assert found.get("roof:shape") == tags.get("roof:shape")
+        assert made.cloud["buildings"]["without_shape"] == 1
+        assert [p.osm_id for p in made.problems if p.reason == "no-roof-shape"] == ["way/5"]
 
 
 def test_heights_in_feet_that_were_taken_for_metres_are_told_by_the_tags():
