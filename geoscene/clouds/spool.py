@@ -157,13 +157,15 @@ def _by_square(rows: NDArray[np.void]) -> list[tuple[Square, NDArray[np.void]]]:
     """The rows of each square, in their order."""
     if not len(rows):
         return []
-    square = np.floor(rows["xyz"][:, :2] * _STEP / SIDE).astype(np.int64)
-    keys, owner = np.unique(square, axis=0, return_inverse=True)
-    order = np.argsort(owner.ravel(), kind="stable")
-    cuts = np.searchsorted(owner.ravel()[order], np.arange(len(keys) + 1))
-    return [
-        ((int(i), int(j)), rows[order[a:b]]) for (i, j), a, b in zip(keys, cuts[:-1], cuts[1:], strict=True)
-    ]
+    square = rows["xyz"][:, :2] // round(SIDE / _STEP)
+    low = square.min(axis=0)
+    many = square.max(axis=0) - low + 1
+    key = np.ravel_multi_index((square - low).T.astype(np.int64), many)
+    order = np.argsort(key, kind="stable")
+    keys, first = np.unique(key[order], return_index=True)
+    squares = np.column_stack(np.unravel_index(keys, many)) + low
+    parts = np.split(rows[order], first[1:])
+    return [((i, j), part) for (i, j), part in zip(squares.tolist(), parts, strict=True)]
 
 
 def _flush(held: dict[Square, list[NDArray[np.void]]], folder: Path) -> None:
