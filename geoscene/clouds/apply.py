@@ -106,6 +106,12 @@ def _with_buildings(
             tags = _with_roof(tags, roof, turn=turn)
         areas[k] = replace(area, tags=tags)
     counts["parts_added"] = len(added)
+    walls = zip(names, measured.walls.tolist(), measured.base.tolist(), strict=True)
+    for name, top, base in walls:
+        if top - base > THINNEST and name not in found:
+            counts["walls_only"] += 1
+            detail = f"walls seen up to {top - base:.1f} m, no roof; height by the map's rules"
+            problems.append(Problem(name, "building", "repaired", "walls-only", detail))
     check_unit(ratios)
     counts["not_measured"] = len(names) - len(found)
     roofs = [body.roof for bodies, _ in found.values() for body in bodies]

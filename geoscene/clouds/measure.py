@@ -16,7 +16,7 @@ from geoscene.clouds import trees as canopy
 from geoscene.clouds.ground import MARGIN, Grid, ground_heights
 from geoscene.clouds.levels import Body, split_bodies
 from geoscene.clouds.read import GROUND, VEGETATION
-from geoscene.clouds.roofs import block_of, fit_roof, roof_points
+from geoscene.clouds.roofs import FEWEST, block_of, fit_roof, roof_points
 from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
 from geoscene.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
@@ -51,10 +51,11 @@ class GroundOf(NamedTuple):
 
 
 class _Objects(NamedTuple):
-    """Bodies by row of the buildings, and trees, of a square."""
+    """Bodies by row of the buildings, tops of walls without roofs, and trees, of a square."""
 
     square: Square
     bodies: list[tuple[int, tuple[Body, ...]]]
+    walls: list[tuple[int, float]]
     trees: canopy.Found
 
 
@@ -67,6 +68,7 @@ class Measured:
     rows      : (k,) rows of buildings that were sought
     bodies    : of those rows: one, or several where the roof steps, the highest first; none where too few
                 points lie on the roof
+    walls     : (k,) z up to which walls were seen where no roof was, as from the street; else NaN
     base      : (k,) z of the lowest ground along their outlines
     trees     : all that were found
     """
@@ -75,6 +77,7 @@ class Measured:
     buildings: Buildings
     rows: list[int]
     bodies: list[tuple[Body, ...]]
+    walls: Float
     base: Float
     trees: canopy.Found
 
@@ -211,12 +214,14 @@ def measure(
         progress("buildings and trees of the cloud", done, total=len(tasks))
     found.sort(key=lambda some: some.square)
     bodies = dict(pair for some in found for pair in some.bodies)
+    walls = dict(pair for some in found for pair in some.walls)
     trees = [some.trees for some in found]
     return Measured(
         frame,
         buildings,
         rows.tolist(),
         [bodies.get(k, ()) for k in range(len(rows))],
+        np.array([walls.get(k, np.nan) for k in range(len(rows))], float),
         base,
         canopy.Found(
             *(np.concatenate([getattr(t, name) for t in trees]) for name in ("xy", "height", "crown"))
@@ -265,15 +270,25 @@ def _objects_of(
     points, _ = _points(work, square, margin=max(reach, canopy.MARGIN))
     order = np.argsort(points.xyz[:, 0], kind="stable")
     points = points.take(order)
-    bodies = []
+    bodies, walls = [], []
     solid = ~np.isin(points.klass, _NO_ROOF)
     for k in own:
         xmin, _, xmax, _ = shapely.bounds(outlines[k])
-        a, b = np.searchsorted(points.xyz[:, 0], (xmin, xmax))
+        a, b = np.searchsorted(points.xyz[:, 0], (xmin - _INSET, xmax + _INSET))
         some = points.xyz[a:b][solid[a:b] & (points.xyz[a:b, 2] > base[k] + _LOWEST_ROOF)]
-        some = some[roof_points(outlines[k], some, inset=_INSET)]
-        bodies.append((k, _bodies_of(whole[k], some, seed=str(names[k]), split=bool(single[k]))))
-    return _Objects(square, bodies, _trees_of(work, square, points=points, terrain=terrain))
+        roof = some[roof_points(outlines[k], some, inset=_INSET)]
+        bodies.append((k, _bodies_of(whole[k], roof, seed=str(names[k]), split=bool(single[k]))))
+        if not bodies[-1][1]:
+            walls.append((k, _top_of_walls(outlines[k], some)))
+    return _Objects(square, bodies, walls, _trees_of(work, square, points=points, terrain=terrain))
+
+
+def _top_of_walls(polygon: Any, xyz: Float) -> float:
+    """The height z up to which points (n, 3) were seen on the walls of a footprint; NaN for too few."""
+    near = shapely.buffer(shapely.boundary(polygon), _INSET)
+    shapely.prepare(near)
+    z = xyz[shapely.contains_xy(near, xyz[:, 0], xyz[:, 1]), 2]
+    return float(np.percentile(z, 98)) if len(z) >= FEWEST else np.nan
 
 
 def _bodies_of(polygon: Any, xyz: Float, *, seed: str, split: bool) -> tuple[Body, ...]:

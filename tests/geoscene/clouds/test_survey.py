@@ -220,6 +220,23 @@ def test_points_that_no_roof_explains_give_heights_only_where_tags_give_none(tmp
         assert [p.osm_id for p in made.problems if p.reason == "no-roof-shape"] == ["way/5"]
 
 
+def test_a_cloud_from_the_street_tells_walls_and_leaves_heights_to_the_map(tmp_path):
+    rng = np.random.default_rng(6)
+    xyz = village_cloud()
+    xyz = xyz[np.abs(xyz[:, 2] - ground(xyz[:, 0])) < 0.2]  # no roofs, no trees
+    (x, y), (width, depth), *_ = HOUSES["way/2"]
+    along = x - width / 2 + width * rng.random(3000)
+    wall = np.column_stack(
+        [along, np.full(3000, y - depth / 2), ground(x - width / 2) + 6 * rng.random(3000)]
+    )
+    osm, _ = measured(village_map(), las_of(np.concatenate([xyz, wall]), tmp_path / "street.laz"), tmp_path)
+    found = osm.cloud["buildings"]
+    assert (found["walls_only"], found["not_measured"]) == (1, 4)
+    assert not any("height" in tags for tags in tags_of(osm).values())
+    told = [(p.osm_id, p.detail) for p in osm.problems if p.reason == "walls-only"]
+    assert told == [("way/2", "walls seen up to 6.0 m, no roof; height by the map's rules")]
+
+
 def test_heights_in_feet_that_were_taken_for_metres_are_told_by_the_tags():
     with pytest.raises(InputError, match=r"3\.28 times as high as tagged.*`cloud_unit`"):
         check_unit([3.28] * 12)
