@@ -250,11 +250,9 @@ class Caster:
         if on is not None and self.refiners:
             hits, at = self._left(rays, on, normals=False)
             blocked = hits.face >= 0
-            for row, part in _parts(rays, at):
-                if at[row[0]] == 0.0:
-                    blocked[row] = self._any_hit(part, None, threads=threads)
-                else:  # they start on a face, which only first hits are sure to leave out
-                    blocked[row] = self._first_hits(part, None, normals=False, threads=threads).face >= 0
+            row = np.flatnonzero(at < np.inf)
+            part, at = (taken(rays, row), at[row]) if len(row) < len(at) else (rays, at)
+            blocked[row] = self._any_hit(beyond(part, np.maximum(at, rays.near)), None, threads=threads)
             return blocked
         blocked = self.scene.occluded(rays, threads=threads)
         if self.refiners and np.isfinite(rays.far).any():

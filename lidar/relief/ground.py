@@ -13,30 +13,29 @@ from geoscene.mesh import Mesh
 from geoscene.typing import Float
 from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import called, inlined
 from lidar.raycast.rays import share
-from lidar.relief.lines import direction_of, origin_of
-from lidar.relief.roughness import BLOCK, KINDS, kinds_of, roughness
+from lidar.relief.lines import beyond_plane, direction_of, origin_of
+from lidar.relief.roughness import BLOCK, KINDS, NODES, STEP, kinds_of, roughness
 
-_DEPTH, _SLOPE, _WAVE_SLOPE = 6, 7, 8
+_DEPTH, _SLOPE = 5, 6
 """Columns of `Roughness.kinds`."""
 
-_LEAST, _LEAST_GRAINS, _LEAST_WAVES = 5e-4, 2e-3, 5e-3
-"""Metres along the plane that a step covers at least: among joints, on grains (6 cm and more), and on waves
-(10 cm and more); dips shorter than that can be missed."""
+_LEAST = 5e-4
+"""Metres along the plane that a step among joints covers at least; dips shorter than that can be missed."""
 
 _STEPS = 4096
 _NARROWINGS = 60
 """Steps towards the surface at most, and narrowings of the step that crosses it."""
+
+_PAST = 1e-7
+"""Cells by which a step goes past the border of a cell."""
 
 _DIFFERENCE = 1e-3
 """Metres to both sides over which the slope of joints is measured, so that normals in them point upwards."""
 
 _CLOSE = 1e-8
 """Metres from the surface at which a crossing is found."""
-
-_OVER = 1e-3
-"""Metres above the plane at which a ray from below it goes on: shadow rays keep as far off surfaces."""
 
 
 class GroundTables(NamedTuple):
@@ -110,34 +109,19 @@ def heights(kind: str, xy: Float) -> Float:
 
 
 @inlined
-def _cell(field: Any, step: float, x: float, y: float) -> Any:
-    """Heights of a periodic field at the corners of the cell of a place, and the place in it, 0 to 1."""
-    n = field.shape[0]
-    u, v = x / step, y / step
+def _cell(rough: Any, f: int, u: float, v: float) -> Any:
+    """Block of a place in cells, the place in its cell, and the surface there, a + p u + q v + r u v."""
+    field = rough.field
     fu, fv = np.floor(u), np.floor(v)
-    i, j = np.int64(fu) & (n - 1), np.int64(fv) & (n - 1)
-    k, m = (i + 1) & (n - 1), (j + 1) & (n - 1)
-    corners = (
-        np.float64(field[i, j]),
-        np.float64(field[k, j]),
-        np.float64(field[i, m]),
-        np.float64(field[k, m]),
-    )
-    return corners, u - fu, v - fv
-
-
-@inlined
-def _at(field: Any, step: float, x: float, y: float) -> Any:
-    """Height of a periodic field at a place, bilinear between its nodes."""
-    (a, b, c, d), u, v = _cell(field, step, x, y)
-    return (a * (1.0 - u) + b * u) * (1.0 - v) + (c * (1.0 - u) + d * u) * v
-
-
-@inlined
-def _slope_at(field: Any, step: float, x: float, y: float) -> Any:
-    """Slopes of `_at` along x and y."""
-    (a, b, c, d), u, v = _cell(field, step, x, y)
-    return ((b - a) * (1.0 - v) + (d - c) * v) / step, ((c - a) * (1.0 - u) + (d - b) * u) / step
+    last = np.uint64(NODES - 1)
+    i, j = np.uint64(np.int64(fu)) & last, np.uint64(np.int64(fv)) & last
+    k, m = (i + np.uint64(1)) & last, (j + np.uint64(1)) & last
+    row, next_row = i * np.uint64(NODES), k * np.uint64(NODES)
+    a = np.float64(field[f, row + j])
+    p, q = np.float64(field[f, next_row + j]) - a, np.float64(field[f, row + m]) - a
+    r = np.float64(field[f, next_row + m]) - a - p - q
+    block = (i >> np.uint64(1)) * np.uint64(NODES // BLOCK) + (j >> np.uint64(1))
+    return block, u - fu, v - fv, a, p, q, r
 
 
 @inlined
@@ -152,37 +136,29 @@ def _joint(length: float, width: float, joint: float, deep: float, x: float, y: 
 
 
 @inlined
-def _waves(rough: Any, k: int, x: float, y: float) -> Any:
-    """Height of the waves alone, of which grains and joints only take away."""
-    return rough.kinds[k, 0] * _at(rough.road, rough.step[0], x, y)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _height(rough: Any, k: int, x: float, y: float) -> Any:
+def _joints(rough: Any, k: int, x: float, y: float) -> Any:
+    """Height of a kind with stones above its waves."""
     kinds = rough.kinds
-    h = _waves(rough, k, x, y)
-    if kinds[k, 1] > 0.0:
-        h += kinds[k, 1] * _at(rough.grain, rough.step[1], x, y)
-    if kinds[k, 2] > 0.0:
-        h += _joint(kinds[k, 2], kinds[k, 3], kinds[k, 4], kinds[k, 5], x, y)
-    return h
+    return _joint(kinds[k, 1], kinds[k, 2], kinds[k, 3], kinds[k, 4], x, y)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@called
+def _height(rough: Any, k: int, x: float, y: float) -> Any:
+    _, u, v, a, p, q, r = _cell(rough, rough.number[k], x / STEP, y / STEP)
+    h = rough.kinds[k, 0] * (a + p * u + q * v + r * u * v)
+    return h + _joints(rough, k, x, y) if rough.kinds[k, 1] > 0.0 else h
+
+
+@inlined
 def _slopes(rough: Any, k: int, x: float, y: float) -> Any:
     """Slopes of `_height` along x and y."""
-    kinds = rough.kinds
-    p, q = _slope_at(rough.road, rough.step[0], x, y)
-    sx, sy = kinds[k, 0] * p, kinds[k, 0] * q
-    if kinds[k, 1] > 0.0:
-        p, q = _slope_at(rough.grain, rough.step[1], x, y)
-        sx, sy = sx + kinds[k, 1] * p, sy + kinds[k, 1] * q
-    if kinds[k, 2] > 0.0:
-        length, width, joint, deep = kinds[k, 2], kinds[k, 3], kinds[k, 4], kinds[k, 5]
+    _, u, v, _, p, q, r = _cell(rough, rough.number[k], x / STEP, y / STEP)
+    factor = rough.kinds[k, 0] / STEP
+    sx, sy = factor * (p + r * v), factor * (q + r * u)
+    if rough.kinds[k, 1] > 0.0 and _joints(rough, k, x, y) < 0.0:
         d = _DIFFERENCE
-        p = _joint(length, width, joint, deep, x + d, y) - _joint(length, width, joint, deep, x - d, y)
-        q = _joint(length, width, joint, deep, x, y + d) - _joint(length, width, joint, deep, x, y - d)
-        sx, sy = sx + p / (2.0 * d), sy + q / (2.0 * d)
+        sx += (_joints(rough, k, x + d, y) - _joints(rough, k, x - d, y)) / (2.0 * d)
+        sy += (_joints(rough, k, x, y + d) - _joints(rough, k, x, y - d)) / (2.0 * d)
     return sx, sy
 
 
@@ -193,15 +169,13 @@ def _heights(rough: Any, k: int, xy: Any, out: Any) -> None:
 
 
 @inlined
-def _gap(rough: Any, k: int, place: Any, way: Any, t: float, whole: bool) -> Any:  # noqa: FBT001
-    """Metres of a ray above the surface, or above its waves alone, at a parameter."""
-    x, y = place[0] + t * way[0], place[1] + t * way[1]
-    h = _height(rough, k, x, y) if whole else _waves(rough, k, x, y)
-    return place[2] + t * way[2] - h
+def _gap(rough: Any, k: int, place: Any, way: Any, t: float) -> Any:
+    """Metres of a ray above the surface at a parameter."""
+    return place[2] + t * way[2] - _height(rough, k, place[0] + t * way[0], place[1] + t * way[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any, whole: bool) -> Any:  # noqa: FBT001
+@called
+def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any) -> Any:
     """The crossing between two parameters with the gaps there, by false position (Illinois)."""
     (a, above), (b, below) = low, high
     side = 0
@@ -209,7 +183,7 @@ def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any, who
         t = (a * below - b * above) / (below - above)
         if not a < t < b:
             return b if t >= b else a
-        gap = _gap(rough, k, place, way, t, whole)
+        gap = _gap(rough, k, place, way, t)
         if gap > 0.0:
             a, above = t, gap
             if gap < _CLOSE:
@@ -225,115 +199,116 @@ def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any, who
     return a
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _march(
-    rough: Any,
-    k: int,
-    place: Any,
-    way: Any,
-    start: float,
-    end: float,
-    least: float,
-    whole: bool,  # noqa: FBT001
-) -> Any:
-    """Ray parameter of the first crossing from above of the surface, or of its waves alone; inf without one.
+@called
+def _among_joints(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """Ray parameter of the first crossing of the surface by a ray that is below the top of the stones.
 
-    Steps are so short that the greatest slope cannot reach the ray within them, but for those of ``least``
+    Steps are so short that the greatest slope cannot reach the ray within them, but for those of `_LEAST`
     metres.
     """
     dx, dy, dz = way
     across = np.sqrt(dx * dx + dy * dy)
-    closing = across * rough.kinds[k, _SLOPE if whole else _WAVE_SLOPE] + abs(dz)
-    shortest = least / max(across, abs(dz))
-    t, gap = start, _gap(rough, k, place, way, start, whole)
+    closing = across * rough.kinds[k, _SLOPE] + abs(dz)
+    shortest = _LEAST / max(across, abs(dz))
+    t, gap = start, _gap(rough, k, place, way, start)
     if gap <= 0.0:
         return t
     for _ in range(_STEPS):
         ahead = min(t + max(gap / closing, shortest), end)
-        there = _gap(rough, k, place, way, ahead, whole)
+        there = _gap(rough, k, place, way, ahead)
         if there <= 0.0:
-            return _narrowed(rough, k, place, way, (t, gap), (ahead, there), whole)
+            return _narrowed(rough, k, place, way, (t, gap), (ahead, there))
         if ahead >= end:
             return np.inf
         t, gap = ahead, there
     return t
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _descent(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
-    """The only crossing of the waves by a ray that falls faster than they can, by Newton's method."""
-    low, high, t, factor = start, end, start, rough.kinds[k, 0]
-    for _ in range(_NARROWINGS):
-        x, y = place[0] + t * way[0], place[1] + t * way[1]
-        gap = place[2] + t * way[2] - _waves(rough, k, x, y)
-        if abs(gap) < _CLOSE or (gap <= 0.0 and t <= start):
-            return t
-        if gap > 0.0:
-            low = t
-        else:
-            high = t
-        p, q = _slope_at(rough.road, rough.step[0], x, y)
-        t -= gap / (way[2] - factor * (p * way[0] + q * way[1]))
-        if not low < t < high:
-            t = 0.5 * (low + high)
-    return t
+@called
+def _in_joint(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """`_crossing` of a ray that is below the top of the stones at ``start``."""
+    t = _among_joints(rough, k, place, way, start, end)
+    sx, sy = 0.0, 0.0
+    if t < np.inf:
+        sx, sy = _slopes(rough, k, place[0] + t * way[0], place[1] + t * way[1])
+    return t, sx, sy
 
 
 @inlined
-def _border(x: float, way: float, cell: float) -> Any:
-    """Parameter from a coordinate to the border of its block."""
-    if way == 0.0:
+def _inverse(way: float) -> Any:
+    """One over a change; for none a number so great that no border is reached."""
+    return 1.0 / way if way != 0.0 else 1e300
+
+
+@inlined
+def _in_cell(gap: float, falls: float, bend: float) -> Any:
+    """Least parameter at which gap + falls t + bend t^2 is zero, ``gap`` above 0; inf for none."""
+    under = falls * falls - 4.0 * bend * gap
+    if under < 0.0:
         return np.inf
-    return ((cell + (1.0 if way > 0.0 else 0.0)) * BLOCK - x) / way
+    over = np.sqrt(under) - falls
+    return 2.0 * gap / over if over > 0.0 else np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _among_grains(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
-    """The first crossing of a surface with grains after one of its waves; blocks below the ray are passed."""
-    dx, dy, dz = way
-    across, n = np.sqrt(dx * dx + dy * dy), rough.highest.shape[0]
-    closing = across * rough.kinds[k, _WAVE_SLOPE] + abs(dz)
-    t, gap = start, _gap(rough, k, place, way, start, False)
+@inlined
+def _on_field(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """Ray parameter of the first crossing of the field of a kind from above (inf: none), and its slopes.
+
+    A step goes as far as no place ahead of the ray's block can rise to the ray (a cone step, after Dummer
+    2006). Within a cell the surface is bilinear, and the crossing the root of a quadratic equation.
+    """
+    f, factor = rough.number[k], rough.kinds[k, 0]
+    scale = 1.0 / factor
+    x, y, z = place[0] / STEP, place[1] / STEP, place[2] * scale
+    dx, dy, dz = way[0] / STEP, way[1] / STEP, way[2] * scale
+    speed = max(abs(dx), abs(dy))
+    towards = (2 if dx < 0.0 else 0) + (1 if dy < 0.0 else 0)
+    end_x, end_y = (1.0 if dx >= 0.0 else 0.0), (1.0 if dy >= 0.0 else 0.0)
+    over_x, over_y = _inverse(dx), _inverse(dy)
+    unit, past, t = rough.unit[f] * speed, _PAST / speed, start
+    u, v, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0
+    found = np.inf
     for _ in range(_STEPS):
-        x, y = place[0] + t * dx, place[1] + t * dy
-        i, j = np.floor(x / BLOCK), np.floor(y / BLOCK)
-        step = min(_border(x, dx, i), _border(y, dy, j)) + 1e-9 / max(across, abs(dz))
-        ahead = min(t + max(step, 0.0), end)
-        there = _gap(rough, k, place, way, ahead, False)
-        top = rough.kinds[k, 1] * np.float64(rough.highest[np.int64(i) & (n - 1), np.int64(j) & (n - 1)])
-        if 0.5 * (gap + there - closing * (ahead - t)) <= top:
-            found = _march(rough, k, place, way, t, ahead, _LEAST_GRAINS, True)
-            if found < np.inf:
-                return found
-        if ahead >= end:
-            return np.inf
-        t, gap = ahead, there
-    return t
+        block, u, v, a, p, q, r = _cell(rough, f, x + t * dx, y + t * dy)
+        gap = z + t * dz - (a + p * u + q * v + r * u * v)
+        if gap <= 0.0:
+            found = t
+            break
+        closing = unit * np.float64(rough.steep[f, towards, block]) - dz
+        if closing <= 0.0:
+            break
+        step, border = gap / closing, min((end_x - u) * over_x, (end_y - v) * over_y)
+        if step < border:
+            falls = dz - (p * dx + q * dy + r * (u * dy + v * dx))
+            root = _in_cell(gap, falls, -r * dx * dy)
+            if root <= border:
+                t += root
+                if t <= end:
+                    found, u, v = t, u + root * dx, v + root * dy
+                break
+            step = border + past
+        t += step
+        if t >= end:
+            break
+    slope = factor / STEP
+    return found, slope * (p + r * v), slope * (q + r * u)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inlined
 def _crossing(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
-    """Ray parameter of the first crossing from above between two parameters; inf without one.
+    """Ray parameter of the first crossing from above between two parameters, and the surface's slopes there.
 
     place : x, y and height above the plane at parameter 0
     way   : change of each per parameter
 
-    The waves lie above grains and joints and are much flatter, so the way down to them takes few steps.
+    The parameter is inf without a crossing.
     """
-    kinds = rough.kinds
-    if -way[2] > kinds[k, _WAVE_SLOPE] * np.sqrt(way[0] * way[0] + way[1] * way[1]):
-        t = _descent(rough, k, place, way, start, end)
-    else:
-        t = _march(rough, k, place, way, start, end, _LEAST_WAVES, False)
-    if t == np.inf:
-        return t
-    if kinds[k, 1] > 0.0:
-        return _among_grains(rough, k, place, way, t, end)
-    if kinds[k, 2] > 0.0:
+    t, sx, sy = _on_field(rough, k, place, way, start, end)
+    if rough.kinds[k, 1] > 0.0 and t < np.inf:
         x, y = place[0] + t * way[0], place[1] + t * way[1]
-        if _joint(kinds[k, 2], kinds[k, 3], kinds[k, 4], kinds[k, 5], x, y) < 0.0:
-            return _march(rough, k, place, way, t, end, _LEAST, True)
-    return t
+        if _joints(rough, k, x, y) < 0.0:
+            return _in_joint(rough, k, place, way, t, end)
+    return t, sx, sy
 
 
 @inlined
@@ -346,21 +321,19 @@ def _on_plane(plane: Any, f: int, origin: Any, direction: Any) -> Any:
 
 
 @inlined
-def _write(
-    tables: Any, rough: Any, t: float, f: int, place: Any, direction: Any, columns: Any, i: int
-) -> None:
-    """Write a hit with the normal of the surface there."""
+def _write(tables: Any, t: float, f: int, slope: Any, direction: Any, columns: Any, i: int) -> None:
+    """Write a hit on a surface with such slopes against the plane."""
     distance, face, instance, cosine, normal = columns
-    sx, sy = _slopes(rough, tables.kind[f], place[0], place[1])
-    nx, ny = -tables.plane[f, 0] - sx, -tables.plane[f, 1] - sy
-    size = np.sqrt(nx * nx + ny * ny + 1.0)
+    nx, ny = -tables.plane[f, 0] - slope[0], -tables.plane[f, 1] - slope[1]
+    squared = nx * nx + ny * ny + 1.0
     dx, dy, dz = direction
-    across = -(dx * nx + dy * ny + dz) / (size * np.sqrt(dx * dx + dy * dy + dz * dz))
+    across = -(dx * nx + dy * ny + dz) / np.sqrt(squared * (dx * dx + dy * dy + dz * dz))
     distance[i], face[i], instance[i] = t, f, -1
     # A ray that grazes the edge of a dip may seem to come from behind.
     cosine[i] = max(across, 1e-3)
     if len(normal) > 0:
-        normal[i, 0], normal[i, 1], normal[i, 2] = nx / size, ny / size, 1.0 / size
+        z = 1.0 / np.sqrt(squared)
+        normal[i, 0], normal[i, 1], normal[i, 2] = nx * z, ny * z, z
 
 
 @inlined
@@ -380,13 +353,14 @@ def _refine_one(tables: Any, rough: Any, rays: Any, i: int, columns: Any) -> Non
     # The height counts from the hit on the face, so that no ray slips between it and the plane.
     x, y, z = place[0], place[1], -t * way[2]
     end = t - rough.kinds[k, _DEPTH] / way[2]
-    s = min(_crossing(rough, k, (x, y, z), way, t, end), end)
+    s, sx, sy = _crossing(rough, k, (x, y, z), way, t, end)
+    s = min(s, end)
     if s > rays.far[i if len(rays.far) > 1 else 0]:
         distance[i], face[i], instance[i], cosine[i] = np.inf, -1, -1, 0.0
         if len(normal) > 0:
             normal[i, 0], normal[i, 1], normal[i, 2] = 0.0, 0.0, 0.0
         return
-    _write(tables, rough, s, f, (x + s * way[0], y + s * way[1]), direction, columns, i)
+    _write(tables, s, f, (sx, sy), direction, columns, i)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -410,13 +384,13 @@ def _leave_one(tables: Any, rough: Any, rays: Any, f: int, i: int, columns: Any)
     depth = rough.kinds[k, _DEPTH]
     if z >= 0.0 or z < -2.0 * depth:
         return 0.0
-    end = near + ((_OVER - z) / way[2] if way[2] > 0.0 else (-depth - z) / min(way[2], -1e-12))
-    s = _crossing(rough, k, place, way, near, max(end, near))
+    end = near + (-z / way[2] if way[2] > 0.0 else (-depth - z) / min(way[2], -1e-12))
+    s, sx, sy = _crossing(rough, k, place, way, near, max(end, near))
     if s == np.inf and way[2] > 0.0:
-        return end
+        return end + beyond_plane(way[2], direction)
     s = min(s, end)
     if not s > rays.far[i if len(rays.far) > 1 else 0]:
-        _write(tables, rough, s, f, (place[0] + s * way[0], place[1] + s * way[1]), direction, columns, i)
+        _write(tables, s, f, (sx, sy), direction, columns, i)
     return np.inf
 
 

@@ -4,7 +4,25 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from lidar.raycast.memory import inlined
+
+_OVER, _FARTHEST = 1e-3, 0.1
+"""Metres off a plane at which a ray from behind it goes on, as far as shadow rays keep off surfaces; and
+metres along the ray at most."""
+
+
+@inlined
+def beyond_plane(leaving: float, direction: Any) -> Any:
+    """Parameter by which a ray goes on beyond a plane that it crosses from behind.
+
+    leaving : metres that it leaves the plane by per parameter, above 0
+
+    A ray that starts on the plane itself would meet it again in float32.
+    """
+    x, y, z = direction
+    return min(_OVER / leaving, _FARTHEST / np.sqrt(x * x + y * y + z * z))
 
 
 @inlined

@@ -9,6 +9,7 @@ over m), so A = Gd(n0) n0^2 / 4. Fields are periodic tiles of heights, bilinear 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,16 +28,17 @@ CLASS_A, CLASS_B, CLASS_C = (16e-6 * 4.0**k for k in range(3))
 BAND = (0.1, 10.0)
 """Cycles per metre of the waves of roads: 10 m to 10 cm."""
 
-_GRAINS = (4.0, 16.0)
-"""Cycles per metre of grains: 25 to 6 cm."""
+_GRAINS = (2.5, 10.0)
+"""Cycles per metre of grains: 40 to 10 cm."""
 
-_NODES = 1024
-_ROAD_STEP, _GRAIN_STEP = 0.02, 0.01
-"""Nodes along a side of a field, and metres between them."""
+NODES, STEP = 512, 0.025
+"""Nodes along a side of a field, a power of two, and metres between them."""
 
-_BLOCK_NODES = 8
-BLOCK = _BLOCK_NODES * _GRAIN_STEP
-"""Metres: side of the blocks of grains whose greatest height is known."""
+BLOCK = 2
+"""Cells along a side of the blocks whose steepness is known."""
+
+_RINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+"""Blocks ahead up to which steepness is bounded together; each at most twice the one before."""
 
 _PEAK = 2.5
 """Standard deviations at which peaks and dips are cut off: 1.2 % of the area."""
@@ -111,18 +113,20 @@ _STEEPEST = 0.5
 class Roughness(NamedTuple):
     """The kinds of ground for compiled code.
 
-    road, grain : (n, n) float32, heights of periodic fields, for Gd(n0) = 1 m^3 and for a standard
-                  deviation of 1 m; at most 0, and 0 somewhere
-    highest     : (n / 8, n / 8) float32, greatest height of ``grain`` in blocks of side `BLOCK`
-    step        : (2,) metres between their nodes
-    kinds       : (k, 9) factors of the fields, stones as in `Kind`, greatest depth, greatest slope, and
-                  that of the waves alone
+    field  : (f, n n) float32, heights of periodic fields, at most 0; the first in units in which
+             Gd(n0) = 1 m^3, the others, with grains, in metres
+    steep  : (f, 4, n n / 4) uint8, bounds of the rise from any place in a block of `BLOCK` cells to any
+             place ahead of it, per cell: along +x +y, +x -y, -x +y and -x -y; cells are counted along
+             the axis along which they are more
+    unit   : (f,) unit of ``steep``
+    number : (k,) field of each kind
+    kinds  : (k, 7) factor of the field, stones as in `Kind`, greatest depth and greatest slope
     """
 
-    road: NDArray[np.float32]
-    grain: NDArray[np.float32]
-    highest: NDArray[np.float32]
-    step: Float
+    field: NDArray[np.float32]
+    steep: NDArray[np.uint8]
+    unit: Float
+    number: NDArray[np.int64]
     kinds: Float
 
 
@@ -130,25 +134,24 @@ class Roughness(NamedTuple):
 def roughness() -> Roughness:
     """The fields and kinds; the same for all scenes."""
     rng = np.random.default_rng(_SEED)
-    waves = _field(rng, step=_ROAD_STEP, band=BAND, power=3.0)
-    grains = _field(rng, step=_GRAIN_STEP, band=_GRAINS, power=1.0)
-    road, grain = _below(waves), _below(grains / grains.std())
-    depth = np.array([-road.min(), -grain.min()], float)
-    slope = np.array([_steepest(road) / _ROAD_STEP, _steepest(grain) / _GRAIN_STEP])
-    rows = []
+    waves = _below(_field(rng, band=BAND, power=3.0))
+    grains = _field(rng, band=_GRAINS, power=2.0)
+    grains = _below(grains / grains.std())
+    fields, number, rows = {(1.0, 0.0): 0}, [], []
     for kind in KINDS.values():
-        factors = np.array([np.sqrt(kind.road), kind.grain])
-        *_, joint, deep = kind.stones
-        rows.append(
-            [
-                *factors,
-                *kind.stones,
-                float(factors @ depth) + deep,
-                float(factors @ slope) + (2.0 * deep / joint if joint else 0.0),
-                float(factors[0] * slope[0]),
-            ]
-        )
-    return Roughness(road, grain, _highest(grain), np.array([_ROAD_STEP, _GRAIN_STEP]), np.array(rows))
+        factor, *_, joint, deep = np.sqrt(kind.road), *kind.stones
+        key = (float(factor), kind.grain) if kind.grain else (1.0, 0.0)
+        number.append(fields.setdefault(key, len(fields)))
+        rows.append([1.0 if kind.grain else factor, *kind.stones, deep, 2.0 * deep / joint if joint else 0.0])
+    field = np.stack([road * waves + grain * grains for road, grain in fields]).astype(np.float32)
+    kinds = np.array(rows)
+    kinds[:, 5] -= kinds[:, 0] * field.min(axis=(1, 2))[number]
+    kinds[:, 6] += kinds[:, 0] * np.array([_steepest(f) for f in field])[number]
+    steep = np.stack([_steepness(f) for f in field])
+    unit = steep.max(axis=(1, 2, 3)) / 254.0
+    steep = np.ceil(steep / unit[:, None, None, None]).astype(np.uint8)
+    n = len(field)
+    return Roughness(field.reshape(n, -1), steep.reshape(n, 4, -1), unit, np.array(number), kinds)
 
 
 def kinds_of(mesh: Mesh) -> NDArray[np.int8]:
@@ -166,34 +169,71 @@ def kinds_of(mesh: Mesh) -> NDArray[np.int8]:
     return number.astype(np.int8)
 
 
-def _below(field: Float) -> NDArray[np.float32]:
+def _below(field: Float) -> Float:
     """A field moved down to 0 and less, without its rare peaks, which would set the plane far above it."""
     most = _PEAK * float(field.std())
-    return np.asarray(np.clip(field, -most, most) - most, np.float32)
-
-
-def _highest(field: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The greatest of the nodes in and on the border of each block of a periodic field."""
-    n = len(field) // _BLOCK_NODES
-    padded = np.pad(field, (0, 1), mode="wrap")
-    first = np.arange(n) * _BLOCK_NODES
-    within = first[:, None] + np.arange(_BLOCK_NODES + 1)
-    found: NDArray[np.float32] = padded[within[:, None, :, None], within[None, :, None, :]].max(axis=(2, 3))
+    found: Float = np.clip(field, -most, most) - most
     return found
 
 
 def _steepest(field: NDArray[np.float32]) -> float:
-    """Bound of the change of a periodic field per step in any direction."""
+    """Bound of the slope of a periodic field in any direction."""
     changes = (np.abs(field - np.roll(field, 1, axis=axis)).max() for axis in (0, 1))
-    return float(np.hypot(*changes))
+    return float(np.hypot(*changes)) / STEP
 
 
-def _field(rng: np.random.Generator, *, step: float, band: tuple[float, float], power: float) -> Float:
+def _steepness(field: NDArray[np.float32]) -> Float:
+    """`Roughness.steep` (4, n / 2, n / 2) of a field, in heights per cell."""
+    found = []
+    for sx, sy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        # Mirrored such that cells, not nodes, keep their blocks.
+        ahead = np.roll(field[::sx, ::sy], (sx < 0, sy < 0), (0, 1))
+        found.append(_steepness_ahead(ahead.astype(np.float64))[::sx, ::sy])
+    return np.stack(found)
+
+
+def _steepness_ahead(h: Float) -> Float:
+    """Bound (n / 2, n / 2) of the rise per cell from any place in a block to any place at +x and +y of it.
+
+    The rise is at most the greatest rise of a cell on the way; and to places ``ring`` blocks ahead, at most
+    the height of the highest there above the lowest in the block, over the cells between.
+    """
+    right, up, both = (np.roll(h, shift, (0, 1)) for shift in ((-1, 0), (0, -1), (-1, -1)))
+    along_x = np.maximum(np.maximum(right - h, both - up), 0.0)
+    along_y = np.maximum(np.maximum(up - h, both - right), 0.0)
+    rise = _blocks(along_x + along_y, np.max)
+    top = _blocks(np.maximum(np.maximum(h, right), np.maximum(up, both)), np.max)
+    low = _blocks(np.minimum(np.minimum(h, right), np.minimum(up, both)), np.min)
+    bound, before = rise.copy(), 0
+    for ring in _RINGS:
+        rise, top = (_grown(values, ring - before) for values in (rise, top))
+        apart = BLOCK * before
+        over = (top - low) / apart if apart else np.inf
+        bound, before = np.maximum(bound, np.minimum(rise, over)), ring
+    found: Float = np.maximum(bound, (top.max() - low) / (BLOCK * before))
+    return found
+
+
+def _blocks(values: Float, reduce: Callable[..., Float]) -> Float:
+    """The greatest or least (n / 2, n / 2) of blocks of cells."""
+    n = len(values) // BLOCK
+    found: Float = reduce(values.reshape(n, BLOCK, n, BLOCK), axis=(1, 3))
+    return found
+
+
+def _grown(values: Float, by: int) -> Float:
+    """The greatest within so many blocks ahead, of values that hold as many already."""
+    wide: Float = np.maximum(values, np.roll(values, -by, 0))
+    found: Float = np.maximum(wide, np.roll(wide, -by, 1))
+    return found
+
+
+def _field(rng: np.random.Generator, *, band: tuple[float, float], power: float) -> Float:
     """A periodic Gaussian field (n, n) with the density k^-power / 4 over the plane within a band, else 0."""
-    k = np.fft.fftfreq(_NODES, step)
+    k = np.fft.fftfreq(NODES, STEP)
     radius = np.hypot(k[:, None], k)
     inside = (radius >= band[0]) & (radius <= band[1])
     density = np.zeros_like(radius)
     density[inside] = radius[inside] ** -power / 4.0 * N0**2
-    white = np.fft.fft2(rng.standard_normal((_NODES, _NODES)))
-    return np.fft.ifft2(white * np.sqrt(density) / step).real
+    white = np.fft.fft2(rng.standard_normal((NODES, NODES)))
+    return np.fft.ifft2(white * np.sqrt(density) / STEP).real

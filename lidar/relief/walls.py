@@ -15,7 +15,7 @@ from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inlined
 from lidar.raycast.rays import share
-from lidar.relief.lines import direction_of, origin_of
+from lidar.relief.lines import beyond_plane, direction_of, origin_of
 from lidar.relief.march import (
     INFILL,
     OUT,
@@ -349,7 +349,7 @@ def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
         return 0.0
     s, axis, part = march(kinds, k, ray, near, layer)
     if part == OUT:
-        return s
+        return s + beyond_plane(-dz, direction)
     if part == INFILL and rays.mask & tables.bits[k] == 0:
         s, axis = in_room(kinds, k, frame[w, _WIDTH], height_of(frame, w, bottom), ray)
         part = ROOM

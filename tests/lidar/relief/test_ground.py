@@ -10,7 +10,7 @@ from geoscene.mesh import Mesh
 from lidar.raycast import Caster
 from lidar.relief import GroundRefiner, ground_tables
 from lidar.relief.ground import heights
-from lidar.relief.roughness import KINDS, N0, roughness
+from lidar.relief.roughness import BLOCK, KINDS, N0, NODES, STEP, roughness
 
 SIDE = 200.0
 KIND_OF = {"asphalt": ("asphalt", Class.ROAD), "paving": ("paving", Class.SIDEWALK)}
@@ -79,13 +79,30 @@ def test_rough_ground_lies_at_or_below_its_plane_within_its_depth_and_slope(kind
     rng = np.random.default_rng(1)
     xy = rng.uniform(-1e4, 1e4, (100_000, 2))
     z = heights(kind, xy)
-    *_, depth, slope, _ = roughness().kinds[list(KINDS).index(kind)]
+    *_, depth, slope = roughness().kinds[list(KINDS).index(kind)]
     assert (z <= 0).all()
     assert (z >= -depth).all()
     moved = xy + 1e-4 * rng.normal(size=xy.shape)
     change = np.abs(heights(kind, moved) - z) / np.linalg.norm(moved - xy, axis=1)
     assert change.max() <= slope * (1 + 1e-6)
     assert z.std() > 5e-4
+
+
+@pytest.mark.parametrize("kind", ["asphalt", "soil", "grass", "ballast"])
+@pytest.mark.parametrize("towards", range(4))
+@pytest.mark.parametrize("reach", [0.01, 0.1, 1.0, 6.0])
+def test_no_place_ahead_rises_faster_than_the_steepness_of_a_block(kind, towards, reach):
+    rough, k = roughness(), list(KINDS).index(kind)
+    rng = np.random.default_rng(4)
+    start = rng.uniform(0, 30, (200_000, 2))
+    sign = np.array([-1 if towards & 2 else 1, -1 if towards & 1 else 1])
+    ahead = reach * rng.uniform(0, 1, start.shape) ** rng.integers(1, 4, (len(start), 1))
+    rise = heights(kind, start + sign * ahead) - heights(kind, start)
+    i, j = (np.floor(start / STEP).astype(int) % NODES // BLOCK).T
+    f = rough.number[k]
+    steep = rough.unit[f] * rough.steep[f, towards, i * (NODES // BLOCK) + j]
+    bound = rough.kinds[k, 0] * steep * ahead.max(axis=1) / STEP
+    assert (rise <= bound + 1e-9).all()
 
 
 @pytest.mark.parametrize("kind", KIND_OF)
