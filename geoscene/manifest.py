@@ -186,6 +186,7 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
         "camber_km": _camber_km(plan),
+        "ballast_m2": _ballast_m2(plan),
         **count_kerbs(plan.ground.layers),
         **count_covers(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
@@ -198,8 +199,14 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
 
 def _camber_km(plan: Plan) -> float:
     """Kilometres of carriageway in the extent that have a camber."""
-    camber = plan.ground.camber
-    return 0.0 if camber is None else round(camber.metres(plan.extent) / 1000, 3)
+    raised = plan.ground.raised
+    return 0.0 if raised is None else round(raised.camber.metres(plan.extent) / 1000, 3)
+
+
+def _ballast_m2(plan: Plan) -> float:
+    """Square metres of raised ballast in the extent."""
+    raised = plan.ground.raised
+    return 0.0 if raised is None else round(raised.beds.square_metres(plan.extent), 1)
 
 
 def _facade_tallies(plan: Plan) -> dict[str, dict[str, int]]:

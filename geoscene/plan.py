@@ -36,7 +36,7 @@ from geoscene.ground import (
     tile_span,
     water_levels,
 )
-from geoscene.ground.camber import Camber, Kerbs
+from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
 from geoscene.ground.relief import Relief
@@ -63,6 +63,7 @@ from geoscene.progress import Progress
 from geoscene.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.report import Problem
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph.ballast import read_beds
 from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.driving_side import Side
@@ -469,22 +470,25 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     if len(wires):
         wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
-    camber, kerbs, extra = None, None, []
+    raised, kerbs, extra = None, None, []
     if options.relief != "off":
         ends = sidewalk_ends(roads.carriageways)
         kerbs = Kerbs.of(ends)
         crowns = find_crowns(roads.carriageways)
-        camber = camber_of(roads.carriageways, crowns)
+        tracks = _only_roads(osm, options) if "landcover" in options.only else replace(osm, ways=[])
+        beds, bed_rows = read_beds(tracks, frame, cover=cover, others=Layers.concatenate([surfaces, pads]))
+        raised = Raised(camber_of(roads.carriageways, crowns), beds)
         first = ranges["road_surfaces"][0] + made.first
         extra = [
             lowered_kerbs(surfaces, mapped=mapped_kerbs(_only_roads(osm, options), frame)),
             kerb_ends(surfaces, ends),
+            bed_rows,
             crown_rows(roads.carriageways, crowns, surfaces=surfaces, first=first),
         ]
     covers = Layers.concatenate([cover, surfaces, pads, low, *extra])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
     ground = _plan_ground(
-        covers, roads, extent=extent, terrain=terrain, options=options, kerbs=kerbs, camber=camber
+        covers, roads, extent=extent, terrain=terrain, options=options, kerbs=kerbs, raised=raised
     )
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
@@ -552,7 +556,7 @@ def _plan_ground(
     terrain: Terrain,
     options: BuildOptions,
     kerbs: Kerbs | None,
-    camber: Camber | None,
+    raised: Raised | None,
 ) -> GroundPlan:
     size, tolerance = options.tile_size, options.dem_tolerance
     if tolerance is None:
@@ -566,7 +570,7 @@ def _plan_ground(
         coarse=terrain.lines,
         relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
         kerbs=kerbs,
-        camber=camber,
+        raised=raised,
     )
 
 

@@ -1,4 +1,4 @@
-"""What the ground knows of roads with relief: the camber of carriageways, and where raised sidewalks end."""
+"""Roads and tracks with relief: the camber of carriageways, beds of ballast, ends of raised sidewalks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from geoscene.ground.ballast import Beds
 from geoscene.typing import Float
 
 CAMBER = 0.025
@@ -75,3 +76,18 @@ class Camber:
         crown = self.crown[piece, 0] * (1.0 - share) + self.crown[piece, 1] * share
         np.maximum.at(z, point, crown * np.maximum(1.0 - away / self.half[piece], 0.0))
         return z
+
+
+@dataclass(frozen=True, slots=True)
+class Raised:
+    """What stands above the planned height of the ground: crowns of carriageways and beds of tracks.
+
+    They do not overlap.
+    """
+
+    camber: Camber
+    beds: Beds
+
+    def height(self, xy: Float) -> Float:
+        """Metres (n,) above the planned height at points (n, 2)."""
+        return self.camber.height(xy) + self.beds.height(xy)

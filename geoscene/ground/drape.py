@@ -111,8 +111,8 @@ def drape(
     z = np.zeros(len(x)) if height is None else np.array(height(x, y), float)
     if plan.kerbs is not None:
         z += kerb_heights(plan, plan.kerbs, cells=cells, triangles=triangles)
-    if plan.camber is not None:
-        z += plan.camber.height(triangles.points)
+    if plan.raised is not None:
+        z += plan.raised.height(triangles.points)
     if levels is not None:
         z = _flooded(plan, cells, triangles=triangles, z=z, levels=levels)
     color = np.zeros((256, 3), np.uint8)

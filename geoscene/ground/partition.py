@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.errors import GeosceneError, InputError
-from geoscene.ground.camber import Camber, Kerbs
+from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.typing import Bools, Float, Ints
@@ -65,7 +65,7 @@ class GroundPlan:
                 `geoscene.ground.joined` has joined it to others
     span      : (t,) int64, squares along a side of the tile that each square is part of: 1, or a power of two
     kerbs     : by which sidewalks are raised above carriageways, None for level ones
-    camber    : by which the middles of carriageways are, None for level ones
+    raised    : what stands above the planned height, None for nothing
     """
 
     extent: tuple[float, float, float, float]
@@ -85,7 +85,7 @@ class GroundPlan:
     tiles: Ints
     span: Ints
     kerbs: Kerbs | None = None
-    camber: Camber | None = None
+    raised: Raised | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ def plan_ground(
     relief: Relief | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
     kerbs: Kerbs | None = None,
-    camber: Camber | None = None,
+    raised: Raised | None = None,
 ) -> GroundPlan:
     """The scene's outlines sorted by tile, ready for `partition_tile`.
 
@@ -137,7 +137,7 @@ def plan_ground(
     relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
     base   : class and material where no polygon lies
     kerbs  : by which sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
-    camber : of carriageways; their halves must be layers of their own (`geoscene.roadgraph.camber`)
+    raised : what stands above; its parts must be layers of their own (`geoscene.roadgraph.camber`)
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
     """
@@ -176,7 +176,7 @@ def plan_ground(
         np.stack([i, j], axis=1) + low,
         np.ones(len(i), np.int64),
         kerbs,
-        camber,
+        raised,
     )
 
 

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from geoscene.frames import Frame
 from geoscene.ground import Layers, ground_tile, plan_ground
-from geoscene.ground.camber import CAMBER, Kerbs
+from geoscene.ground.ballast import Beds
+from geoscene.ground.camber import CAMBER, Kerbs, Raised
 from geoscene.ground.kerbs import lowered_kerbs
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
@@ -18,6 +19,7 @@ from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources.data import OsmData, Way
 
 FRAME = Frame.at(10.0, 50.0)
+NO_BEDS = Beds.of(np.empty(0, object), np.empty(0, object))
 EXTENT = (-120.0, -60.0, 120.0, 60.0)
 STREET = {"highway": "residential", "width": "8", "sidewalk": "both"}
 ALONG = {1: (-200, 0), 2: (0, 0), 3: (200, 0), 4: (0, 200)}
@@ -39,7 +41,13 @@ def meshes(places, ways, *, tile_size=60.0, height=None):
     crowns = find_crowns(table)
     halves = crown_rows(table, crowns, surfaces=layers, first=made.first)
     layers = Layers.concatenate([layers, lowered_kerbs(layers), halves])
-    plan = plan_ground(EXTENT, layers, tile_size=tile_size, kerbs=Kerbs.of(), camber=camber_of(table, crowns))
+    plan = plan_ground(
+        EXTENT,
+        layers,
+        tile_size=tile_size,
+        kerbs=Kerbs.of(),
+        raised=Raised(camber_of(table, crowns), NO_BEDS),
+    )
     return [ground_tile(plan, int(i), j=int(j), height=height) for i, j in plan.tiles]
 
 

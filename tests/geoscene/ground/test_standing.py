@@ -6,11 +6,13 @@ import shapely
 
 from geoscene.classes import Class, materials
 from geoscene.ground import Layers, ground_tile, plan_ground
-from geoscene.ground.camber import Camber, Kerbs
+from geoscene.ground.ballast import Beds
+from geoscene.ground.camber import Camber, Kerbs, Raised
 from geoscene.ground.kerbs import KERB
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.ground.standing import standing_height
 
+NO_BEDS = Beds.of(np.empty(0, object), np.empty(0, object))
 ROAD = shapely.LineString([(0, 20), (80, 20)])
 
 
@@ -40,7 +42,11 @@ def street(*, kerbs):
         np.array([[0.0, 20.0]]), np.array([[80.0, 20.0]]), half=np.array([4.0]), crown=np.array([[0.1, 0.1]])
     )
     return plan_ground(
-        (0.0, 0.0, 80.0, 40.0), layers, tile_size=40.0, kerbs=Kerbs.of() if kerbs else None, camber=camber
+        (0.0, 0.0, 80.0, 40.0),
+        layers,
+        tile_size=40.0,
+        kerbs=Kerbs.of() if kerbs else None,
+        raised=Raised(camber, NO_BEDS),
     )
 
 

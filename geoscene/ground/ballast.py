@@ -1,0 +1,57 @@
+"""Beds of ballast: level tops that stand above the ground, with slopes around them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene.typing import Float
+
+HEIGHT = 0.4
+"""Metres from the ground to the top of the ballast. Assumed: 30 cm below sleepers of 21 cm, partly sunk."""
+
+SLOPE = 0.6
+"""Metres in plan over which ballast falls to the ground: 1 to 1.5, the slope at which it lies."""
+
+FADE = 15.0
+"""Metres of track over which a bed comes down to crossings, bridges and tunnels. Assumed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beds:
+    """Beds of ballast.
+
+    tops : STRtree of the level tops, polygons in scene metres that do not overlap
+    ends : STRtree of the places to which beds come down
+    """
+
+    tops: shapely.STRtree
+    ends: shapely.STRtree
+
+    @classmethod
+    def of(cls, tops: NDArray[np.object_], ends: NDArray[np.object_]) -> Beds:
+        """Beds with such tops that come down to such places."""
+        return cls(shapely.STRtree(tops), shapely.STRtree(ends))
+
+    def height(self, xy: Float) -> Float:
+        """Metres (n,) by which beds stand above the ground at points (n, 2), by the place alone."""
+        z = np.zeros(len(xy))
+        points = shapely.points(xy)
+        point, top = self.tops.query(points, predicate="dwithin", distance=SLOPE)
+        if len(point):
+            away = shapely.distance(points[point], self.tops.geometries[top])
+            np.maximum.at(z, point, HEIGHT * (1.0 - away / SLOPE))
+        point, end = self.ends.query(points, predicate="dwithin", distance=FADE)
+        if len(point):
+            share = np.ones(len(xy))
+            np.minimum.at(share, point, shapely.distance(points[point], self.ends.geometries[end]) / FADE)
+            z *= share
+        return np.asarray(z, float)
+
+    def square_metres(self, box: Sequence[float]) -> float:
+        """Area of the tops within a box (xmin, ymin, xmax, ymax)."""
+        return float(shapely.area(shapely.intersection(self.tops.geometries, shapely.box(*box))).sum())
