@@ -78,7 +78,8 @@ def test_check_scene_reports_broken_surfaces(scene, tmp_path):
         extra = replace(
             mesh.take(np.array([row])), vertices=np.array(corners), faces=np.array([[0, 1, 2]], np.int32)
         )
-        write_tile(broken.files.tile(i, j), replace(tile, mesh=concatenate([mesh, extra])))
+        with_extra = replace(tile, mesh=concatenate([mesh, extra]), relief=None)
+        write_tile(broken.files.tile(i, j), with_extra)
         [told] = check_scene(broken)["broken_surfaces"]
         assert (told["tile"], told["fault"]) == ([i, j], fault)
         assert told["feature"] == mesh.feature[row]
@@ -253,7 +254,7 @@ def test_scene_for_a_map_has_tables_in_plan(osm, scene, tmp_path):
     part = build(osm, tmp_path / "map", options=BuildOptions(name="demo", use="map"))
     assert part.files.road_graph.read_bytes() == scene.files.road_graph.read_bytes()
     for name in scene.layers:
-        kept = name not in ("building_parts", "structures")
+        kept = name not in ("building_parts", "structures", "wires")
         assert part.table_length(name) == (scene.table_length(name) if kept else 0)
     assert part.manifest["left_out"]["tiles"] == len(scene.tile_indices)
     assert part.manifest["left_out"]["bytes"] > 0
