@@ -22,7 +22,7 @@ def street_shapes() -> dict[str, Mesh]:
 
     Sizes are usual ones, assumed.
     """
-    bicycles = [_bicycle(side) for side in (0.28, -0.28)]
+    bicycles = [_bicycle(side) for side in (0.29, -0.29)]
     return {
         "waste_basket": concatenate(
             [
@@ -34,7 +34,7 @@ def street_shapes() -> dict[str, Mesh]:
         "recycling_container": concatenate(
             [
                 _metal(box((1.3, 1.2), (_UNDER, 1.25))),
-                _metal(prism(rectangle(1.3, 1.2), 1.25, top=1.65, taper=0.6)),
+                _metal(prism(rectangle(1.29, 1.19), 1.23, top=1.65, taper=0.6)),
             ]
         ),
         "waste_container": concatenate(
@@ -71,7 +71,7 @@ def street_shapes() -> dict[str, Mesh]:
             [
                 _metal(box((0.06, 0.06), (_UNDER, 0.6))),
                 _metal(box((0.35, 0.45), (0.6, 1.2))),
-                _metal(prism(rectangle(0.35, 0.45), 1.2, top=1.3, taper=0.75)),
+                _metal(prism(rectangle(0.34, 0.44), 1.18, top=1.3, taper=0.75)),
             ]
         ),
         "vending_machine": concatenate(
@@ -291,7 +291,7 @@ def _table() -> Mesh:
             _wood(box((0.42, 0.42), (0.44, 0.48), at=(0.0, seat))),
             _wood(box((0.42, 0.04), (0.48, 0.88), at=(0.0, back))),
             *(
-                _metal(box((0.04, 0.42), (-0.02, 0.44), at=(x, seat)), klass=Class.BENCH)
+                _metal(box((0.04, 0.4), (-0.02, 0.46), at=(x, seat)), klass=Class.BENCH)
                 for x in (-0.19, 0.19)
             ),
         ]

@@ -1,5 +1,7 @@
 """Street furniture with relief stands on sidewalks, apart from each other, whatever else there is."""
 
+from dataclasses import replace
+
 import manifold3d
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from geoscene.plan import make_plan
 from geoscene.progress import silent
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Way
+from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(11.0, 50.0)
 EXTENT = (-300.0, -40.0, 300.0, 40.0)
@@ -66,6 +69,8 @@ def test_shapes_are_closed_solids_facing_outward_within_the_budget(name):
     assert part.status() == manifold3d.Error.NoError
     assert all(piece.volume() > 0 for piece in part.decompose())
     assert shape.closed.all()
+    verdict = validate_mesh(replace(shape, feature=np.zeros(len(shape), np.int32)))  # also where bodies meet
+    assert (verdict.closed & verdict.oriented & verdict.positive & (verdict.degenerate == 0)).all()
     assert len(shape) <= 420
 
 

@@ -46,11 +46,12 @@ def test_three_cables_hang_from_pole_to_pole_and_sag_between():
     assert len(np.unique(wires.feature)) == 6
 
 
-def test_pieces_of_a_wire_meet_and_have_its_width():
+def test_pieces_of_a_wire_reach_into_each_other_and_have_its_width():
     copies = wire_instances(wires_of({"power": "minor_line"}, (0, 0), (30, 40)))
     ends = copies.transform[:, :, 3] + copies.transform[:, :, 0]
     own = np.arange(len(copies)).reshape(3, 8)
-    np.testing.assert_allclose(ends[own[:, :-1]], copies.transform[own[:, 1:], :, 3], atol=1e-9)
+    into = ends[own[:, :-1]] - copies.transform[own[:, 1:], :, 3]
+    np.testing.assert_allclose(np.linalg.norm(into, axis=2), 0.01, atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(copies.transform[:, :, 1:3], axis=1), 0.025)
     assert (np.linalg.det(copies.transform[:, :, :3]) > 0).all()
 
