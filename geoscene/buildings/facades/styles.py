@@ -264,6 +264,7 @@ def _types(buildings: Buildings, given: Sequence[Tags], *, area: Float, eaves: F
     name = np.full(len(use), "", object)
     for kind, uses in _USES.items():
         name[np.isin(use, uses)] = kind
+    name[(use == "tower") & (buildings.levels >= 2)] = ""  # a tower with storeys has rooms
     types = {value: kind for kind, values in _USES.items() for value in values}
     for k in np.flatnonzero((name == "") | np.isin(use, _PLAIN)).tolist():
         tags = given[k]

@@ -237,6 +237,14 @@ def test_facades_with_a_shop_or_door_of_the_map_are_tagged():
     assert setting.source.tolist() == ["tag", "tag", "guess"]
 
 
+@pytest.mark.parametrize(
+    ("tags", "windows"), [({"building__levels": "13", "tourism": "hotel"}, True), ({}, False)]
+)
+def test_a_tower_has_windows_if_it_has_storeys(tags, windows):
+    _, _, layout = facades_of(house(1, shapely.box(0, 0, 20, 18), building="tower", height="70", **tags))
+    assert (layout.counts["windows"] > 50) == windows
+
+
 def test_doors_are_guessed_where_a_street_is():
     shape = shapely.box(0, 0, 14, 10)
     _, _, layout = facades_of(house(1, shape, building="house", height="6"), street=[(-30, -8), (40, -8)])
