@@ -41,7 +41,7 @@ def scene(tmp_path_factory):
     bounds = '<bounds minlat="60" minlon="24" maxlat="60.23" maxlon="24.62"/>'
     path = folder / "map.osm"
     path.write_text(f'<osm version="0.6">{bounds}{"".join(nodes + ways)}</osm>')
-    return build(read_osm(path), folder / "scene", options=BuildOptions())
+    return build(read_osm(path), folder / "scene", options=BuildOptions(relief="off"))
 
 
 def test_empty_ground_is_in_few_tiles_that_cover_it_without_gaps(scene):

@@ -22,7 +22,7 @@ EXTRACTS = [
 
 
 def assert_off_carriageways(path):
-    plan, problems = make_plan(read_osm(path), BuildOptions(), progress=silent)
+    plan, problems = make_plan(read_osm(path), BuildOptions(relief="off"), progress=silent)
     layers = plan.ground.layers
     rails = shapely.union_all(layers.polygon[layers.klass == Class.RAIL])
     for table in (plan.furniture, plan.trees):

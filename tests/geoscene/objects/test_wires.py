@@ -95,6 +95,6 @@ def test_tramways_of_a_real_place_have_wires_with_relief_alone(shared_osm):
     assert plan.layers[-1].name == "wires"
     assert plan.ranges["wires"] == (plan.wires.feature[0], plan.wires.feature[-1] + 1)
     assert sum(len(rows) for rows in plan.rows["wires"].values()) == len(plan.wires)
-    off, _ = make_plan(osm, BuildOptions(), progress=silent)
+    off, _ = make_plan(osm, BuildOptions(relief="off"), progress=silent)
     assert len(off.wires) == 0
     assert "wires" not in off.ranges

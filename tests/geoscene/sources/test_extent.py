@@ -95,7 +95,7 @@ def test_a_stray_corner_costs_its_building_and_nothing_else(stated, tmp_path):
     data = town.read(tmp_path, stated=stated)
     assert max(size_km(data)) < 0.6
     assert (f"node/{stray}", "node", "dropped", "far-away") in found(data)
-    plan, _ = make_plan(data, BuildOptions(), progress=silent)
+    plan, _ = make_plan(data, BuildOptions(relief="off"), progress=silent)
     assert max(np.abs(plan.extent)) < 400
     assert 20 <= plan.buildings.count <= 21
 
@@ -153,8 +153,8 @@ def test_a_map_across_180_degrees_equals_the_same_map_elsewhere(stated, bounds, 
     inland = Town(-16.8, 100.998).read(tmp_path, bounds=bounds and (100.996, -16.81, 101.004, -16.79))
     assert len(across.areas) == 20
     assert not across.problems
-    here, _ = make_plan(across, BuildOptions(), progress=silent)
-    there, _ = make_plan(inland, BuildOptions(), progress=silent)
+    here, _ = make_plan(across, BuildOptions(relief="off"), progress=silent)
+    there, _ = make_plan(inland, BuildOptions(relief="off"), progress=silent)
     assert here.buildings.count == there.buildings.count
     np.testing.assert_allclose(
         [f.area for f in here.buildings.footprint], [f.area for f in there.buildings.footprint], rtol=1e-4
@@ -177,7 +177,7 @@ def test_a_map_of_one_straight_street_has_ground_on_both_sides(dlat, dlon, tmp_p
     town.nodes.clear()
     town.ways.clear()
     town.way([town.node(60.17, 24.94), town.node(60.17 + dlat, 24.94 + dlon)], ROAD)
-    plan, _ = make_plan(town.read(tmp_path), BuildOptions(), progress=silent)
+    plan, _ = make_plan(town.read(tmp_path), BuildOptions(relief="off"), progress=silent)
     xmin, ymin, xmax, ymax = plan.extent
     assert min(-xmin, -ymin, xmax, ymax) >= 9
     assert min(xmax - xmin, ymax - ymin) < 25
