@@ -11,7 +11,7 @@ from typing import Any, TypeVar, cast
 
 from geoscene import __version__
 from geoscene.errors import InputError, WorkersLostError, need
-from geoscene.files import digest_of, write_atomically
+from geoscene.files import digest_of, sources_digest, write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -49,11 +49,11 @@ class Cluster:
             ) from error
         finally:
             probe.unlink()
-        for worker, (version, digests) in sorted(found.items()):
-            if version != __version__:
+        for worker, (version, sources, digests) in sorted(found.items()):
+            if sources != sources_digest("geoscene"):
                 raise InputError(
-                    f"`scheduler` {self._address}: worker {worker} has geoscene {version}, this program is"
-                    f" {__version__}; install the same version"
+                    f"`scheduler` {self._address}: the sources of geoscene {version} of worker {worker} are not"
+                    f" those of this program, {__version__}; install the same version"
                 )
             for path, seen in zip(wanted, digests, strict=True):
                 if seen != wanted[path]:
@@ -116,9 +116,9 @@ def connected(address: str) -> Iterator[Cluster]:
         yield Cluster(client, address=address)
 
 
-def _worker_sees(paths: Sequence[Path]) -> tuple[str, list[str]]:
-    """Version of this package, and digests of files; run by workers."""
-    return __version__, [digest_of(path) for path in paths]
+def _worker_sees(paths: Sequence[Path]) -> tuple[str, str, list[str]]:
+    """Version of this package, digest of its sources, and digests of files; run by workers."""
+    return __version__, sources_digest("geoscene"), [digest_of(path) for path in paths]
 
 
 def _first_line(error: Exception) -> str:

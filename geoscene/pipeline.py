@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 
-from geoscene import __version__
 from geoscene.cluster import Cluster
 from geoscene.errors import SourceNotFoundError
-from geoscene.files import digest, digest_of
+from geoscene.files import digest, digest_of, sources_digest
 from geoscene.manifest import scene_manifest
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions
@@ -116,7 +115,7 @@ def _keys(osm: OsmData, options: BuildOptions, *, digest: str) -> Keys:
     """
     chosen = {f.name: getattr(options, f.name) for f in fields(options) if f.name not in _NOT_IN_TILES}
     common = {
-        "version": __version__,
+        "program": sources_digest("geoscene"),
         "schema": SCHEMA,
         "map": digest,
         "bounds": osm.bounds,

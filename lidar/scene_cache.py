@@ -25,11 +25,10 @@ from typing import Any
 
 import shapely
 
-from geoscene import __version__ as builder_version
 from geoscene.clouds.survey import with_clouds
 from geoscene.errors import FrameError, NetworkError, SceneFormatError
 from geoscene.errors import InputError as SceneInputError
-from geoscene.files import digest, digest_of, exclusive, write_atomically
+from geoscene.files import digest, digest_of, exclusive, sources_digest, write_atomically
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build, elevation_digests
 from geoscene.progress import Progress, silent
@@ -38,7 +37,6 @@ from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
 from geoscene.storage import cache_folder, url_of
-from lidar import __version__
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
 from lidar.options import DriveOptions, PlaceOptions
@@ -156,9 +154,8 @@ def _folder(source: _Map) -> Path:
     chosen |= {"bbox": place.bbox, "dem": elevation_digests(place.dem)}
     if clouds.cloud:
         chosen |= asdict(clouds) | {"cloud": [digest_of(Path(name)) for name in clouds.cloud]}
-    key = digest(
-        json.dumps([builder_version, SCHEMA, source.digest, place.dem == ("tiles",), chosen]).encode()
-    )
+    made_of = [sources_digest("geoscene"), SCHEMA, source.digest, place.dem == ("tiles",), chosen]
+    key = digest(json.dumps(made_of).encode())
     cache = place.scene_cache or cache_folder() / "scenes"
     slug = re.sub(r"[^\w.-]+", "-", source.name).strip("-.")[:32] or "map"
     return next(iter(sorted(cache.glob(f"*-{key}"))), cache / f"{slug}-{key}")
@@ -214,7 +211,7 @@ class _CachedScene:
 
     def _drive_area(self, scene: Scene) -> Any:
         """The area that the drive needs, as planned in the scene; it holds if the scene covers it."""
-        recipe = json.dumps([__version__, self.drive.recipe(scene)], default=str, sort_keys=True)
+        recipe = json.dumps([sources_digest("lidar"), self.drive.recipe(scene)], default=str, sort_keys=True)
         known = self.folder / "drives" / f"{digest(recipe.encode())}.wkb"
         with suppress(OSError, shapely.errors.GEOSException):
             return shapely.from_wkb(known.read_bytes())

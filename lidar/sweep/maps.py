@@ -12,11 +12,10 @@ from typing import Any
 
 from cyclopts import App
 
-from geoscene import __version__
 from geoscene.cluster import Cluster
 from geoscene.console import DEFAULTS, guard_numbers
 from geoscene.errors import SceneFormatError
-from geoscene.files import digest_of, write_json
+from geoscene.files import digest_of, sources_digest, write_json
 from geoscene.options import BuildOptions, Degrees
 from geoscene.pipeline import build
 from geoscene.progress import Progress, silent
@@ -56,7 +55,7 @@ class MapScene:
         """The scene in a folder, built unless it is there of the same files and options."""
         target, stamp = folder / self.name, folder / f"{self.name}.json"
         made_of = {
-            "version": __version__,
+            "program": sources_digest("geoscene"),
             "bounds": self.bounds,
             "options": asdict(self.options),
             "files": {str(path): digest_of(path) for path in self.inputs},

@@ -68,6 +68,13 @@ def test_a_worker_that_does_not_see_the_folder_is_named_before_planning(address,
     assert not list(tmp_path.iterdir())
 
 
+def test_workers_with_other_sources_are_refused_before_planning(address, osm, tmp_path, monkeypatch):
+    monkeypatch.setattr("geoscene.cluster.sources_digest", lambda _: "of this process")
+    with connected(address) as cluster, pytest.raises(InputError, match=r"tcp.* are not those of this program"):
+        build(osm, tmp_path / "scene", cluster=cluster)
+    assert not list(tmp_path.iterdir())
+
+
 def test_program_names_a_scheduler_that_does_not_answer(tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.cluster._SECONDS", 0.5)
     done = run_program(

@@ -18,6 +18,7 @@ from helpers.scenes import same_files
 
 import geoscene.tiles
 from geoscene.errors import SceneFormatError, WorkersLostError
+from geoscene.files import sources_digest
 from geoscene.options import BuildOptions
 from geoscene.pipeline import build
 from geoscene.processes import run_tasks
@@ -89,6 +90,39 @@ def test_rebuild_with_another_option_has_the_bytes_of_a_fresh_build(
     kept = ("lod", "name", "along", "reach", "use")  # no option on which the ground depends
     assert len(made) == (0 if name in kept else len(again.tile_indices))
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
+
+
+def test_tiles_of_other_sources_are_built_again(osm, whole, tmp_path, monkeypatch):
+    shutil.copytree(whole.path, tmp_path / "scene")
+    made, ground_tile = [], geoscene.tiles.ground_tile
+    monkeypatch.setattr(geoscene.tiles, "ground_tile", lambda *a, **o: made.append(a) or ground_tile(*a, **o))
+    build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True)
+    assert made == []
+    monkeypatch.setattr("geoscene.pipeline.sources_digest", lambda _: "of edited modules")
+    again = build(osm, tmp_path / "scene", options=OPTIONS, overwrite=True)
+    assert len(made) == len(again.tile_indices)
+
+
+@pytest.mark.parametrize(
+    ("change", "noticed"),
+    [
+        ({"walls.py": "HEIGHT = 4\n"}, True),
+        ({"tables/sizes.toml": "door = 2.2\n"}, True),
+        ({"walls.py": None, "wall.py": "HEIGHT = 3\n"}, True),
+        ({"page.js": "x", "__pycache__/walls.pyc": "x"}, False),
+    ],
+)
+def test_digest_of_sources_covers_code_and_tables(change, noticed, tmp_path, monkeypatch):
+    monkeypatch.setattr("geoscene.files.resources.files", tmp_path.joinpath)
+    files = {"__init__.py": "", "walls.py": "HEIGHT = 3\n", "tables/sizes.toml": "door = 2.1\n"}
+    for name, contents in {"before": files, "after": files | change}.items():
+        for file, text in contents.items():
+            if text is not None:
+                path = tmp_path / name / file
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text)
+    sources_digest.cache_clear()
+    assert (sources_digest("before") != sources_digest("after")) == noticed
 
 
 def test_elevation_file_with_other_heights_is_noticed(osm, raster, tmp_path):
