@@ -52,8 +52,8 @@ class Cluster:
         for worker, (version, sources, digests) in sorted(found.items()):
             if sources != sources_digest("geoscene"):
                 raise InputError(
-                    f"`scheduler` {self._address}: the sources of geoscene {version} of worker {worker} are not"
-                    f" those of this program, {__version__}; install the same version"
+                    f"`scheduler` {self._address}: the sources of geoscene {version} of worker {worker}"
+                    f" are not those of this program, {__version__}; install the same version"
                 )
             for path, seen in zip(wanted, digests, strict=True):
                 if seen != wanted[path]:

@@ -299,7 +299,8 @@ class DriveOptions:
     flown over in strips."""
 
     altitude: float | None = None
-    """Metres above the ground of a flight; by default heights in the route's file, or 60 (drone) or 600."""
+    """Metres of a flight above the ground below it; an aircraft's survey is level, that much above the
+    highest ground below it. By default heights in the route's file, or 60 (drone) or 600 (aircraft)."""
 
     overlap: float = 0.3
     """Share of a survey's strip that the next one covers too."""

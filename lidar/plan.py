@@ -22,7 +22,7 @@ from lidar import __version__
 from lidar.attacks.placed_object import with_objects
 from lidar.dataset.provenance import scene_provenance, versions
 from lidar.dataset.recording import Recording
-from lidar.errors import InputError
+from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory, blocks_of
 from lidar.options import DriveOptions
@@ -218,6 +218,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     road = options.road_conditions()
     vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
+    _refuse_elsewhere(scene, motion if isinstance(motion, Trajectory) else motion.trajectory, sensors=sensors)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
     stages = options.contents().stages
     actors = with_objects(actors, stages, scene=scene, trajectory=trajectory)
@@ -240,6 +241,22 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=jobs,
     )
+
+
+def _refuse_elsewhere(scene: Scene, trajectory: Trajectory, *, sensors: Sequence[Scanner | Camera]) -> None:
+    """Raise RouteError for a motion from which no sensor ever reaches the scene."""
+    sight = max((sensor.max_range for sensor in sensors), default=0.0)
+    xmin, ymin, xmax, ymax = scene.bounds
+    nearest = np.inf
+    for rows in blocks_of(len(trajectory.time_ns)):
+        xy = trajectory.position[rows, :2]
+        off = np.hypot(*(xy - np.clip(xy, [xmin, ymin], [xmax, ymax])).T)
+        nearest = min(nearest, float(off.min()))
+    if nearest > sight:
+        raise RouteError(
+            f"the route comes no closer than {nearest:,.0f} m to {scene.path}, and the sensors see up to"
+            f" {sight:g} m; give a route through the scene, or the scene of the route"
+        )
 
 
 def reach_limit(scene: Scene, position: Float, *, sight: float) -> list[Limit]:

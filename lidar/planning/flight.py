@@ -18,6 +18,7 @@ from lidar.planning.path import Ground
 from lidar.planning.route import Route, free_route
 
 _ARC_STEP = np.radians(2.0)
+_STEP = 10.0  # metres between points of a flight at which the ground is looked for
 _ALONG = np.cos(np.radians(15.0))  # minimum cosine of the angle between the course and a strip
 _LEAD_NS = 1_000_000_000  # nanoseconds before and after a strip for which scanners work
 
@@ -53,17 +54,21 @@ def survey_flight(
     heading_deg: float = 90.0,
     run_out: float = 0.0,
     ground: Ground | None = None,
+    follow: bool = False,
     limit: float = np.inf,
 ) -> Route:
     """The route over an area in parallel strips, flown in alternating directions.
 
     area        : shapely polygon in scene metres
     spacing     : metres between strips: every point of the area is within half of it of one
-    height      : metres of z; above the highest ground under the flight if a ground is given
+    height      : metres of z; above the ground if one is given
     radius      : metres of the turns from strip to strip; where two of them do not fit between strips the
                   turn first swings out (an omega)
     heading_deg : of the first strip, clockwise from grid north
     run_out     : metres flown straight before and after the area
+    ground      : of scene x (n,), y (n,), in order of the flight
+    follow      : keep the height above the ground below each point; by default the flight is level, above the
+                  highest ground below it
     limit       : m/s
 
     Raises RouteError for an area or spacing that is not positive.
@@ -84,8 +89,19 @@ def survey_flight(
             x = max(ends[1][k : k + 2]) if forth else min(ends[0][k : k + 2])
             parts.append(_turn(float(x), y, spacing=spacing, radius=radius, way=1.0 if forth else -1.0))
     xy = np.concatenate(parts) @ back
-    top = float(ground(xy[:, 0], xy[:, 1]).max()) if ground is not None else 0.0
-    return free_route(np.column_stack([xy, np.full(len(xy), top + height)]), limit=limit)
+    if ground is None:
+        return free_route(np.column_stack([xy, np.full(len(xy), height)]), limit=limit)
+    dense = dense_line(xy)
+    below = ground(dense[:, 0], dense[:, 1])
+    if follow:
+        return free_route(np.column_stack([dense, below + height]), limit=limit)
+    return free_route(np.column_stack([xy, np.full(len(xy), float(below.max()) + height)]), limit=limit)
+
+
+def dense_line(xy: Float) -> Float:
+    """A line (n, 2) with points every ten metres or closer, at which a flight looks at the ground."""
+    dense: Float = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(xy), _STEP))
+    return dense
 
 
 def _strips(area: Any, spacing: float, *, heading_deg: float) -> tuple[Float, Float, Float, Float]:

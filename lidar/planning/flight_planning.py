@@ -19,7 +19,14 @@ from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float
 from lidar.errors import InputError, RouteError
 from lidar.geometry.poses import Trajectory
-from lidar.planning.flight import Flight, survey_flight, survey_lines, times_on_lines, waypoint_flight
+from lidar.planning.flight import (
+    Flight,
+    dense_line,
+    survey_flight,
+    survey_lines,
+    times_on_lines,
+    waypoint_flight,
+)
 from lidar.planning.motion import drive_path
 from lidar.planning.path import plan_path
 from lidar.planning.road_drive import ROUTE_MARGIN_S, graph_on_tiles
@@ -37,9 +44,9 @@ ALTITUDES = {"slow": 60.0, "fast": 600.0}
 _STREET_RADIUS = 20.0  # metres, largest turning radius that can follow streets
 _HIGH = 1e4
 _LAYERS = 16  # surfaces above the ground that a vertical ray passes at most
+_BORDER = 1e-3  # metres inside the scene's border, on which rays may miss the ground
 _CLEAR = 2.0  # metres, minimum clearance above the scene
 _STEEPEST = 0.2  # sine of the smallest depression angle of a beam that counts for the swath
-_STEP = 10.0
 _LONGEST_S = 6 * 3600.0  # seconds: few aircraft stay up longer, and plans of longer flights fill the memory
 _FURTHEST = 20_000.0  # metres from the scene to a waypoint; sensors do not range further
 _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
@@ -51,8 +58,9 @@ class FlightOptions:
 
     survey    : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area to fly over in
                 parallel strips, instead of a route
-    altitude  : metres above the ground: for a survey above the highest ground under it, else above the ground
-                below each point. By default the heights of the route's file, or `ALTITUDES`
+    altitude  : metres above the ground below each point; surveys of craft that cannot hover (`cruise`) are
+                level, above the highest ground below them. By default the heights of the route's file, or
+                `ALTITUDES`
     overlap   : share of a strip that the next one covers too
     turns     : scan in the turns between strips too
     seed      : of a random route
@@ -174,7 +182,14 @@ class _SceneBelow:
         return _HIGH - hits.range
 
     def ground(self, x: Float, y: Float) -> Float:
-        """Height (n,) of the ground below buildings and trees; the mean of the others where there is none."""
+        """Height (n,) of the ground below buildings and trees along a line.
+
+        Outside the scene it is that of the nearest place on its border. Where there is no ground, it is
+        interpolated between the points before and after, and 0 if none has any.
+        """
+        xmin, ymin, xmax, ymax = self._scene.bounds
+        x = np.clip(x, xmin + _BORDER, xmax - _BORDER)
+        y = np.clip(y, ymin + _BORDER, ymax - _BORDER)
         world = self._load(x, y)
         origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
         found = np.full(len(x), np.nan)
@@ -189,8 +204,8 @@ class _SceneBelow:
             if not len(left):
                 break
             origin[left, 2] -= 1e-3
-        mean = float(np.nanmean(found)) if np.isfinite(found).any() else 0.0
-        return np.where(np.isfinite(found), found, mean)
+        known = np.flatnonzero(np.isfinite(found))
+        return np.interp(np.arange(len(x)), known, found[known]) if len(known) else np.zeros(len(x))
 
 
 def _along(
@@ -232,15 +247,9 @@ def _along(
         )
     if options.altitude is None and given:
         return waypoint_flight(xyz, limit=vehicle.max_speed)
-    xy = _dense(xyz[:, :2])
+    xy = dense_line(xyz[:, :2])
     level = np.column_stack([xy, np.full(len(xy), above)])
     return waypoint_flight(level, ground=below.ground, limit=vehicle.max_speed)
-
-
-def _dense(xy: Float) -> Float:
-    """A line (n, 2) with points every ten metres or closer, so that a flight follows the ground."""
-    dense: Float = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(xy), _STEP))
-    return dense
 
 
 def _strips(
@@ -280,6 +289,7 @@ def _strips(
         heading_deg=heading_deg,
         run_out=stop,
         ground=below.ground,
+        follow=not vehicle.cruise,
         limit=vehicle.max_speed,
     )
     return route, survey_lines(area, spacing=spacing, heading_deg=heading_deg), spacing
@@ -326,8 +336,11 @@ def _polygon(path: Path) -> Any:
 def swath(sensors: Sequence[Scanner | Camera], height: float) -> float:
     """Width in metres of the swath that all scanners (without scanners, all cameras) cover from a height.
 
-    Raises RouteError if a sensor does not look down, or its maximum range is less than the height.
+    Raises RouteError without sensors, if a sensor does not look down, or if its maximum range is less than
+    the height.
     """
+    if not sensors:
+        raise RouteError("a survey needs a rig with a scanner or a camera, such as drone or aircraft")
     lidars = [s for s in sensors if isinstance(s, Scanner)]
     return min(_swath(s, height) for s in lidars or sensors)
 

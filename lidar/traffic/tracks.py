@@ -77,29 +77,69 @@ def actor_table(
 
 
 def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, scale: float) -> Actors:
-    """Actors of the trips that appeared in a simulation."""
+    """Actors of the trips that appeared in a simulation, while they are on the scene.
+
+    Streets may lead beyond the bounds of a map, where there is no ground. A road user that comes back is
+    another actor.
+    """
     n = len(flow.trip)
     counts = sum(
         (np.bincount(flow.trip[rows], minlength=len(trips)) for rows in row_blocks(n, BLOCK_POSES)),
         np.zeros(len(trips), np.int64),
     )
     present, first = np.flatnonzero(counts), np.cumsum(counts) - counts
-    knots = Knots(room((n,), np.int64), room((n, 3)), room((n, 3)), room((n, 3)), room((n,)))
+    knots, inside = _room_for(n), np.empty(n, bool)
     for some in _together(present, trips, counts=counts):  # in order of time: they are near each other
         rows = np.concatenate([np.arange(first[row], first[row] + counts[row]) for row in some])
         tracks = _tracks([trips[row] for row in some], flow.take(rows), counts=counts[some])
         part = knots_on_ground(scene, tracks, scale=scale)
         for name, column in knots.columns().items():
             column[rows] = getattr(part, name)
+        half = np.repeat(
+            [np.hypot(trips[row].length, trips[row].width) / 2 * scale for row in some], counts[some]
+        )
+        inside[rows] = _inside(scene, part.position, half=half)
         release(*knots.columns().values(), *flow.columns().values())
+    trip, counts = present, counts[present]
+    if not inside.all():
+        knots, trip, counts = _parts_inside(knots, inside, trip=present, counts=counts)
     return actor_table(
-        [trips[row].shape for row in present.tolist()],
-        [trips[row].stretch for row in present.tolist()],
-        knots=counts[present],
+        [trips[row].shape for row in trip.tolist()],
+        [trips[row].stretch for row in trip.tolist()],
+        knots=counts,
         motion=knots,
         parked=False,
         scale=scale,
     )
+
+
+def _room_for(n: int) -> Knots:
+    """Room for ``n`` knots."""
+    return Knots(room((n,), np.int64), room((n, 3)), room((n, 3)), room((n, 3)), room((n,)))
+
+
+def _inside(scene: Scene, position: Float, *, half: Float) -> NDArray[np.bool_]:
+    """Whether (n,) bodies of half diagonals (n,) at positions (n, 3) are within the scene's bounds."""
+    low, high = np.reshape(scene.bounds, (2, 2))
+    xy = position[:, :2]
+    return np.asarray(((xy - half[:, None] >= low) & (xy + half[:, None] <= high)).all(axis=1), np.bool_)
+
+
+def _parts_inside(
+    knots: Knots, inside: NDArray[np.bool_], *, trip: Ints, counts: Ints
+) -> tuple[Knots, Ints, Ints]:
+    """The knots inside, and of each uninterrupted part its trip and its number of knots, two or more."""
+    of = np.where(inside, np.repeat(trip, counts), -1)
+    starts = np.flatnonzero(np.diff(of, prepend=-2))
+    sizes = np.diff(starts, append=len(of))
+    part = (of[starts] >= 0) & (sizes > 1)
+    kept = np.flatnonzero(np.repeat(part, sizes))
+    out = _room_for(len(kept))
+    for rows in row_blocks(len(kept), BLOCK_POSES):
+        for name, column in out.columns().items():
+            column[rows] = getattr(knots, name)[kept[rows]]
+        release(*out.columns().values(), *knots.columns().values())
+    return out, of[starts[part]], sizes[part]
 
 
 def _together(rows: Ints, trips: Sequence[Trip], *, counts: Ints) -> Iterator[list[int]]:

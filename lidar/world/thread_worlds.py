@@ -61,8 +61,6 @@ class Worlds:
     def _loaded(self, world: World | None, region: Region) -> World:
         if world is None:
             shapes = actor_shapes(self.actors) if self.actors is not None else ()
-            return World.load(
-                self.scene, region=region, margin=self.margin, actors=shapes, settings=self.settings
-            )
+            world = World(self.scene, margin=self.margin, actors=shapes, settings=self.settings)
         world.follow(region)
         return world

@@ -146,19 +146,19 @@ class World:
         """
         world = cls(scene, margin=margin, actors=actors, settings=settings, backend=backend)
         world.follow(scene.bounds if region is None else region)
+        if region is not None and not world.has_tiles:
+            raise InputError(
+                f"no tile of {scene.path} lies in {tuple(round(float(v), 1) for v in region)};"
+                f" the scene covers {scene.bounds}"
+            )
         return world
 
     def follow(self, region: Region) -> None:
-        """Load another region in place; tiles of both regions are kept.
+        """Load another region in place; tiles of both regions are kept. Away from the scene there are none.
 
         The hits depend on the region alone, not on earlier ones.
         """
         ranks = _tiles_intersecting(self.scene, region, margin=self.margin + OVERHANG)
-        if not ranks:
-            raise InputError(
-                f"no tile of {self.scene.path} lies in {tuple(round(float(v), 1) for v in region)};"
-                f" the scene covers {self.scene.bounds}"
-            )
         xmin, ymin, xmax, ymax = region
         origin = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 0.0])
         origin = np.round(origin / _GRID) * _GRID if self.settings.origin == "near" else np.zeros(3)
@@ -232,6 +232,11 @@ class World:
             found = shelter_of(parts, origin=self.caster.origin, corner=corner, count=int(2 * half / CELL))
             self._sheltered = dict([*self._sheltered.items(), (place, found)][-_KEPT:])
         return self._sheltered[place]
+
+    @property
+    def has_tiles(self) -> bool:
+        """Whether any tile of the scene is loaded."""
+        return bool(self._tiles)
 
     @property
     def reach(self) -> float:

@@ -70,7 +70,10 @@ def test_a_worker_that_does_not_see_the_folder_is_named_before_planning(address,
 
 def test_workers_with_other_sources_are_refused_before_planning(address, osm, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.cluster.sources_digest", lambda _: "of this process")
-    with connected(address) as cluster, pytest.raises(InputError, match=r"tcp.* are not those of this program"):
+    with (
+        connected(address) as cluster,
+        pytest.raises(InputError, match=r"tcp.* are not those of this program"),
+    ):
         build(osm, tmp_path / "scene", cluster=cluster)
     assert not list(tmp_path.iterdir())
 

@@ -46,6 +46,20 @@ def test_strips_cover_the_area_and_can_be_flown(name, spacing, run_out, heading)
     assert not away.any()
 
 
+def hill(x, y):
+    """Ground (n,) with a hill of 120 m in the middle of the area."""
+    return 30.0 + 120.0 * np.exp(-((np.asarray(x) - 450.0) ** 2 + (np.asarray(y) - 350.0) ** 2) / 200.0**2)
+
+
+@pytest.mark.parametrize(("follow", "lowest", "highest"), [(True, 80.0, 80.0), (False, 80.0, 200.0)])
+def test_surveys_follow_the_ground_or_fly_level_above_its_highest_point(follow, lowest, highest):
+    route = survey_flight(AREA, spacing=60.0, height=80.0, radius=4.0, ground=hill, follow=follow)
+    path = plan_path(route, load_vehicle("drone"), frame=FRAME)
+    above = path.position[:, 2] - hill(*path.position[:, :2].T)
+    assert above.min() == pytest.approx(lowest, abs=2.0)
+    assert above.max() == pytest.approx(highest, abs=4.0)
+
+
 def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
     craft = load_vehicle("aircraft")
     route = survey_flight(AREA, spacing=400.0, height=500.0, radius=700.0, run_out=400.0)

@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 import shapely
 from helpers.programs import run_program
+from helpers.rasters import write_slope
 
+from geoscene.options import BuildOptions
+from geoscene.pipeline import build
 from geoscene.scene import SceneFiles
+from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.errors import FormatError, InputError, RouteError
@@ -24,6 +28,7 @@ from lidar.planning.replay import read_replay
 from lidar.rig.devices import cameras, scanners
 from lidar.rig.specs import load_rig
 from lidar.rig.vehicle import load_vehicle
+from lidar.traffic.ground import ground_heights
 
 
 def flight(scene, rig="drone", **change):
@@ -73,8 +78,33 @@ def test_a_survey_flies_over_every_part_of_its_area(scene):
     track = shapely.linestrings(trajectory.position[:, :2])
     area = survey_area(scene, "all")
     assert shapely.difference(area, shapely.buffer(track, half)).area < 0.002 * area.area
-    assert np.ptp(trajectory.position[:, 2]) < 1e-6
+    assert np.ptp(trajectory.position[:, 2]) < 0.1
     assert trajectory.position[0, 2] == pytest.approx(90.0, abs=3.0)  # the scene is level
+
+
+@pytest.fixture(scope="module")
+def hillside(tmp_path_factory):
+    """A scene on a slope of about one in three."""
+    folder = tmp_path_factory.mktemp("hillside")
+    box = (24.9430, 60.1669, 24.9455, 60.1684)
+    raster = write_slope(folder / "hill.tif", box, rise=10.0)
+    osm = read_osm(demo_path(), bounds=box)
+    return build(osm, folder / "scene", options=BuildOptions(dem=(str(raster),), use="lidar"))
+
+
+def test_drones_survey_at_a_height_above_the_ground_below_them_and_aircraft_fly_level(hillside):
+    drone = flight(hillside, survey="all", altitude=60.0).position
+    xmin, ymin, xmax, ymax = hillside.bounds
+    inside = (np.abs(drone[:, :2] - [(xmin + xmax) / 2, (ymin + ymax) / 2]) < 50.0).all(axis=1)
+    over = drone[inside][::50]
+    ground = ground_heights(hillside, over - [0.0, 0.0, 60.0], above=30.0, below=30.0)
+    known = np.isfinite(ground)  # other surfaces, such as those of bridges, are none
+    assert known.mean() > 0.9
+    assert np.ptp(ground[known]) > 10.0
+    np.testing.assert_allclose((over[:, 2] - ground)[known], 60.0, atol=3.0)
+    level = flight(hillside, "aircraft", survey="all", altitude=600.0).position[:, 2]
+    assert np.ptp(level) < 1e-6
+    assert level[0] - drone[:, 2].max() == pytest.approx(540.0, abs=3.0)
 
 
 def test_the_swath_follows_from_the_field_of_view():
@@ -83,6 +113,8 @@ def test_the_swath_follows_from_the_field_of_view():
     assert swath(scanners(aircraft), 600.0) == pytest.approx(2 * 600 * np.tan(np.radians(30)), rel=0.05)
     with pytest.raises(RouteError, match="is 6000 m"):
         swath(scanners(aircraft), 7000.0)
+    with pytest.raises(RouteError, match="needs a rig with a scanner or a camera"):
+        swath([], 60.0)
 
 
 def test_more_overlap_gives_more_strips_and_areas_come_from_files_or_boxes(scene, tmp_path):
@@ -193,6 +225,18 @@ def test_a_drive_replayed_in_another_frame_keeps_its_geographic_positions(scene,
     one, other = (t.at(t.time_ns[::100]).place(ahead) for t in (here, there))
     found = scene.frame.from_geographic(*scene_utm.frame.to_geographic(*other[:, :2].T))
     np.testing.assert_allclose(np.column_stack(found), one[:, :2], atol=1e-4)
+
+
+def test_a_replay_that_never_comes_near_the_scene_is_refused(scene, driven, tmp_path):
+    first, *lines = (driven / "trajectory.csv").read_text().splitlines()
+    column = first.split(",").index("x")
+    rows = [line.split(",") for line in lines]
+    moved = [[*row[:column], str(float(row[column]) + 5000.0), *row[column + 1 :]] for row in rows]
+    (tmp_path / "trajectory.csv").write_text("\n".join([first, *map(",".join, moved)]))
+    options = DriveOptions(rig="vlp16", route=tmp_path / "trajectory.csv", formats=("pcd",))
+    with pytest.raises(RouteError, match=r"comes no closer than 4,[0-9]{3} m"):
+        drive(scene, tmp_path / "x", options=options)
+    assert not (tmp_path / "x").exists()
 
 
 def test_tables_without_poses_are_refused(scene, tmp_path):

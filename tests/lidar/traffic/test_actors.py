@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -96,6 +97,19 @@ def test_vehicles_stand_on_the_ground(actors, scene):
     hits = world.caster.cast(start, np.tile([0.0, 0.0, -1.0], (len(rows), 1)))
     off = at.position[:, 2] - (start[:, 2] - hits.range)
     assert np.abs(off).max() < 0.15
+
+
+def test_road_users_are_there_only_while_they_are_on_the_scene(scene, ego, actors):
+    """Streets of a part of a map lead beyond it, where there is no ground."""
+    part = replace(scene, manifest=scene.manifest | {"bounds": np.divide(scene.bounds, 2).tolist()})
+    low, high = np.reshape(part.bounds, (2, 2))
+    found = populate(part, scene.road_graph(), ego=ego, vehicle=CAR, seed=5, options=BUSY)
+    assert 3 < (~found.parked).sum() < (~actors.parked).sum()
+    for t in range(0, ego.duration_ns, 500_000_000):
+        rows = existing_actors(found, t, end_ns=t)
+        corners = shapely.bounds(outlines(found, rows[~found.parked[rows]], t)).reshape(-1, 4)
+        assert (corners[:, :2] >= low - 0.6).all()  # bodies at an angle reach further than half their length
+        assert (corners[:, 2:] <= high + 0.6).all()
 
 
 def test_feature_numbers_follow_those_of_the_scene(actors, scene):

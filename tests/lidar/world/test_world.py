@@ -124,6 +124,15 @@ def test_a_region_loads_only_its_own_tiles(scene):
         World.load(scene, region=(5000, 0, 5010, 10))
 
 
+def test_away_from_the_scene_there_is_nothing_to_hit(scene):
+    """As for an aircraft that turns beyond the area that it surveys."""
+    world = World(scene, margin=10)
+    for x, hit in ((115.0, True), (5000.0, False), (115.0, True)):
+        world.follow((x - 5, 50, x + 5, 60))
+        assert world.caster.occluded([[x, 55.0, 30.0]], DOWN).item() == hit
+        assert world.has_tiles == hit
+
+
 def test_hits_do_not_depend_on_earlier_regions(scene):
     rng = np.random.default_rng(1)
     way = rng.normal(size=(20_000, 3))
