@@ -111,6 +111,11 @@ def read_path(source: Path, *, truth: Dataset | None, sensor: str) -> Path3D:
     """
     source = file_of(source)
     if source.is_dir():
+        if not (source / MANIFEST).is_file():
+            raise InputError(
+                f"{source}: neither a dataset, a folder of lidar odometry, nor one of detections"
+                " (NNNNNN.txt or results.json)"
+            )
         return true_path(open_dataset(source))
     if source.suffix.lower() == ".csv":
         return _read_csv(source, truth=truth)

@@ -310,9 +310,14 @@ def load_rig(name: str | Path) -> Rig:
 def rig_of(rig: str) -> Rig:
     """A rig as a recipe names it: its name or file, and a digest.
 
-    Raises InputError if the rig has changed since.
+    Raises RigError if its file is not there, and InputError if it has changed since.
     """
     name = rig.rpartition(" (")[0]
+    if name.endswith(".toml") and not Path(name).is_file():
+        raise RigError(
+            f"rig {name}: the drive's file is not there; run the command in the directory of `lidar drive`,"
+            " or put the file back"
+        )
     if f"{name} ({rig_digest(name)})" != rig:
         raise InputError(f"rig {name}: has changed since the drive")
     return load_rig(name)

@@ -341,6 +341,11 @@ def test_what_is_no_trajectory_is_refused(tmp_path, text, message):
         read_path(tmp_path / "e.txt", truth=None, sensor="")
 
 
+def test_a_folder_that_holds_no_estimate_is_refused(tmp_path):
+    with pytest.raises(InputError, match="neither a dataset, a folder of lidar odometry, nor"):
+        read_path(tmp_path, truth=None, sensor="")
+
+
 def test_a_folder_is_written_whole_with_figures_and_tables(tmp_path):
     drive(tmp_path / "d")
     truth, _ = read_truth(tmp_path / "d")

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar.dataset.metadata import calibration
-from lidar.errors import RigError
+from lidar.errors import InputError, RigError
 from lidar.rig.devices import scanners
 from lidar.rig.scanner import load_sensor, sensor_names
-from lidar.rig.specs import load_rig, rig_digest, rig_names
+from lidar.rig.specs import load_rig, rig_digest, rig_names, rig_of
 
 
 def test_all_rigs_load_and_their_sensors_too():
@@ -259,6 +259,19 @@ def test_every_number_of_every_preset_has_a_source():
         text = (folder / f"{name}.toml").read_text()
         keys = {line.split(" = ")[0] for line in text.split("[source]")[0].splitlines() if " = " in line}
         assert keys - words == set(sensor.source), name
+
+
+def test_the_rig_of_a_drive_is_found_again_only_as_it_was(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('name = "mine"\nvehicle = "car"\n')
+    recorded = f"{path} ({rig_digest(path)})"
+    assert rig_of(recorded).name == "mine"
+    path.write_text('name = "other"\nvehicle = "car"\n')
+    with pytest.raises(InputError, match="has changed since the drive"):
+        rig_of(recorded)
+    path.unlink()
+    with pytest.raises(RigError, match="run the command in the directory of"):
+        rig_of(recorded)
 
 
 @settings(max_examples=60, deadline=None)
