@@ -68,7 +68,7 @@ def survey_flight(
     run_out     : metres flown straight before and after the area
     ground      : of scene x (n,), y (n,), in order of the flight
     follow      : keep the height above the ground below each point; by default the flight is level, above the
-                  highest ground below it
+                  highest ground below it and along the area's outline
     limit       : m/s
 
     Raises RouteError for an area or spacing that is not positive.
@@ -92,9 +92,11 @@ def survey_flight(
     if ground is None:
         return free_route(np.column_stack([xy, np.full(len(xy), height)]), limit=limit)
     dense = dense_line(xy)
-    below = ground(dense[:, 0], dense[:, 1])
     if follow:
+        below = ground(dense[:, 0], dense[:, 1])
         return free_route(np.column_stack([dense, below + height]), limit=limit)
+    edge = dense_line(shapely.get_coordinates(area.exterior))
+    below = ground(*np.concatenate([dense, edge]).T)
     return free_route(np.column_stack([xy, np.full(len(xy), float(below.max()) + height)]), limit=limit)
 
 
