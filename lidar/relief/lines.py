@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lidar.raycast.memory import inlined
 
 _OVER, _FARTHEST = 1e-3, 0.1
@@ -14,15 +12,15 @@ metres along the ray at most."""
 
 
 @inlined
-def beyond_plane(leaving: float, direction: Any) -> Any:
+def beyond_plane(leaving: float, length: float) -> Any:
     """Parameter by which a ray goes on beyond a plane that it crosses from behind.
 
     leaving : metres that it leaves the plane by per parameter, above 0
+    length  : metres per parameter
 
     A ray that starts on the plane itself would meet it again in float32.
     """
-    x, y, z = direction
-    return min(_OVER / leaving, _FARTHEST / np.sqrt(x * x + y * y + z * z))
+    return min(_OVER / leaving, _FARTHEST / length)
 
 
 @inlined

@@ -120,7 +120,8 @@ class Roughness(NamedTuple):
              the axis along which they are more
     unit   : (f,) unit of ``steep``
     number : (k,) field of each kind
-    kinds  : (k, 7) factor of the field, stones as in `Kind`, greatest depth and greatest slope
+    kinds  : (k, 8) factor of the field, stones as in `Kind`, greatest depth, greatest slope, and one over the
+             factor
     """
 
     field: NDArray[np.float32]
@@ -147,6 +148,7 @@ def roughness() -> Roughness:
     kinds = np.array(rows)
     kinds[:, 5] -= kinds[:, 0] * field.min(axis=(1, 2))[number]
     kinds[:, 6] += kinds[:, 0] * np.array([_steepest(f) for f in field])[number]
+    kinds = np.column_stack([kinds, 1.0 / kinds[:, 0]])
     steep = np.stack([_steepness(f) for f in field])
     unit = steep.max(axis=(1, 2, 3)) / 254.0
     steep = np.ceil(steep / unit[:, None, None, None]).astype(np.uint8)

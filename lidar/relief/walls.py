@@ -349,7 +349,8 @@ def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
         return 0.0
     s, axis, part = march(kinds, k, ray, near, layer)
     if part == OUT:
-        return s + beyond_plane(-dz, direction)
+        length = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+        return s + beyond_plane(-dz, length)
     if part == INFILL and rays.mask & tables.bits[k] == 0:
         s, axis = in_room(kinds, k, frame[w, _WIDTH], height_of(frame, w, bottom), ray)
         part = ROOM

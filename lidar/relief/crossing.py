@@ -1,0 +1,274 @@
+"""First crossings of rays with the rough ground of a kind, as compiled code.
+
+Rays are put into lanes and followed by turns; a lane is a column of a table whose rows are named below.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from geoscene.typing import Float
+from lidar.raycast.memory import called, inlined
+from lidar.relief.roughness import BLOCK, KINDS, NODES, STEP, roughness
+
+DEPTH, _SLOPE, _SCALE = 5, 6, 7
+"""Columns of `Roughness.kinds`."""
+
+_CELLS = 1.0 / STEP
+"""Cells of a field per metre."""
+
+_LEAST = 5e-4
+"""Metres along the plane that a step among joints covers at least; dips shorter than that can be missed."""
+
+_STEPS = 4096
+_NARROWINGS = 60
+"""Steps towards the surface at most, and narrowings of the step that crosses it."""
+
+_PAST = 1e-7
+"""Cells by which a step goes past the border of a cell."""
+
+_DIFFERENCE = 1e-3
+"""Metres to both sides over which the slope of joints is measured, so that normals in them point upwards."""
+
+LANES = 64
+"""Rays that are followed by turns."""
+
+_X, _Y, _Z, DX, DY, _DZ, _OVER_X, _OVER_Y, _UNIT, _PASSES = range(10)
+_T, END, _KIND, FOUND, SLOPE_X, SLOPE_Y, GAIN, LENGTH = range(10, 18)
+COLUMNS = 18
+"""Columns of a lane: place in cells and height in units of the field, their changes, one over those along x
+and y, steepness and steps past borders per parameter; parameter, its end, kind, crossing, slopes there,
+height that the ray gains on the plane, and length of the direction."""
+
+_CLOSE = 1e-8
+"""Metres from the surface at which a crossing is found."""
+
+
+def heights(kind: str, xy: Float) -> Float:
+    """Heights (n,) of a kind of ground at places (n, 2), scene metres, relative to the plane: 0 or less."""
+    out = np.empty(len(xy))
+    _heights(roughness(), list(KINDS).index(kind), np.ascontiguousarray(xy, np.float64), out)
+    return out
+
+
+@inlined
+def _cell(field: Any, u: float, v: float) -> Any:
+    """Block of a place in cells, the place in its cell, and the surface there, a + p u + q v + r u v."""
+    fu, fv = np.floor(u), np.floor(v)
+    last = np.uint64(NODES - 1)
+    i, j = np.uint64(np.int64(fu)) & last, np.uint64(np.int64(fv)) & last
+    k, m = (i + np.uint64(1)) & last, (j + np.uint64(1)) & last
+    row, next_row = i * np.uint64(NODES), k * np.uint64(NODES)
+    a = np.float64(field[row + j])
+    p, q = np.float64(field[next_row + j]) - a, np.float64(field[row + m]) - a
+    r = np.float64(field[next_row + m]) - a - p - q
+    block = (i // np.uint64(BLOCK)) * np.uint64(NODES // BLOCK) + j // np.uint64(BLOCK)
+    return block, u - fu, v - fv, a, p, q, r
+
+
+@inlined
+def _joint(length: float, width: float, joint: float, deep: float, x: float, y: float) -> Any:
+    """Height among stones in stretcher bond: 0 on top, ``-deep`` in the middle of joints."""
+    row = np.floor(y / width)
+    v = y - row * width
+    u = x + (0.5 * length if np.int64(row) & 1 else 0.0)
+    u -= np.floor(u / length) * length
+    edge = min(u, length - u, v, width - v)
+    return -deep * max(1.0 - 2.0 * edge / joint, 0.0)
+
+
+@inlined
+def _joints(rough: Any, k: int, x: float, y: float) -> Any:
+    """Height of a kind with stones above its waves."""
+    kinds = rough.kinds
+    return _joint(kinds[k, 1], kinds[k, 2], kinds[k, 3], kinds[k, 4], x, y)
+
+
+@called
+def _height(rough: Any, k: int, x: float, y: float) -> Any:
+    _, u, v, a, p, q, r = _cell(rough.field[rough.number[k]], x * _CELLS, y * _CELLS)
+    h = rough.kinds[k, 0] * (a + p * u + q * v + r * u * v)
+    return h + _joints(rough, k, x, y) if rough.kinds[k, 1] > 0.0 else h
+
+
+@inlined
+def _slopes(rough: Any, k: int, x: float, y: float) -> Any:
+    """Slopes of `_height` along x and y."""
+    _, u, v, _, p, q, r = _cell(rough.field[rough.number[k]], x * _CELLS, y * _CELLS)
+    factor = rough.kinds[k, 0] * _CELLS
+    sx, sy = factor * (p + r * v), factor * (q + r * u)
+    if rough.kinds[k, 1] > 0.0 and _joints(rough, k, x, y) < 0.0:
+        d = _DIFFERENCE
+        sx += (_joints(rough, k, x + d, y) - _joints(rough, k, x - d, y)) / (2.0 * d)
+        sy += (_joints(rough, k, x, y + d) - _joints(rough, k, x, y - d)) / (2.0 * d)
+    return sx, sy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _heights(rough: Any, k: int, xy: Any, out: Any) -> None:
+    for i in range(len(out)):
+        out[i] = _height(rough, k, xy[i, 0], xy[i, 1])
+
+
+@inlined
+def _gap(rough: Any, k: int, place: Any, way: Any, t: float) -> Any:
+    """Metres of a ray above the surface at a parameter."""
+    return place[2] + t * way[2] - _height(rough, k, place[0] + t * way[0], place[1] + t * way[1])
+
+
+@called
+def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any) -> Any:
+    """The crossing between two parameters with the gaps there, by false position (Illinois)."""
+    (a, above), (b, below) = low, high
+    side = 0
+    for _ in range(_NARROWINGS):
+        t = (a * below - b * above) / (below - above)
+        if not a < t < b:
+            return b if t >= b else a
+        gap = _gap(rough, k, place, way, t)
+        if gap > 0.0:
+            a, above = t, gap
+            if gap < _CLOSE:
+                return a
+            if side > 0:
+                below *= 0.5
+            side = 1
+        else:
+            b, below = t, gap
+            if side < 0:
+                above *= 0.5
+            side = -1
+    return a
+
+
+@called
+def _among_joints(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """Ray parameter of the first crossing of the surface by a ray that is below the top of the stones.
+
+    Steps are so short that the greatest slope cannot reach the ray within them, but for those of `_LEAST`
+    metres.
+    """
+    dx, dy, dz = way
+    across = np.sqrt(dx * dx + dy * dy)
+    closing = across * rough.kinds[k, _SLOPE] + abs(dz)
+    shortest = _LEAST / max(across, abs(dz))
+    t, gap = start, _gap(rough, k, place, way, start)
+    if gap <= 0.0:
+        return t
+    for _ in range(_STEPS):
+        ahead = min(t + max(gap / closing, shortest), end)
+        there = _gap(rough, k, place, way, ahead)
+        if there <= 0.0:
+            return _narrowed(rough, k, place, way, (t, gap), (ahead, there))
+        if ahead >= end:
+            return np.inf
+        t, gap = ahead, there
+    return t
+
+
+@called
+def _in_joint(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
+    """`_crossing` of a ray that is below the top of the stones at ``start``."""
+    t = _among_joints(rough, k, place, way, start, end)
+    sx, sy = 0.0, 0.0
+    if t < np.inf:
+        sx, sy = _slopes(rough, k, place[0] + t * way[0], place[1] + t * way[1])
+    return t, sx, sy
+
+
+@inlined
+def _inverse(way: float) -> Any:
+    """One over a change; for none a number so great that no border is reached."""
+    return 1.0 / way if way != 0.0 else 1e300
+
+
+@inlined
+def begin(rough: Any, k: int, place: Any, way: Any, direction: Any, span: Any, lanes: Any, n: int) -> None:
+    """Put a ray into a lane.
+
+    place     : x, y and height above the plane at parameter 0
+    way       : change of each per parameter
+    direction : of the ray
+    span      : first and last parameter
+    """
+    scale = rough.kinds[k, _SCALE]
+    lanes[_X, n], lanes[_Y, n], lanes[_Z, n] = place[0] * _CELLS, place[1] * _CELLS, place[2] * scale
+    dx, dy = way[0] * _CELLS, way[1] * _CELLS
+    lanes[DX, n], lanes[DY, n], lanes[_DZ, n] = dx, dy, way[2] * scale
+    lanes[_OVER_X, n], lanes[_OVER_Y, n] = _inverse(dx), _inverse(dy)
+    speed = max(abs(dx), abs(dy))
+    lanes[_UNIT, n], lanes[_PASSES, n] = rough.unit[rough.number[k]] * speed, _PAST / speed
+    lanes[_T, n], lanes[END, n] = span
+    lanes[_KIND, n], lanes[GAIN, n] = k, way[2]
+    lanes[LENGTH, n] = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+
+
+@inlined
+def _step(field: Any, steep: Any, lanes: Any, n: int) -> Any:
+    """Advance the ray of a lane by a step; whether it goes on.
+
+    A step goes as far as no place ahead of the ray's block can rise to the ray (a cone step, after Dummer
+    2006). Within a cell the surface is bilinear, and the crossing the root of a quadratic equation.
+    """
+    t, dx, dy, dz = lanes[_T, n], lanes[DX, n], lanes[DY, n], lanes[_DZ, n]
+    block, u, v, a, p, q, r = _cell(field, lanes[_X, n] + t * dx, lanes[_Y, n] + t * dy)
+    gap = lanes[_Z, n] + t * dz - (a + p * u + q * v + r * u * v)
+    towards = (2 if dx < 0.0 else 0) + (1 if dy < 0.0 else 0)
+    closing = lanes[_UNIT, n] * np.float64(steep[towards, block]) - dz
+    border = min(
+        ((1.0 if dx >= 0.0 else 0.0) - u) * lanes[_OVER_X, n],
+        ((1.0 if dy >= 0.0 else 0.0) - v) * lanes[_OVER_Y, n],
+    )
+    crosses, ends, step = gap <= 0.0, closing <= 0.0, 0.0
+    if gap > border * closing:
+        step = gap / closing
+    elif not crosses:
+        # The least t at which gap + falls t + bend t^2 is zero.
+        falls, bend = dz - (p * dx + q * dy + r * (u * dy + v * dx)), -r * dx * dy
+        under = falls * falls - 4.0 * bend * gap
+        over = np.sqrt(max(under, 0.0)) - falls
+        crosses = (under >= 0.0) & (over > 0.0) & (2.0 * gap <= border * over)
+        step = 2.0 * gap / over if crosses else border + lanes[_PASSES, n]
+    t += step
+    lanes[_T, n] = t
+    lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = p + r * (v + step * dy), q + r * (u + step * dx)
+    ends = (t > lanes[END, n]) | (ends & (not crosses))
+    lanes[FOUND, n] = np.inf if ends else t
+    return not (crosses | ends)
+
+
+@inlined
+def follow(rough: Any, lanes: Any, active: Any, count: int) -> None:
+    """Follow the rays of lanes to their first crossing: its parameter (inf: none) and the slopes there.
+
+    Rays advance by turns, for a step waits for its own numbers, but not for those of other rays.
+    """
+    for n in range(count):
+        active[n] = n
+    left = count
+    for _ in range(_STEPS):
+        kept = 0
+        for m in range(left):
+            n = active[m]
+            active[kept] = n
+            f = rough.number[np.int64(lanes[_KIND, n])]
+            kept += 1 if _step(rough.field[f], rough.steep[f], lanes, n) else 0
+        left = kept
+        if left == 0:
+            break
+    for n in range(count):
+        k = np.int64(lanes[_KIND, n])
+        factor = rough.kinds[k, 0]
+        slope = factor * _CELLS
+        lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = slope * lanes[SLOPE_X, n], slope * lanes[SLOPE_Y, n]
+        t = lanes[FOUND, n]
+        if rough.kinds[k, 1] > 0.0 and t < np.inf:
+            place = lanes[_X, n] * STEP, lanes[_Y, n] * STEP, lanes[_Z, n] * factor
+            way = lanes[DX, n] * STEP, lanes[DY, n] * STEP, lanes[_DZ, n] * factor
+            if _joints(rough, k, place[0] + t * way[0], place[1] + t * way[1]) < 0.0:
+                lanes[FOUND, n], lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = _in_joint(
+                    rough, k, place, way, t, lanes[END, n]
+                )
