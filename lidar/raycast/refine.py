@@ -33,7 +33,8 @@ class Refiner(Protocol):
 
         on : (n,) the face, as in ``hits.face`` after `refine`; -1 for none
 
-        Returns the ray parameter (n,) at which each ray crosses the plane from behind; 0 for rays that start
-        elsewhere; inf for those that hit the surface before, whose hit is written in place.
+        Returns the ray parameter (n,) at which each ray has crossed the plane from behind, by a millimetre
+        unless it is nearly parallel; 0 for rays that start elsewhere; inf for those that hit the surface
+        before, whose hit is written in place.
         """
         ...
