@@ -27,13 +27,16 @@ def scenes(tmp_path_factory):
 
 
 def contents(scene, relief):
-    """Corners of faces with class and material, and names of shapes with their places, of all tiles."""
+    """Corners of faces of solids with class and material, and names of shapes with their places."""
     shapes = scene.shapes()
     names = list(shapes)
     faces, copies = set(), []
     for rank in range(len(scene.tile_indices)):
         tile = selected_tile(scene, rank, settings=WorldSettings(relief=relief), shapes=shapes)
-        mesh, some = tile.mesh.shifted(tile.origin), tile.instances.shifted(tile.origin)
+        mesh, some = (
+            tile.mesh.take(tile.mesh.closed).shifted(tile.origin),
+            tile.instances.shifted(tile.origin),
+        )
         rows = np.column_stack([mesh.vertices[mesh.faces].reshape(-1, 9), mesh.klass, mesh.material])
         faces |= set(map(tuple, np.round(rows, 4).tolist()))
         copies += [
