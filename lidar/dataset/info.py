@@ -121,6 +121,7 @@ def _dataset(dataset: Dataset, name: str, *, full: bool, progress: Progress) -> 
             "stages": stages,
             "denoised": str(recipe.get("denoised", "")),
             "watermark_step_m": recipe.get("watermark"),
+            "settings": {str(name): str(value) for name, value in recipe.get("settings") or ()},
             "recipe": recipe,
             "derived_from": [
                 {k: str(v) for k, v in step.items()} for step in manifest.get("derived_from", ())

@@ -35,7 +35,7 @@ def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     )
     traffic = ", ".join(f"{k} {_short(v)}" for k, v in d["traffic"].items() if v not in (None, ""))
     route, fidelity = str(recipe.get("route", ""))[:60], recipe.get("fidelity", "")
-    changed = "".join(f", {name}={value}" for name, value in recipe.get("settings", ()))
+    changed = "".join(f", {name}={value}" for name, value in d["settings"].items())
     yield "options", f"route {route}, seed {d['seed']}, fidelity {fidelity}{changed}"
     yield "traffic", traffic or "none"
     for stage in d["stages"]:

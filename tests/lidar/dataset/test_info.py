@@ -187,6 +187,7 @@ def test_other_folders_are_named_with_the_command_for_them(scene, tmp_path):
         *[(k, v) for k in ("duration_ns", "length_m", "seed", "scene") for v in ("x", None, 1e999, [])],
         *[("recipe", {"stages": v}) for v in ([{"nam": 1}], 5, [[]])],
         ("recipe", {"traffic": "x"}),
+        ("recipe", {"settings": [["relief"]]}),
         ("sources", 5),
         ("sources", ["x"]),
         ("derived_from", [3]),
