@@ -110,7 +110,8 @@ def test_what_rays_hit_of_buildings_is_on_the_surfaces(places):
     behind = world.walls.panes(hits)[on] >= 0
     assert behind.any() == (places.relief != "off")
     assert on.sum() > 100
-    assert TrueSurfaces(places, limit=LIMIT).distances(points).max() < 1e-4
+    # Faces of a wall may differ by a milliradian in bearing; panes lie 5 cm or more behind it.
+    assert TrueSurfaces(places, limit=LIMIT).distances(points).max() < 0.01
 
 
 def test_rows_and_files_of_a_comparison_hold_the_distances(places, tmp_path):
