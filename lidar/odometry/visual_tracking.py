@@ -36,6 +36,8 @@ _LOOP_DRIFT = 0.02  # of the way between keyframes, by which their distance may 
 _FIRST_ANGLE = 0.01  # radians between the bearings of two views, from which they tell distances
 _UNKNOWN = 3  # first frames, whose motion before is not known well
 _OPEN = (0.05, 0.5)  # radians and metres: standard deviations of a step without matches
+_SPEEDS = np.arange(0.0, 41.0, 4.0)  # m/s ahead, from which the first motion is sought
+_ROUNDS = 2  # of distances and pose from each
 
 
 class Distances(Protocol):
@@ -101,7 +103,8 @@ def tracked(
     matched, inliers = np.zeros(count, np.int64), np.zeros(count, np.int64)
     keyframes: list[Keyframe] = []
     loops: list[tuple[int, int, Float, Float]] = []
-    rate, best, tracks = np.eye(4), 0, 0
+    rate = np.eye(4) if measure is None else _first_rate(images, camera, measure=measure, settings=settings)
+    best, tracks = 0, 0
     for row in range(count):
         progress("tracking features", row + 1, total=count)
         features = read_features(images.files[row], camera, settings=settings)
@@ -113,7 +116,7 @@ def tracked(
             continue
         last = keyframes[-1]
         expected = poses[row - 1] @ scaled_motion(rate, seconds[row])
-        rows, mine = _matches(last, features, expected=expected if row > 1 else None)
+        rows, mine = _matches(last, features, expected=None if row == 1 and measure is None else expected)
         matched[row] = len(rows)
         rng = np.random.default_rng([_SEED, row])
         pose, good, found = expected, np.zeros(len(rows), bool), None
@@ -163,6 +166,37 @@ def tracked(
                 loops += _loops(keyframes, settings=settings, rng=rng)
             best = 0
     return Tracked(keyframes, reference, relative, covariance, matched, inliers, loops)
+
+
+def _first_rate(
+    images: Stream, camera: CameraSpec, *, measure: Distances, settings: OdometrySettings
+) -> Float:
+    """Motion (4, 4) of the camera in a second, at the first image.
+
+    Setts, slabs and windows look alike: without an expectation, features are matched to others of their
+    kind. So the second image is matched near to where several speeds ahead lead the features of the first.
+    That counts with which most matches agree on a pose.
+    """
+    first, second = (read_features(images.files[row], camera, settings=settings) for row in (0, 1))
+    seconds = float(images.time_ns[1] - images.time_ns[0]) * 1e-9
+    best, most = np.eye(4), 0
+    for speed in _SPEEDS:
+        rate, agree = np.eye(4), 0
+        rate[:3, 3] = images.mount.matrix[0, :3] * speed
+        for _ in range(_ROUNDS):
+            begin = _keyframe(0, first, pose=np.eye(4), rate=rate, measure=measure, tracks=0)
+            start = scaled_motion(rate, seconds)
+            rows, mine = _matches(begin, second, expected=start)
+            rng = np.random.default_rng([_SEED, 1])
+            found = _pose_in(
+                begin, second, rows=rows, mine=mine, start=start, rate=rate, settings=settings, rng=rng
+            )
+            if found is None:
+                break
+            rate, agree = scaled_motion(found[0], 1.0 / seconds), int(np.count_nonzero(found[1]))
+        if agree > most:
+            best, most = rate, agree
+    return best if most >= ENOUGH else np.eye(4)
 
 
 def _matches(last: Keyframe, features: Features, *, expected: Float | None) -> tuple[Ints, Ints]:
