@@ -121,24 +121,55 @@ def ground_returns(points: Points, grid: Grid, *, built: Bools) -> Bools:
 
 def bridged(heights: Float) -> Float:
     """Heights without gaps: NaN cells by linear interpolation between the cells around, else the nearest."""
-    from scipy.interpolate import LinearNDInterpolator  # noqa: PLC0415 - slow to import
-    from scipy.ndimage import binary_dilation, distance_transform_edt  # noqa: PLC0415
+    from scipy.ndimage import binary_dilation, distance_transform_edt  # noqa: PLC0415 - slow to import
 
     gap = np.isnan(heights)
     if not gap.any() or gap.all():
         return heights
     row, column = distance_transform_edt(gap, return_distances=False, return_indices=True)
-    filled = heights[row, column]
+    filled = np.asarray(heights[row, column], float)
     rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
     if len(rim) > 3 and np.ptp(rim, axis=0).all():
-        holes = np.column_stack(np.nonzero(gap))
-        hull = shapely.convex_hull(shapely.multipoints(rim))
-        shapely.prepare(hull)
-        holes = holes[shapely.intersects_xy(hull, *holes.T)]  # beyond it the search would be exhaustive
-        linear = LinearNDInterpolator(rim, heights[tuple(rim.T)])(holes)
-        inside = ~np.isnan(linear)
-        filled[tuple(holes[inside].T)] = linear[inside]
-    return np.asarray(filled, float)
+        linear = _interpolated(rim, heights[tuple(rim.T)], shape=heights.shape)
+        between = gap & np.isfinite(linear)
+        filled[between] = linear[between]
+    return filled
+
+
+def _interpolated(places: NDArray[np.int64], values: Float, *, shape: tuple[int, ...]) -> Float:
+    """Values (rows, columns) of the Delaunay triangles over cells (n, 2); NaN beside all triangles.
+
+    The triangles are burnt into the raster: SciPy's interpolator solves equations for each of them in threads
+    that wait for one another, which takes many times as long on a busy machine.
+    """
+    from rasterio import Affine  # noqa: PLC0415 - slow to import
+    from rasterio.features import rasterize  # noqa: PLC0415
+    from scipy.spatial import Delaunay  # noqa: PLC0415
+
+    out = np.full(shape, np.nan)
+    corners = Delaunay(places).simplices
+    a, u, v = _edges(places[corners].astype(float))
+    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    corners, a, u, v, area = (some[np.abs(area) > 0.5] for some in (corners, a, u, v, area))
+    if not len(corners):
+        return out
+    outlines = shapely.polygons(places[corners][:, :, ::-1].astype(float))
+    numbered = zip(outlines.tolist(), range(1, len(outlines) + 1), strict=True)
+    centres = Affine(1.0, 0.0, -0.5, 0.0, 1.0, -0.5)
+    owner = rasterize(numbered, shape, transform=centres, dtype="int32")
+    cell = np.nonzero(owner)
+    k = owner[cell] - 1
+    off = np.column_stack(cell) - a[k]
+    s = (off[:, 0] * v[k, 1] - off[:, 1] * v[k, 0]) / area[k]
+    t = (u[k, 0] * off[:, 1] - u[k, 1] * off[:, 0]) / area[k]
+    z = values[corners[k]]
+    out[cell] = z[:, 0] + s * (z[:, 1] - z[:, 0]) + t * (z[:, 2] - z[:, 0])
+    return out
+
+
+def _edges(corners: Float) -> tuple[Float, Float, Float]:
+    """First corners (m, 2) of triangles (m, 3, 2), and their edges to the two others."""
+    return corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
 
 def _low_outliers(low: Float, cell: float) -> Bools:
