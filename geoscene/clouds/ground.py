@@ -25,6 +25,9 @@ _SLOPE = 0.15
 _OFF = (0.25, 1.25)
 """Metres, and shares of the local gradient, within which a point belongs to the filtered ground."""
 
+_EMPTY = 0.6
+"""Cells of area up to which a triangle over centres of cells has no further centre within it (Pick 1899)."""
+
 
 class Grid(NamedTuple):
     """A lattice of cells.
@@ -130,46 +133,41 @@ def bridged(heights: Float) -> Float:
     filled = np.asarray(heights[row, column], float)
     rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
     if len(rim) > 3 and np.ptp(rim, axis=0).all():
-        linear = _interpolated(rim, heights[tuple(rim.T)], shape=heights.shape)
+        linear = _interpolated(heights, rim)
         between = gap & np.isfinite(linear)
         filled[between] = linear[between]
     return filled
 
 
-def _interpolated(places: NDArray[np.int64], values: Float, *, shape: tuple[int, ...]) -> Float:
-    """Values (rows, columns) of the Delaunay triangles over cells (n, 2); NaN beside all triangles.
+def _interpolated(heights: Float, places: NDArray[np.int64]) -> Float:
+    """Heights (rows, columns) on the Delaunay triangles over some cells (n, 2); NaN beside all triangles.
 
     The triangles are burnt into the raster: SciPy's interpolator solves equations for each of them in threads
     that wait for one another, which takes many times as long on a busy machine.
     """
     from rasterio import Affine  # noqa: PLC0415 - slow to import
     from rasterio.features import rasterize  # noqa: PLC0415
-    from scipy.spatial import Delaunay  # noqa: PLC0415
 
-    out = np.full(shape, np.nan)
-    corners = Delaunay(places).simplices
-    a, u, v = _edges(places[corners].astype(float))
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
-    corners, a, u, v, area = (some[np.abs(area) > 0.5] for some in (corners, a, u, v, area))
-    if not len(corners):
+    out = np.full(heights.shape, np.nan)
+    triangles = shapely.get_parts(
+        shapely.delaunay_triangles(shapely.multipoints(places[:, ::-1].astype(float)))
+    )
+    triangles = triangles[shapely.area(triangles) > _EMPTY]
+    if not len(triangles):
         return out
-    outlines = shapely.polygons(places[corners][:, :, ::-1].astype(float))
-    numbered = zip(outlines.tolist(), range(1, len(outlines) + 1), strict=True)
     centres = Affine(1.0, 0.0, -0.5, 0.0, 1.0, -0.5)
-    owner = rasterize(numbered, shape, transform=centres, dtype="int32")
-    cell = np.nonzero(owner)
-    k = owner[cell] - 1
-    off = np.column_stack(cell) - a[k]
-    s = (off[:, 0] * v[k, 1] - off[:, 1] * v[k, 0]) / area[k]
-    t = (u[k, 0] * off[:, 1] - u[k, 1] * off[:, 0]) / area[k]
-    z = values[corners[k]]
-    out[cell] = z[:, 0] + s * (z[:, 1] - z[:, 0]) + t * (z[:, 2] - z[:, 0])
+    numbered = zip(triangles.tolist(), range(1, len(triangles) + 1), strict=True)
+    owner = rasterize(numbered, heights.shape, transform=centres, dtype="int32")
+    row, column = np.nonzero(owner)
+    corners = np.rint(shapely.get_coordinates(triangles)).astype(np.int64).reshape(-1, 4, 2)[:, :3]
+    of = corners[owner[row, column] - 1]
+    (ax, ay), (ux, uy), (vx, vy) = of[:, 0].T, (of[:, 1] - of[:, 0]).T, (of[:, 2] - of[:, 0]).T
+    area = ux * vy - uy * vx
+    s = ((column - ax) * vy - (row - ay) * vx) / area
+    t = (ux * (row - ay) - uy * (column - ax)) / area
+    z = heights[of[:, :, 1], of[:, :, 0]]
+    out[row, column] = z[:, 0] + s * (z[:, 1] - z[:, 0]) + t * (z[:, 2] - z[:, 0])
     return out
-
-
-def _edges(corners: Float) -> tuple[Float, Float, Float]:
-    """First corners (m, 2) of triangles (m, 3, 2), and their edges to the two others."""
-    return corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
 
 
 def _low_outliers(low: Float, cell: float) -> Bools:
