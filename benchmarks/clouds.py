@@ -3,12 +3,12 @@
     python benchmarks/clouds.py scene MAP SCENE [--bbox W,S,E,N] [--dem FILE ...] [--draw]
     lidar drive SCENE --survey all --altitude 350 --rig aircraft -o FLIGHT; lidar map FLIGHT -o CLOUD
     python benchmarks/clouds.py spoil CLOUD SPOILT [--seed N]
-    python benchmarks/clouds.py measure MAP SPOILT SCENE [--bbox W,S,E,N] [--align]
+    python benchmarks/clouds.py measure MAP SPOILT [--bbox W,S,E,N] [--dem FILE ...] [--draw] [--align]
 
 ``scene`` builds the truth; with ``--draw`` it gives buildings of the map without heights some, and roofs, at
 random by OSM id. ``spoil`` takes the classes from a cloud, moves it by 0.6 m east and 0.4 m south, and adds
 noise of 5 cm in plan and 4 cm in height. ``measure`` withholds heights, roofs and trees of the map, measures
-them in the cloud, builds the scene and compares the two.
+them in the cloud, builds the tables of the scene and of the truth, and compares them.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from geoscene.buildings import read_buildings
 from geoscene.clouds.survey import with_clouds
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build
-from geoscene.scene import Scene, open_scene
+from geoscene.scene import Scene
 from geoscene.sources import OsmData, read_osm
 from geoscene.sources.data import Tags
 
@@ -89,7 +89,7 @@ def spoil(given: argparse.Namespace) -> None:
 
 def table(scene: Scene) -> Any:
     """Bodies of a scene by OSM id: base, height, top and roof; of several with one id the largest."""
-    rows = pyogrio.read_dataframe(scene.path / "features.gpkg", layer="buildings")
+    rows = pyogrio.read_dataframe(scene.files.features, layer="buildings")
     rows["top"] = rows["base"] + rows["height"]
     rows["area"] = rows.geometry.area
     return rows.sort_values("area").drop_duplicates("osm_id", keep="last").set_index("osm_id")
@@ -97,7 +97,7 @@ def table(scene: Scene) -> Any:
 
 def compare_buildings(truth: Any, made: Any) -> None:
     """Print errors of tops, heights and bases, and the confusion of roof shapes."""
-    both = truth.join(made, rsuffix="_made", how="inner")
+    both = truth.join(made.add_suffix("_made"), how="inner")
     both = both[both["height_source_made"] == "cloud"]
     print(f"buildings {len(truth)}, measured {len(both)}")
     for name in ("top", "height", "base"):
@@ -123,17 +123,18 @@ def compare_buildings(truth: Any, made: Any) -> None:
 
 def compare_trees(truth: Scene, made: Scene) -> None:
     """Print trees that were found, missed and false, and their errors."""
-    mapped, found = (pyogrio.read_dataframe(s.path / "features.gpkg", layer="trees") for s in (truth, made))
-    if not len(mapped) or not len(found):
-        print(f"trees: {len(mapped)} in the scene, {len(found)} found")
+    counts = [s.manifest["counts"]["trees"] for s in (truth, made)]
+    print(f"trees: {counts[0]} in the scene, {counts[1]} found")
+    if not all(counts):
         return
+    mapped, found = (pyogrio.read_dataframe(s.files.features, layer="trees") for s in (truth, made))
     xy, other = (
         shapely.get_coordinates(t.to_crs(truth.frame.crs.to_wkt()).geometry) for t in (mapped, found)
     )
     distance, near = cKDTree(other).query(xy)
     close = distance < 2.5
     false = len(found) - len(set(near[close].tolist()))
-    print(f"trees: {close.sum()} of {len(mapped)} found, {false} false")
+    print(f"  {close.sum()} of those in the scene, {false} false")
     if not close.any():
         return
     print(f"  place: 50 % {np.median(distance[close]):.2f}, 95 % {np.percentile(distance[close], 95):.2f} m")
@@ -146,7 +147,7 @@ def compare_trees(truth: Scene, made: Scene) -> None:
 def measure(given: argparse.Namespace) -> None:
     """Measure the map without heights in the cloud, build it, and compare with the truth."""
     osm = read_osm(given.map, bounds=given.bbox)
-    truth = open_scene(given.scene)
+    osm = drawn(osm) if given.draw else osm
     started = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         cloud = CloudOptions((given.cloud,), cloud_align=given.align)
@@ -157,9 +158,10 @@ def measure(given: argparse.Namespace) -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"{spent[0]:.0f} s, {spent[1]:.0f} s of CPU, at most {peak:.0f} MiB, one process")
         print(json.dumps(measured.cloud))
-        made = build(measured, Path(folder) / "scene", options=options)
+        made = build(measured, Path(folder) / "made", options=options)
+        truth = build(osm, Path(folder) / "truth", options=BuildOptions(dem=tuple(given.dem), use="gis"))
         whole, _ = read_buildings(osm, truth.frame)
-        whole = whole.where(whole.drawn & ~whole.is_part)  # the scene has no table of parts
+        whole = whole.where(whole.drawn & ~whole.is_part)
         rows = table(truth)
         compare_buildings(rows[rows.index.isin(whole.osm_id)], table(made))
         compare_trees(truth, made)
@@ -185,8 +187,9 @@ def main() -> None:
     step = steps.add_parser("measure")
     step.add_argument("map")
     step.add_argument("cloud")
-    step.add_argument("scene")
     step.add_argument("--bbox", **box)
+    step.add_argument("--dem", nargs="*", default=[])
+    step.add_argument("--draw", action="store_true")
     step.add_argument("--align", action="store_true")
     given = parser.parse_args()
     if given.step == "spoil":

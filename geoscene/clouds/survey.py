@@ -64,7 +64,7 @@ def with_clouds(
     reach = (extent[0] - MARGIN, extent[1] - MARGIN, extent[2] + MARGIN, extent[3] + MARGIN)
     with temporary_folder(cache_dir / "cloud", "points") as folder:
         spool = spool_clouds(files, frame, bounds=reach, folder=folder, progress=progress)
-        work = Work(spool, footprints, _cell(spool, extent), (0.0, 0.0))
+        work = Work(spool, footprints, _cell(spool, extent, reach=reach), (0.0, 0.0))
         grounds = grounds_of(work, workers=workers, progress=progress)
         east_m, north_m, gain = best_shift(sum((g.agreement for g in grounds), np.zeros(())))
         moved = cloud.cloud_align and np.hypot(east_m, north_m) > _SHIFTED
@@ -129,9 +129,14 @@ def _check_datums(files: Sequence[CloudFile]) -> None:
         )
 
 
-def _cell(spool: Spool, extent: Sequence[float]) -> float:
-    """Metres of a cell of the ground: a power of two from 1, by the density of points and the extent."""
-    density = (spool.read - spool.outside) / (len(spool.squares) * SIDE**2)
+def _cell(spool: Spool, extent: Sequence[float], *, reach: Sequence[float]) -> float:
+    """Metres of a cell of the ground: a power of two from 1, by the density of points and the extent.
+
+    reach : bounds within which points were taken, beyond which squares at the rim are empty
+    """
+    low = np.array(spool.squares) * SIDE
+    sides = np.maximum(np.minimum(low + SIDE, reach[2:]) - np.maximum(low, reach[:2]), 0.0)
+    density = (spool.read - spool.outside) / sides.prod(axis=1).sum()
     area = (extent[2] - extent[0]) * (extent[3] - extent[1])
     least = max(1.0, np.sqrt(_PER_CELL / density), np.sqrt(area / _MOST_CELLS))
     return float(min(2.0 ** np.ceil(np.log2(least)), SIDE / 4))
