@@ -44,10 +44,13 @@ def side_at(lon: float, lat: float) -> Side:
 
 
 def driving_side(osm: OsmData) -> tuple[Side, str]:
-    """Driving side of a map extract and its source: ``tag`` (most frequent ``driving_side``) or ``place``."""
-    tags = [item.tags for items in (osm.ways, osm.areas, osm.relations) for item in items]
+    """Driving side of a map extract and its source: ``tag`` or ``place``.
+
+    The tag ``driving_side`` counts if half of the streets or more have it: single streets are exceptions.
+    """
+    tags = [way.tags for way in osm.ways if "highway" in way.tags]
     tagged = Counter(side for tag in tags if (side := tag.get("driving_side")) in ("left", "right"))
-    if tagged:
+    if tagged and 2 * tagged.total() >= len(tags):
         return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"
     west, south, east, north = osm.bounds
     return side_at(wrapped((west + east) / 2), (south + north) / 2), "place"

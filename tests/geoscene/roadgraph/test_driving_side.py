@@ -54,6 +54,11 @@ def test_driving_side_tags_override_the_country():
     assert driving_side(extract(street(1, driving_side="both"))) == ("left", "place")
 
 
+def test_a_street_that_is_driven_on_the_other_side_does_not_turn_its_town():
+    town = extract(street(1, driving_side="right"), street(2), street(3))
+    assert driving_side(town) == ("left", "place")
+
+
 @pytest.mark.parametrize("given", ["", "left", "right"])
 def test_scene_and_drive_use_the_same_driving_side(given, tmp_path):
     scene = build(extract(street(1)), tmp_path / "scene", options=BuildOptions(driving_side=given))
