@@ -86,6 +86,19 @@ def test_paint_wears_less_than_the_road_under_it(x, y, kind, across, long):
     assert ground(BARE, False, x, y, 0.6, 0.8, across, across * long) == 1.0
 
 
+def test_asphalt_is_speckled_by_its_stones_and_not_blotchy():
+    # Standard deviation of what pixels show that are as wide as a stone, a hand, and a pace.
+    stones, hand, pace = (tones(ASPHALT, width=width, half=6.0).std() for width in (0.001, 0.1, 0.7))
+    assert 0.12 < stones < 0.35
+    assert hand < 0.6 * stones
+    assert pace < 0.4 * stones
+    near = np.array([[ground(ASPHALT, False, x, y, 1.0, 0.0, 1e-3, 1e-3) for x in np.arange(0, 3, 0.0101)]
+                     for y in (0.3, 1.7, 2.9, 4.1)])  # fmt: skip
+    # From one stone to the next most of the contrast is there.
+    steps = np.diff(near, axis=1).std() / np.sqrt(2)
+    assert steps > 0.55 * near.std()
+
+
 def test_cracks_are_rare_narrow_and_as_wide_from_along_as_from_across():
     x, y = np.random.default_rng(1).uniform(-300, 300, (2, 60_000))
     share = [cracked(a, b, 1.0, 0.0, 0.002, 0.002, ASPHALT) for a, b in zip(x, y, strict=True)]
