@@ -7,17 +7,14 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import shapely
-from helpers.clouds import write_las
 from helpers.programs import ENVIRONMENT, command
 from helpers.scenes import same_files
 
 from geoscene import tiles
 from geoscene.errors import InputError as SceneInputError
 from geoscene.errors import NetworkError
-from geoscene.frames import Frame
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build
 from geoscene.scene import open_scene
@@ -284,25 +281,9 @@ def test_a_map_is_built_with_the_relief_of_the_drive(town, south, tmp_path):
     assert (again.built, again.scene.path) == (0, plain.scene.path)
 
 
-def test_a_map_is_measured_in_point_clouds(town, south, tmp_path):
-    box = (WEST - 0.001, SOUTH - 0.0005, WEST + 0.001, SOUTH + 0.0025)
-    frame = Frame.at((box[0] + box[2]) / 2, (box[1] + box[3]) / 2)
-    xy = np.random.default_rng(1).uniform(-300, 300, (400_000, 2))
-    east, north = frame.to_crs(*xy.T, crs="EPSG:32632")
-    cloud = write_las(tmp_path / "c.laz", np.column_stack([east, north, 0 * east + 400]), crs="EPSG:32632")
-    clouds = CloudOptions(cloud=(str(cloud),))
-    place = PlaceOptions(scene_cache=tmp_path / "cache", bbox=box)
-
-    def found(clouds):
-        return open_scene_or_map(town / "town.osm", south, place=place, clouds=clouds)
-
-    first, again, without = found(clouds), found(clouds), found(CloudOptions())
-    assert "cloud" in {source["kind"] for source in first.scene.manifest["sources"]}
-    assert first.scene.tile(*first.scene.tile_indices[0]).origin[2] == pytest.approx(400, abs=2)
-    assert (again.built, again.scene.path) == (0, first.scene.path)
-    assert without.scene.path != first.scene.path
+def test_point_clouds_are_for_maps(town, south):
     with pytest.raises(InputError, match="`cloud`: is for maps"):
-        open_scene_or_map(first.scene.path, south, clouds=clouds)
+        open_scene_or_map(town / "whole", south, clouds=CloudOptions(cloud=("a.laz",)))
 
 
 def test_datasets_name_the_map_and_the_options_of_its_scene(town, south, tmp_path):
