@@ -259,7 +259,7 @@ def build_tile(
         _plan_area(rest.take(~rest.closed & (rest.klass == Class.WATER))),
         digest,
         tuple(problems),
-        layout.counts if layout and layout.counts["walls"] else {},
+        layout.counts if layout and any(layout.counts.values()) else {},
         guessed,
         roofs,
     )

@@ -67,6 +67,10 @@ _TYPES: dict[int, str] = {
 _CONSTRUCTIONS = frozenset({"Building", "Bridge", "Tunnel", "OtherConstruction"})
 _WITH_PARTS = frozenset({"Building", "Bridge", "Tunnel"})
 _INSTALLATION = "BuildingInstallation"
+_INSTANCED = frozenset({"CityFurniture", "SolitaryVegetationObject", "OtherConstruction"}) | {
+    f"{kind}Installation" for kind in _WITH_PARTS
+}
+"""Types that the schema lets have instances of templates."""
 _AUXILIARY = frozenset({Class.KERB, Class.LANE_MARKING})
 _PARTS = {"Railway": "TrafficArea", "WaterBody": "WaterSurface"}
 
@@ -257,7 +261,12 @@ def _tile_objects(
             ]
             entries.append((name, {"type": kind, "attributes": attributes, "geometry": made}))
     entries += _copies(
-        part.instances, features, library=library, index=part.index, anchors=number[ids[len(mesh.vertices) :]]
+        part.instances,
+        features,
+        library=library,
+        index=part.index,
+        anchors=number[ids[len(mesh.vertices) :]],
+        owners=dict(entries),
     )
     return fresh, entries, solids
 
@@ -388,8 +397,14 @@ def _copies(
     library: Sequence[Mesh],
     index: tuple[int, int],
     anchors: Ints,
+    owners: dict[str, dict[str, Any]],
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One city object per feature with all its instances; one for each instance without a feature."""
+    """One city object per feature with all its instances; one for each instance without a feature.
+
+    Buildings cannot have instances: what stands on their roofs is an installation, and their child.
+
+    owners : city objects of the tile's faces by name
+    """
     key = np.where(instances.feature >= 0, instances.feature, -1 - np.arange(len(instances)))
     _, first, owner = np.unique(key, return_index=True, return_inverse=True)
     rows_of: list[list[int]] = [[] for _ in first]
@@ -402,9 +417,17 @@ def _copies(
         name = features.name(feature) if feature >= 0 else f"copy/{rows[0]}"
         matrix = np.tile(np.eye(4), (len(rows), 1, 1))
         matrix[:, :3, :3] = instances.transform[rows][:, :, :3]
+        attributes: dict[str, Any] = {"class": klass_name(klass)}
+        kind, parents = _TYPES.get(klass, "CityFurniture"), {}
+        if name in owners and owners[name]["type"] in _WITH_PARTS:
+            kind, parents = f"{owners[name]['type']}Installation", {"parents": [name]}
+            owners[name].setdefault("children", []).append(f"{name}@{index[0]}_{index[1]}")
+        else:
+            attributes |= features.attributes(feature)
         entry = {
-            "type": _TYPES.get(klass, "CityFurniture"),
-            "attributes": {"class": klass_name(klass), **features.attributes(feature)},
+            "type": kind if kind in _INSTANCED else "OtherConstruction",
+            "attributes": attributes,
+            **parents,
             "geometry": [
                 {
                     "type": "GeometryInstance",

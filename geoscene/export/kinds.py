@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from geoscene.errors import InputError
@@ -110,7 +110,8 @@ def export_scene(
         names = ", ".join(f"`{key}`" for key in foreign)
         takes = ", ".join(f"`{key}`" for key in sorted(kind.options)) or "none"
         raise InputError(f"{names} does not go with {kind.title}, which takes {takes}")
-    if given.pop("relief", None):
+    modelled = bool(given.pop("relief", None))
+    if modelled:
         scene = scene.with_relief_mesh()
     for path in (out, out.with_suffix(kind.beside)) if kind.beside else (out,):
         if path.exists() and not overwrite:
@@ -123,4 +124,18 @@ def export_scene(
     write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
     with exclusive(out) if kind.suffixes else nullcontext():  # writers of folders see to that
         summary: Summary = write(scene, out, **given, progress=progress)
-    return summary
+    return replace(summary, notes=(*summary.notes, _relief_note(scene))) if modelled else summary
+
+
+def _relief_note(scene: Scene) -> str:
+    """How many walls of a scene have openings as geometry, and why others have none."""
+    counts = scene.manifest.get("relief", {}).get("facades", {})
+    causes = {
+        "small": "are too small for openings",
+        "blank": "are blank (their type has no openings, or none fits)",
+        "touching": "have an outline that touches itself",
+    }
+    planes = [f"{counts.get(f'walls_{why}', 0)} {text}" for why, text in causes.items()]
+    return (
+        f"openings of {counts.get('walls', 0)} walls are geometry; planes are walls that {', '.join(planes)}"
+    )

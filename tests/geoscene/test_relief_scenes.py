@@ -7,9 +7,10 @@ import pytest
 from helpers.scenes import same_files
 
 import geoscene.tiles
+from geoscene.buildings.facades.walls import find_walls
 from geoscene.errors import InputError, SceneFormatError
 from geoscene.export import export_scene
-from geoscene.mesh import DOOR, WINDOW
+from geoscene.mesh import DOOR, WALL, WINDOW
 from geoscene.options import BuildOptions, ExportOptions
 from geoscene.pipeline import build
 from geoscene.scene.tile_files import pack, read_tile, write_tile
@@ -133,6 +134,39 @@ def test_cityjson_has_windows_and_doors_in_closed_solids(relief, tmp_path):
     types = {thing["type"] for thing in city["CityObjects"].values()}
     assert {"Building", "BuildingInstallation"} <= types
     assert {"Window", "Door", "WallSurface", "RoofSurface", "GroundSurface"} <= seen
+
+
+# Types of CityJSON 2.0 that may have instances of templates, and those that need a parent.
+INSTANCED = {"CityFurniture", "SolitaryVegetationObject", "OtherConstruction", "BuildingInstallation"}
+
+
+def test_what_stands_on_roofs_is_an_installation_of_its_building_in_cityjson(relief, tmp_path):
+    out = tmp_path / "city.city.json"
+    export_scene(relief, out)
+    things = json.loads(out.read_text())["CityObjects"]
+    copies = {
+        name: thing
+        for name, thing in things.items()
+        if any(g["type"] == "GeometryInstance" for g in thing["geometry"])
+    }
+    assert {thing["type"] for thing in copies.values()} <= INSTANCED
+    on_roofs = {n: thing for n, thing in copies.items() if thing["type"] == "BuildingInstallation"}
+    assert on_roofs
+    for name, thing in on_roofs.items():
+        (owner,) = thing["parents"]
+        assert things[owner]["type"] == "Building"
+        assert name in things[owner]["children"]
+
+
+def test_every_flat_wall_has_openings_or_a_cause_for_being_a_plane(relief, tmp_path):
+    walls = 0
+    for tile in relief.tiles():
+        solids = tile.mesh.take(tile.mesh.closed & (tile.mesh.surface == WALL))
+        walls += len(find_walls(solids)[0])
+    counts = relief.manifest["relief"]["facades"]
+    assert sum(counts[name] for name in ("walls", "walls_small", "walls_blank", "walls_touching")) == walls
+    summary = export_scene(relief, tmp_path / "walls.stl", options=ExportOptions(relief="mesh"))
+    assert f"openings of {counts['walls']} walls are geometry" in summary.notes[-1]
 
 
 def test_relief_of_an_export_is_mesh_or_left_out():

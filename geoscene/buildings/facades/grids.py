@@ -11,7 +11,7 @@ from geoscene.buildings.facades.setting import Setting
 from geoscene.buildings.facades.styles import Styles
 from geoscene.buildings.facades.walls import Walls
 from geoscene.columns import Columns
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Bools, Float, Height, Ints
 
 _BESIDE = 0.3
 """Metres outside a wall at which the ground beside it is looked up."""
@@ -90,12 +90,12 @@ class Elevations:
 
     @classmethod
     def of(
-        cls, walls: Walls, setting: Setting, *, base: Float, height: Height | None
+        cls, walls: Walls, setting: Setting, *, usable: Bools, base: Float, height: Height | None
     ) -> tuple[Elevations, Ints]:
-        """The elevations of walls, and the rows of those with room for cells."""
+        """The elevations of usable walls, and the rows of those of them with room for cells."""
         row = _table_rows(walls, setting, base=base)
         grids = _grids(walls, setting, row=row, base=base)
-        some = np.flatnonzero(grids.count.min(axis=1) > 0)
+        some = np.flatnonzero(usable & (grids.count.min(axis=1) > 0))
         walls, grids = walls.take(some), grids.take(some)
         styles = setting.styles.take(grids.row)
         cells = _cells(walls, grids, styles=styles, height=height)

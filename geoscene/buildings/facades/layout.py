@@ -14,6 +14,7 @@ from geoscene.buildings.facades.fit import Sheet
 from geoscene.buildings.facades.grids import Elevations, nth
 from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_openings
 from geoscene.buildings.facades.setting import Setting
+from geoscene.buildings.facades.solids import outlines
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.mesh import Mesh
 from geoscene.splitmix import uniform_at
@@ -37,7 +38,9 @@ class Layout:
     """The relief of a tile's walls, and what was counted.
 
     parts  : solids that stand out of the walls
-    counts : walls with openings, openings and parts by what they are, entrances mapped and left out
+    counts : walls with openings; walls that stay planes because their outline touches itself, they are small,
+             or blank (no opening fits, or their type has none); openings and parts by what they are;
+             entrances and shops mapped and left out
     """
 
     relief: WallRelief
@@ -56,7 +59,9 @@ def wall_relief(
     guess  : also parts that stand out of walls and are not mapped
     """
     walls, of_face = find_walls(mesh)
-    at, some = Elevations.of(walls, setting, base=base, height=height)
+    simple = np.array([o is not None for o in outlines(mesh, of_face, count=len(walls))], np.bool_)
+    at, some = Elevations.of(walls, setting, usable=simple, base=base, height=height)
+    planes = {"touching": int((~simple).sum()), "small": int(simple.sum()) - len(some)}
     number = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
     number[some] = np.arange(len(some))
     walls, grids, cells = at.walls, at.grids, at.cells
@@ -82,7 +87,9 @@ def wall_relief(
         grids.count.astype(np.int32),
         (np.cumsum(sizes) - sizes).astype(np.int32),
     )
-    counts = {"walls": len(walls), **parts.counts, "parts_left_out": touching}
+    planes["blank"] = len(some) - len(walls)
+    left = {f"walls_{why}": n for why, n in planes.items()}
+    counts = {"walls": len(walls), **left, **parts.counts, "parts_left_out": touching}
     relief = WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32))
     return Layout(relief, parts, counts)
 

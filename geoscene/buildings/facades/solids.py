@@ -41,14 +41,13 @@ class _Template:
 def relief_mesh(mesh: Mesh, relief: WallRelief) -> Mesh:
     """The mesh of a tile with its facades as geometry; solids stay closed, without T-junctions.
 
-    Faces of walls with openings are replaced, all others are kept. A wall whose faces are not bounded by
-    simple rings stays a plane.
+    Faces of walls with openings are replaced, all others are kept.
     """
     if not len(relief.facades):
         return mesh
     cells = _Placed.of(relief)
-    outlines = _outlines(mesh, relief)
-    facing, done = _pierced_walls(mesh, relief, outlines=outlines, cells=cells)
+    rings = outlines(mesh, relief.wall, count=len(relief.facades))
+    facing, done = _pierced_walls(mesh, relief, outlines=rings, cells=cells)
     kept = (relief.wall < 0) | ~done[relief.wall]
     templates = [_template(relief.openings, k) for k in range(len(relief.openings))]
     insets = _insets(mesh, relief, cells=cells.take(done[cells.wall]), templates=templates)
@@ -90,10 +89,15 @@ def _rims(openings: Openings) -> Float:
     return np.where(openings.panel_depth[:, None] > 0, openings.panel, openings.opening)
 
 
-def _outlines(mesh: Mesh, relief: WallRelief) -> list[list[Ints] | None]:
-    """The rings of each wall as vertices of the mesh, seen from outside; None where they are not simple."""
-    face = np.flatnonzero(relief.wall >= 0)
-    wall = relief.wall[face].astype(np.int64)
+def outlines(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> list[list[Ints] | None]:
+    """The rings of each wall (count,) as vertices of the mesh, seen from outside.
+
+    None stands for an outline that touches itself, which cannot be cut in one way only.
+
+    of_face : (m,) wall of each face, -1 for none
+    """
+    face = np.flatnonzero(of_face >= 0)
+    wall = of_face[face].astype(np.int64)
     # one vertex has one number in each wall
     vertex, faces = np.unique(mesh.faces[face].ravel(), return_inverse=True)
     own = wall[:, None] * len(vertex) + faces.reshape(-1, 3)
@@ -103,7 +107,7 @@ def _outlines(mesh: Mesh, relief: WallRelief) -> list[list[Ints] | None]:
     of = np.repeat(wall, 3)[open_]
     order = np.lexsort((start, of))
     start, stop, of = start[order], stop[order], of[order]
-    cuts = np.searchsorted(of, np.arange(len(relief.facades) + 1))
+    cuts = np.searchsorted(of, np.arange(count + 1))
     return [
         _rings(start[a:b] % len(vertex), stop[a:b] % len(vertex), vertex=vertex)
         for a, b in pairwise(cuts.tolist())

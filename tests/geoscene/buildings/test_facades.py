@@ -11,11 +11,11 @@ from shapely import affinity
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.buildings.facades import read_setting, wall_relief
-from geoscene.buildings.facades.solids import relief_mesh
+from geoscene.buildings.facades.solids import outlines, relief_mesh
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.frames import Frame
-from geoscene.mesh import DOOR, WALL, WINDOW, concatenate
+from geoscene.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
 from geoscene.sources.data import Area, OsmData, Point, Way
 from geoscene.watertight import validate_mesh
 
@@ -287,6 +287,18 @@ def test_each_face_of_a_straight_wall_is_in_it():
     assert np.sort(walls.size[:, 0]) == pytest.approx([10, 10, 20, 20], abs=1e-3)
     moved = replace(mesh, vertices=mesh.vertices + np.array([5000.0, -3000.0, 100.0]))
     assert len(find_walls(moved)[0]) == 4
+
+
+def test_an_outline_that_touches_itself_has_no_rings():
+    squares = [(0, 0), (1, 0), (2, 0), (2, 1), (2, 2), (1, 2), (0, 1)]  # the last two meet in one point
+    corners = [(x + dx, 0.0, z + dz) for x, z in squares for dx, dz in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    points, number = np.unique(np.array(corners), axis=0, return_inverse=True)
+    quads = number.reshape(-1, 4)
+    faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    mesh = Mesh.of(points, faces, feature=0, surface=WALL)
+    assert outlines(mesh, np.zeros(len(mesh), np.int32), count=1) == [None]
+    apart = np.tile([0, 0, 0, 0, 0, 0, 1], 2).astype(np.int32)
+    assert [len(rings) for rings in outlines(mesh, apart, count=2)] == [1, 1]
 
 
 def recesses(relief):
