@@ -17,6 +17,7 @@ _HUBER = 1.5  # standard deviations, from which an error counts linearly
 _CAUCHY = 1.0  # likewise, from which loops lose weight
 _DRIFT = (0.002, 0.02)  # radians and metres per root of a metre: of a step, which drifts as a random walk
 _LEAST_VIEWS = 2
+_WEIGHINGS = 3  # times that a window with ranges is fitted, with weights by the distances found before
 
 
 @dataclass
@@ -63,47 +64,25 @@ def refine_window(window: list[Keyframe], *, scaled: bool) -> None:
     shared = number[views >= _LEAST_VIEWS]
     if len(shared) < 10:
         return
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    firm = gtsam.noiseModel.Isotropic.Sigma(6, _FIRM)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
     pose_key, point_key = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
-    place: dict[int, Float] = {}
+    values, place = gtsam.Values(), dict[int, Float]()
     for k, frame in enumerate(window):
         values.insert(pose_key(k), gtsam.Pose3(frame.pose))
         rows = np.flatnonzero(np.isin(frame.track, shared) & np.isfinite(frame.distance))
-        local = frame.points(rows)
-        for row, point in zip(rows.tolist(), local, strict=True):
+        for row, point in zip(rows.tolist(), frame.points(rows), strict=True):
             track = int(frame.track[row])
             if track not in place:
                 place[track] = point
                 values.insert(point_key(track), point)
-            sigma = float(frame.features.sigma[row])
-            bearing = gtsam.Unit3(frame.features.bearing[row])
-            if frame.measured[row]:
-                distance = float(frame.distance[row])
-                spread = np.array([sigma, sigma, float(frame.fuzz[row]) * distance])
-                noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(spread))
-                graph.add(gtsam.BearingRangeFactor3D(pose_key(k), point_key(track), bearing, distance, noise))
-            else:
-                plain = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-                noise = gtsam.noiseModel.Robust.Create(huber, plain)
-                graph.add(gtsam.BearingFactor3D(pose_key(k), point_key(track), bearing, noise))
-    graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(window[0].pose), firm))
-    if not scaled and len(window) > 1:
-        base = window[1].pose[:3, 3] - window[0].pose[:3, 3]
-        length = max(float(np.linalg.norm(base)), 1e-6)
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, _SCALE_FIRM * length)
-        graph.add(gtsam.RangeFactorPose3(pose_key(0), pose_key(1), length, noise))
-    for track, point in place.items():  # a point far away has no distance from bearings alone
-        away = float(np.linalg.norm(point - window[0].pose[:3, 3]))
-        loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0 * away)
-        graph.add(gtsam.PriorFactorPoint3(point_key(track), point, loose))
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(10)
-    try:
-        found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    except RuntimeError:  # of an indeterminate system: the window stays as it was
-        return
+    found = values
+    for _ in range(_WEIGHINGS if scaled else 1):
+        graph = _window_graph(window, found, place=place, scaled=scaled)
+        try:
+            found = gtsam.LevenbergMarquardtOptimizer(graph, found, parameters).optimize()
+        except RuntimeError:  # of an indeterminate system: the window stays as it was
+            return
     poses = [found.atPose3(pose_key(k)).matrix() for k in range(len(window))]
     if not all(np.isfinite(pose).all() for pose in poses):
         return
@@ -115,6 +94,48 @@ def refine_window(window: list[Keyframe], *, scaled: bool) -> None:
         if len(rows):
             there = np.array([points[int(frame.track[row])] for row in rows])
             frame.distance[rows] = np.linalg.norm(there - frame.pose[:3, 3], axis=1)
+
+
+def _window_graph(window: list[Keyframe], values: Any, *, place: dict[int, Float], scaled: bool) -> Any:
+    """The factors of a window; ``values`` are its present poses and points, ``place`` the first ones.
+
+    Ranges from two bearings have symmetric errors as inverse ranges only; as ranges, those measured too short
+    would count more, and the way would shrink. So each counts as the range whose difference from the present
+    distance is, to first order, that of the inverse ranges.
+    """
+    gtsam = need("gtsam", "odometry")
+    pose_key, point_key = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+    graph = gtsam.NonlinearFactorGraph()
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+    for k, frame in enumerate(window):
+        centre = values.atPose3(pose_key(k)).translation()
+        for row in np.flatnonzero(np.isin(frame.track, list(place)) & np.isfinite(frame.distance)).tolist():
+            track = int(frame.track[row])
+            sigma = float(frame.features.sigma[row])
+            bearing = gtsam.Unit3(frame.features.bearing[row])
+            if frame.measured[row]:
+                away = float(np.linalg.norm(values.atPoint3(point_key(track)) - centre))
+                measured = float(frame.distance[row])
+                spread = np.array([sigma, sigma, float(frame.fuzz[row]) * away**2 / measured])
+                noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Diagonal.Sigmas(spread))
+                distance = 2.0 * away - away**2 / measured
+                graph.add(gtsam.BearingRangeFactor3D(pose_key(k), point_key(track), bearing, distance, noise))
+            else:
+                plain = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+                noise = gtsam.noiseModel.Robust.Create(huber, plain)
+                graph.add(gtsam.BearingFactor3D(pose_key(k), point_key(track), bearing, noise))
+    firm = gtsam.noiseModel.Isotropic.Sigma(6, _FIRM)
+    graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(window[0].pose), firm))
+    if not scaled and len(window) > 1:
+        base = window[1].pose[:3, 3] - window[0].pose[:3, 3]
+        length = max(float(np.linalg.norm(base)), 1e-6)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, _SCALE_FIRM * length)
+        graph.add(gtsam.RangeFactorPose3(pose_key(0), pose_key(1), length, noise))
+    for track, point in place.items():  # a point far away has no distance from bearings alone
+        away = float(np.linalg.norm(point - window[0].pose[:3, 3]))
+        loose = gtsam.noiseModel.Isotropic.Sigma(3, 10.0 * away)
+        graph.add(gtsam.PriorFactorPoint3(point_key(track), point, loose))
+    return graph
 
 
 def close_loops(keyframes: list[Keyframe], loops: list[tuple[int, int, Float, Float]]) -> Float:

@@ -285,6 +285,24 @@ def test_a_window_is_refined_to_the_true_poses(measured):
         assert metres < 5e-3
 
 
+def test_ranges_of_two_cameras_do_not_shorten_the_way():
+    """Ranges from a base have symmetric errors as inverse ranges; weighed as ranges, they are too short."""
+    shares = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        frames = window_of(rng, measured=True)
+        true = frames[-1].pose[:3, 3].copy()
+        for frame in frames:
+            inverse = 1.0 / frame.distance
+            spread = 0.012  # 1/m: a quarter of 20 m
+            noisy = inverse + rng.normal(0.0, spread, len(inverse))
+            frame.distance = 1.0 / np.maximum(noisy, 1e-3)
+            frame.fuzz = spread * frame.distance
+        refine_window(frames, scaled=True)
+        shares.append(frames[-1].pose[:3, 3] @ true / (true @ true))
+    assert np.mean(shares) == pytest.approx(1.0, abs=0.02)
+
+
 def test_a_loop_takes_the_drift_out_of_a_way_around_a_block():
     """Forty keyframes around a circle, each turned by 2 mrad too much; the last is where the first is."""
     turn = 2 * np.pi / 40
