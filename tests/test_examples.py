@@ -1,6 +1,7 @@
 """The examples in Python run, write what they say and print figures that hold."""
 
 import csv
+import itertools
 import json
 import re
 import runpy
@@ -101,3 +102,15 @@ def test_a_map_becomes_rasters_from_a_bare_folder(tmp_path):
         height = surface.read(1, masked=True) - ground.read(1, masked=True)
     assert height.min() > -0.1
     assert height.max() > 5
+
+
+def test_a_street_looks_different_with_each_relief(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["relief", str(tmp_path)])
+    runpy.run_path(str(FOLDER / "relief.py"))
+    shown = [int(n.replace(",", "")) for n in re.findall(r"relief \w+: ([\d,]+) of", capsys.readouterr().out)]
+    assert len(shown) == 3
+    assert min(shown) > 500_000
+    rows = np.split(read_png(tmp_path / "relief.png"), 3)
+    for one, other in itertools.pairwise(rows):
+        differs = (one != other).any(axis=2)
+        assert all(part.mean() > 0.001 for part in np.split(differs, 3, axis=1))
