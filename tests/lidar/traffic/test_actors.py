@@ -243,7 +243,8 @@ def test_a_road_user_that_appears_during_a_frame_or_beyond_the_radius_has_a_box(
     assert late in rows["id"]
     first = actors.position[actors.first[late]]
     k = rows["id"].tolist().index(late)
-    np.testing.assert_allclose([rows["x"][k], rows["y"][k]], first[:2], atol=1e-6)
+    # the centre of a body that leans with the camber is beside its foot
+    np.testing.assert_allclose([rows["x"][k], rows["y"][k]], first[:2], atol=0.05)
     assert len(box_rows(actors, ego, time_ns=start, end_ns=end, frame=0, radius=0.1)["id"]) == 0
 
 

@@ -33,12 +33,12 @@ def graph(scene):
 
 @pytest.fixture(scope="module")
 def street(scene, graph):
-    """The middle of the right half of the longest level street, (n, 2) every metre."""
+    """The middle of the right half of the longest street level but for its camber, (n, 2) every metre."""
     for edge in np.argsort(-graph.length * (graph.twin >= 0)).tolist():
         line = shapely.linestrings(parallel(graph.geometry[edge], -graph.width[edge] / 4)[:, :2])
         xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(0.0, line.length - 1.0)))
         z = ground_heights(scene, np.column_stack([xy, np.zeros(len(xy))]))
-        if np.abs(z).max() < 0.02 and (graph.geometry[edge][:, 2] == 0).all():
+        if np.abs(z).max() < 0.15 and (graph.geometry[edge][:, 2] == 0).all():
             return xy
     pytest.fail("no street is level")
 
