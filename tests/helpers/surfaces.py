@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import shapely
 
 
 def edge_counts(faces):
@@ -33,3 +34,15 @@ def assert_one_surface(points, faces, extent):
     area = (ux * vy - uy * vx) / 2
     assert (area > 0).all()
     assert area.sum() == pytest.approx((extent[2] - extent[0]) * (extent[3] - extent[1]), rel=1e-9)
+
+
+def heights_on(corners, xy):
+    """Heights (n,) at points (n, 2) of triangles (k, 3, 3) that do not overlap in plan; NaN beside them."""
+    point, face = shapely.STRtree(shapely.polygons(corners[..., :2])).query(
+        shapely.points(xy), predicate="intersects"
+    )
+    z = np.full(len(xy), np.nan)
+    a, b, c = (corners[face, k] for k in range(3))
+    normal = np.cross(b - a, c - a)
+    z[point] = a[:, 2] - ((xy[point] - a[:, :2]) * normal[:, :2]).sum(axis=1) / normal[:, 2]
+    return z

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import shapely
-from helpers.surfaces import assert_one_surface
+from helpers.surfaces import assert_one_surface, heights_on
 
 from geoscene.classes import Class
 from geoscene.frames import Frame
@@ -49,15 +48,7 @@ def ground(*ways, tile_size=50.0):
 def heights_at(tiles, xy):
     """Heights (n,) of the ground at points (n, 2)."""
     mesh = concatenate(tiles)
-    corners = mesh.vertices[mesh.faces]
-    point, face = shapely.STRtree(shapely.polygons(corners[..., :2])).query(
-        shapely.points(xy), predicate="intersects"
-    )
-    z = np.full(len(xy), np.nan)
-    a, b, c = (corners[face, k] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    z[point] = a[:, 2] - ((xy[point] - a[:, :2]) * normal[:, :2]).sum(axis=1) / normal[:, 2]
-    return z
+    return heights_on(mesh.vertices[mesh.faces], xy)
 
 
 def test_beds_are_trapezoids_across_the_track():

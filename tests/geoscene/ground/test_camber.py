@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import shapely
+from helpers.surfaces import heights_on
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -53,15 +53,7 @@ def meshes(places, ways, *, tile_size=60.0, height=None):
 
 def surface_at(tiles, xy):
     """Heights (n,) of the ground at points (n, 2)."""
-    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in tiles])
-    point, face = shapely.STRtree(shapely.polygons(corners[..., :2])).query(
-        shapely.points(xy), predicate="intersects"
-    )
-    z = np.full(len(xy), np.nan)
-    a, b, c = (corners[face, k] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    z[point] = a[:, 2] - ((xy[point] - a[:, :2]) * normal[:, :2]).sum(axis=1) / normal[:, 2]
-    return z
+    return heights_on(np.concatenate([mesh.vertices[mesh.faces] for mesh in tiles]), xy)
 
 
 def test_carriageways_fall_from_the_middle_to_the_edges():
