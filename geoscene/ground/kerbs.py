@@ -27,7 +27,7 @@ from geoscene.ground.layers import (
 )
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
-from geoscene.typing import Bools, Float
+from geoscene.typing import Bools, Float, Ints
 
 KERB, KERB_LOWERED = 0.12, 0.03
 """Metres from the carriageway up to sidewalks, and up to lowered kerbs (RASt 06: 12 cm; 3 cm and less)."""
@@ -120,7 +120,7 @@ def kerb_ends(surfaces: Layers, ends: NDArray[np.object_]) -> Layers:
     near = shapely.buffer(ends, _END, cap_style="flat")
     for priority, above in ((SIDEWALKS, SIDEWALK_ENDS), (KERBS, KERB_ENDS)):
         bands = surfaces.take(np.flatnonzero(surfaces.priority == priority))
-        end, band = shapely.STRtree(bands.polygon).query(near, predicate="intersects")
+        end, band = _meeting(near, bands.polygon)
         parts = shapely.buffer(shapely.intersection(near[end], bands.polygon[band]), 0.0)
         some = shapely.area(parts) > 0.0
         n = int(some.sum())
@@ -131,13 +131,24 @@ def kerb_ends(surfaces: Layers, ends: NDArray[np.object_]) -> Layers:
 def _near(kerbs: Layers, others: Layers, *, metres: float, priority: float) -> Layers:
     """The parts of kerbs within ``metres`` of surfaces of other streets."""
     wide = shapely.buffer(others.polygon, metres, cap_style="flat", join_style="mitre")
-    other, kerb = shapely.STRtree(kerbs.polygon).query(wide, predicate="intersects")
+    other, kerb = _meeting(wide, kerbs.polygon)
     foreign = (others.osm_id[other] != kerbs.osm_id[kerb]) | (others.klass[other] == Class.CROSSING)
     other, kerb = other[foreign], kerb[foreign]
     # Without the lines and points in which some only touch.
     parts = shapely.buffer(shapely.intersection(wide[other], kerbs.polygon[kerb]), 0.0)
     some = shapely.area(parts) > 0.0
     return replace(kerbs.take(kerb[some]), polygon=parts[some], priority=np.full(int(some.sum()), priority))
+
+
+def _meeting(shapes: NDArray[np.object_], bands: NDArray[np.object_]) -> tuple[Ints, Ints]:
+    """Rows of shapes and of bands that intersect, sorted.
+
+    Of rows alike in all else the later covers the earlier, and the order of an index over a part of a map is
+    not that over the whole.
+    """
+    shape, band = shapely.STRtree(bands).query(shapes, predicate="intersects")
+    order = np.lexsort((band, shape))
+    return shape[order], band[order]
 
 
 def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles: Triangles) -> Float:

@@ -166,11 +166,9 @@ def test_drive_on_tiles_along_its_route_gives_the_same_bytes(make_osm, town, tmp
     lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-60.0, 0.0)]))
     route = tuple((lat, lon) for lon, lat in lonlat.tolist())
     along = tuple(f"{lat},{lon}" for lat, lon in route)
-    options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=100.0, relief="off")
+    options = BuildOptions(tile_size=100.0, lod=1, along=along, reach=100.0)
     part = build(read_osm(town), tmp_path / "part", options=options)
-    scene = build(
-        read_osm(town), tmp_path / "whole", options=BuildOptions(tile_size=100.0, lod=1, relief="off")
-    )
+    scene = build(read_osm(town), tmp_path / "whole", options=BuildOptions(tile_size=100.0, lod=1))
     assert len(part.tile_indices) < 0.7 * len(scene.tile_indices)
     assert part.layers == scene.layers
     for i, j in part.tile_indices:
