@@ -9,6 +9,7 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
 from lidar.camera.render import RenderOptions, render
@@ -243,8 +244,10 @@ def test_a_road_user_that_appears_during_a_frame_or_beyond_the_radius_has_a_box(
     assert late in rows["id"]
     first = actors.position[actors.first[late]]
     k = rows["id"].tolist().index(late)
-    # the centre of a body that leans with the camber is beside its foot
-    np.testing.assert_allclose([rows["x"][k], rows["y"][k]], first[:2], atol=0.05)
+    # the centre of a body that leans with the camber is not right above its foot
+    up = Rotation.from_quat([rows[c][k] for c in ("qx", "qy", "qz", "qw")]).apply([0.0, 0.0, 1.0])
+    foot = np.array([rows[c][k] for c in "xyz"]) - up * rows["height"][k] / 2
+    np.testing.assert_allclose(foot[:2], first[:2], atol=1e-6)
     assert len(box_rows(actors, ego, time_ns=start, end_ns=end, frame=0, radius=0.1)["id"]) == 0
 
 
