@@ -62,7 +62,7 @@ from geoscene.options import BuildOptions
 from geoscene.progress import Progress
 from geoscene.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.report import Problem
-from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.ballast import read_beds
 from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
@@ -95,6 +95,7 @@ LARGEST_KM2 = 10_500.0
 """Maximum size of a scene in square kilometres: 100 x 100 km and a margin."""
 
 _TOLERANCE = 0.01  # of the distance between heights: maximum error of bare ground on the terrain's grid
+_SURVEYED = 2.0  # metres between heights, at most, that show roads as they were built
 _ROAD_LINES = 10.0  # metres between the lines at which ground graded to roads can bend
 _ROAD_REACH = 25.0  # metres, maximum distance from a centre line of ground that is graded to the road
 _ARM = 10.0  # metres, maximum horizontal extent of lamps and signals from their position
@@ -340,9 +341,13 @@ def _plan_roads(
     """Road graph with heights, and carriageways."""
     mapped = _only_roads(osm, options)
     graph = _collect(problems, build_road_graph(mapped, frame))
-    graph = profile(graph, terrain.height, obstacles=find_obstacles(osm, frame))
+    surveyed = 0.0 < terrain.spacing <= _SURVEYED
+    obstacles = find_obstacles(osm, frame)
+    graph = profile(graph, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
-    height = graded_ground(graph, terrain.height, level=not terrain.grids) if uneven else None
+    height = None
+    if uneven:
+        height = graded_ground(graph, terrain.height, level=not terrain.grids, surveyed=surveyed)
     side, source = found_side(osm)
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"

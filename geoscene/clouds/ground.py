@@ -25,6 +25,9 @@ _SLOPE = 0.15
 _OFF = (0.25, 1.25)
 """Metres, and shares of the local gradient, within which a point belongs to the filtered ground."""
 
+_BLOCK, _AROUND = 512, 128
+"""Cells of a block whose gaps are bridged at once, and of the rim around it: wider gaps may have steps."""
+
 _EMPTY = 0.6
 """Cells of area up to which a triangle over centres of cells has no further centre within it (Pick 1899)."""
 
@@ -120,6 +123,21 @@ def ground_returns(points: Points, grid: Grid, *, built: Bools) -> Bools:
     reach = _OFF[0] + _OFF[1] * np.minimum(steep, 2.0) * grid.cell / 2
     off = np.abs(points.xyz[:, 2] - ground.ravel()[cell])
     return np.asarray(off <= reach.ravel()[cell], np.bool_)
+
+
+def bridged_by_blocks(heights: Float) -> Float:
+    """Heights without gaps as by `bridged`, for rasters of any size; cells (rows, columns) of float32."""
+    out = heights.copy()
+    for row in range(0, heights.shape[0], _BLOCK):
+        for column in range(0, heights.shape[1], _BLOCK):
+            low = np.maximum((row - _AROUND, column - _AROUND), 0)
+            around = heights[low[0] : row + _BLOCK + _AROUND, low[1] : column + _BLOCK + _AROUND]
+            block = out[row : row + _BLOCK, column : column + _BLOCK]
+            if np.isnan(block).any():
+                first = row - low[0], column - low[1]
+                filled = bridged(around.astype(float))
+                block[:] = filled[first[0] : first[0] + block.shape[0], first[1] : first[1] + block.shape[1]]
+    return out
 
 
 def bridged(heights: Float) -> Float:

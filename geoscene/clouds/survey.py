@@ -13,7 +13,7 @@ import numpy as np
 
 from geoscene.buildings import read_buildings
 from geoscene.clouds.apply import with_measurements
-from geoscene.clouds.ground import MARGIN, Grid
+from geoscene.clouds.ground import MARGIN, Grid, bridged_by_blocks
 from geoscene.clouds.measure import GroundOf, Work, burnt, classified, grounds_of, measure
 from geoscene.clouds.read import CloudFile, open_cloud
 from geoscene.clouds.shift import best_shift
@@ -31,7 +31,7 @@ _MOST_CELLS = 36_000_000  # of the raster of the ground
 _PER_CELL = 2.0  # points, at least, in a mean cell of it
 _TOLERANCE = 0.05  # metres by which bare ground may differ from that raster, by default
 _SHIFTED = 0.1  # metres of shift that are worth a correction
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 
 
 def with_clouds(
@@ -72,7 +72,7 @@ def with_clouds(
             work = work._replace(shift=(east_m, north_m))
             grounds = grounds_of(work, workers=workers, progress=progress)
         keys = [digest_of(file.path) for file in files]
-        raster = _ground_file(
+        raster, bridged = _ground_file(
             grounds, work, frame=frame, extent=extent, files=files, keys=keys, cloud=cloud,
             options=options, cache_dir=cache_dir, footprints=footprints,
         )  # fmt: skip
@@ -110,6 +110,7 @@ def with_clouds(
             "from": "class ground" if classified(spool) else "filter",
             "cell_m": work.cell,
             "cells": known,
+            "cells_bridged": bridged,
         },
     }  # fmt: skip
     osm, found = with_measurements(osm, measured, prefer_tags=cloud.prefer == "tags")
@@ -154,10 +155,11 @@ def _ground_file(
     options: BuildOptions,
     cache_dir: Path,
     footprints: Any,
-) -> Path:
-    """The GeoTIFF of the ground within the extent, in the scene's CRS; cells without heights are empty.
+) -> tuple[Path, int]:
+    """The GeoTIFF of the ground within the extent, in the scene's CRS, and the cells that were bridged.
 
-    Cells over 100 m from any ground return, buildings aside, take the height of the elevation files.
+    Cells without ground returns, as under buildings, are bridged by triangles between those around. Cells
+    over 100 m from any ground return, buildings aside, take the height of the elevation files, or stay empty.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
@@ -183,6 +185,7 @@ def _ground_file(
         other = open_terrain(options.dem, frame, bounds=extent, outside=gaps)
         east, north = grid.centres()
         heights[gap] = other.height(east[gap], north[gap])
+        gap[:] = False
     elif gap.any() and options.dem_gaps == "error":
         share = gap.mean()
         raise InputError(
@@ -190,6 +193,8 @@ def _ground_file(
             " from any ground return; cut the map (`bbox`), add an elevation file (`dem` FILE), or let it"
             " take the nearest height (`dem_gaps` nearest)"
         )
+    void = np.isnan(heights)
+    heights = np.where(gap, np.nan, bridged_by_blocks(heights))
     about = [_CACHE_VERSION, frame.to_json(), list(extent), list(keys), work.shift, cloud.cloud_crs,
              cloud.cloud_unit, hashlib.sha256(heights.tobytes()).hexdigest()]  # fmt: skip
     name = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]
@@ -198,7 +203,7 @@ def _ground_file(
         _write_raster(
             path, heights, grid=grid, frame=frame, file=files[0], attribution=cloud.cloud_attribution
         )
-    return path
+    return path, int((void & ~np.isnan(heights)).sum())
 
 
 def _write_raster(

@@ -20,6 +20,9 @@ from geoscene.typing import Bools, Float, Height, Ints
 _SHARP = 0.05
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
 
+_CUT = 0.5
+"""Rise over run of the slopes of cuts and fills in surveyed ground: 1 to 2, usual in soil."""
+
 _LEVEL = 1e-6
 """Metres: lower roads on level ground count as level."""
 
@@ -47,7 +50,13 @@ def _required_clearance(tags: Tags) -> float | None:
 
 
 def graded_ground(
-    graph: RoadGraph, ground: Height, *, level: bool = False, shoulder: float = 2.5, batter: float = 8.0
+    graph: RoadGraph,
+    ground: Height,
+    *,
+    level: bool = False,
+    surveyed: bool = False,
+    shoulder: float = 2.5,
+    batter: float = 8.0,
 ) -> Height:
     """The terrain with roads graded into it: a function of x, y (n,) that returns z (n,).
 
@@ -55,9 +64,11 @@ def graded_ground(
     ``batter`` metres it blends into the terrain. Where roads meet, the nearer one has the greater weight.
     Bridges and tunnels do not change the terrain; the grading ends square where they begin.
 
-    graph  : with heights, from `profile`
-    ground : height of the terrain
-    level  : the terrain is 0 everywhere, so that only roads near ramps count
+    graph    : with heights, from `profile`
+    ground   : height of the terrain
+    level    : the terrain is 0 everywhere, so that only roads near ramps count
+    surveyed : the terrain shows the roads as they were built: it is kept beyond the shoulder, but where it is
+               over a cut or under a fill with slopes of 1 to 2. Graded again, such ground stays as it is
     """
     once = np.flatnonzero(
         ((graph.twin < 0) | (graph.twin > np.arange(len(graph)))) & ~graph.bridge & ~graph.tunnel
@@ -73,9 +84,9 @@ def graded_ground(
     mouth[graph.tail[structure]] = mouth[graph.head[structure]] = True
     sizes = np.array([len(line) - 1 for line in lines])
     last = np.cumsum(sizes) - 1
-    square_start, square_end = np.zeros((2, len(start)), np.bool_)
-    square_start[last - sizes + 1] = mouth[graph.tail[once]]
-    square_end[last] = mouth[graph.head[once]]
+    square_ends = np.zeros((len(start), 2), np.bool_)
+    square_ends[last - sizes + 1, 0] = mouth[graph.tail[once]]
+    square_ends[last, 1] = mouth[graph.head[once]]
     pieces = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
     reach = float(half.max()) + batter
     rows = _beside_ramps(pieces, start, end=end, reach=2 * reach) if level else np.arange(len(pieces))
@@ -86,9 +97,9 @@ def graded_ground(
         start=start[rows],
         end=end[rows],
         half=half[rows],
-        square_start=square_start[rows],
-        square_end=square_end[rows],
+        square_ends=square_ends[rows],
         batter=batter,
+        surveyed=surveyed,
     )
 
 
@@ -107,9 +118,9 @@ def _graded_height(
     start: Float,
     end: Float,
     half: Float,
-    square_start: Bools,
-    square_end: Bools,
+    square_ends: Bools,
     batter: float,
+    surveyed: bool,
 ) -> Float:
     """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
     z = np.asarray(ground(x, y), float).copy()
@@ -124,7 +135,7 @@ def _graded_height(
     away = np.hypot(*(xy[point] - foot[:, :2]).T)
     beyond = np.maximum(away - half[road], 0.0)
     ahead = np.abs(free - t) * np.sqrt(square)
-    cut = np.where(free < t, square_start[road], square_end[road]) & (ahead > 0)
+    cut = np.where(free < t, *square_ends[road].T) & (ahead > 0)
     aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0)) - half[road]
     beyond[cut] = np.hypot(np.maximum(aside, 0.0), ahead)[cut]
     share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
@@ -134,6 +145,11 @@ def _graded_height(
     road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
     most = np.zeros(len(z))
     np.maximum.at(most, point, share)
+    if surveyed:
+        # steeper towards the end of the reach, so that high fills and deep cuts end there without a step
+        with np.errstate(divide="ignore"):
+            free_of = _CUT * batter * (1.0 - most) / most
+        return np.where(near, np.clip(z, road_z - free_of, road_z + free_of), z)
     blend = most * most * (3.0 - 2.0 * most)
     graded: Float = z + blend * (road_z - z)
     return graded

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
@@ -28,6 +29,8 @@ class ProfileOptions:
     step      : maximum change of gradient from one station to the next, in addition to the ground's own
     smooth    : length over which the ground is smoothed
     spacing   : distance between stations
+    edges     : take heights of the ground near both edges of carriageways, not in the middle, which may be
+                a crown
     """
 
     clearance: float = 4.7
@@ -37,6 +40,7 @@ class ProfileOptions:
     step: float = 0.02
     smooth: float = 12.0
     spacing: float = 10.0
+    edges: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,8 @@ _STILL, _MOVED = 1e-9, 1e-4
 _HARD, _STEADY, _HARDEST = 1e8, 4e9, 1e9
 """Of slopes; of changes of slope, of stations at full spacing; of heights, which come first where a
 short ramp cannot serve all."""
+_WITHIN = 1.0
+"""Metres inside the edges of a carriageway at which its height is looked up: a raster's cells blur kerbs."""
 _CLOSE = 1.0
 """Metres: stations nearer to each other count as so far apart."""
 _BESIDE, _CROSSFALL = 1e6, 0.01
@@ -97,10 +103,27 @@ def profile(
     if not len(graph):
         return graph
     stations = place_stations(graph, spacing=options.spacing)
-    terrain = np.asarray(ground(stations.xy[:, 0], stations.xy[:, 1]), float)
+    if options.edges:
+        terrain = _near_edges(graph, stations, ground=ground)
+    else:
+        terrain = np.asarray(ground(stations.xy[:, 0], stations.xy[:, 1]), float)
     bounds = _bounds(graph, stations, terrain=terrain, ground=ground, obstacles=obstacles, options=options)
     z = _solve(graph, stations, terrain=terrain, bounds=bounds, options=options)
     return _with_heights(graph, stations, z=z)
+
+
+def _near_edges(graph: RoadGraph, stations: Stations, *, ground: Height) -> Float:
+    """Height of the ground (v,): the mean of places `_WITHIN` metres inside both edges of carriageways."""
+    a, b, _, edge = stations.segments
+    x, y = polylines.unit(stations.xy[b] - stations.xy[a]).T
+    aside = np.maximum(graph.width[edge] / 2 - _WITHIN, 0.0)[:, None] * np.column_stack([-y, x])
+    total, count = np.zeros((2, len(stations.xy)))
+    for end in (a, b):
+        for side in (-aside, aside):
+            place = stations.xy[end] + side
+            np.add.at(total, end, np.asarray(ground(place[:, 0], place[:, 1]), float))
+            np.add.at(count, end, 1.0)
+    return total / count
 
 
 def _weights(graph: RoadGraph, stations: Stations) -> Float:

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.clouds.ground import MARGIN, Grid, bridged, ground_heights, ground_returns
+from geoscene.clouds.ground import MARGIN, Grid, bridged, bridged_by_blocks, ground_heights, ground_returns
 from geoscene.clouds.spool import Points
 
 
@@ -84,3 +84,12 @@ def test_gaps_in_a_plane_are_bridged_by_the_plane(a, b):
     gappy = plane.copy()
     gappy[20:60, 30:50] = np.nan
     assert np.abs(bridged(gappy) - plane).max() < 1e-6
+
+
+def test_gaps_that_cross_blocks_are_bridged_as_if_there_were_none():
+    rows, columns = np.mgrid[:700, :1100].astype(float)
+    plane = (0.1 * columns - 0.05 * rows).astype(np.float32)
+    gappy = plane.copy()
+    gappy[480:560, 490:600] = np.nan
+    gappy[100:103, 1000:1090] = np.nan
+    assert np.abs(bridged_by_blocks(gappy) - plane).max() < 1e-3

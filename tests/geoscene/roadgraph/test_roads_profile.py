@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -275,6 +276,51 @@ def test_level_ground_is_graded_to_ramps_alone_with_the_same_heights():
 def test_level_ground_without_ramps_stays_level():
     graph = profile(graph_of({1: (-50, 0), 2: (50, 0)}, [(ROAD, [1, 2])]), flat)
     assert not graded_ground(graph, flat, level=True)(np.zeros(5), np.arange(5.0)).any()
+
+
+def sloping_street(along, across, *, off=0.0):
+    """A street and a side street on a plane, or ``off`` metres above it, and the plane."""
+
+    def ground(x, y):
+        return along * np.asarray(x) + across * np.asarray(y)
+
+    graph = graph_of({1: (-80, 0), 2: (80, 0), 3: (0, 60)}, [(ROAD, [1, 2]), (ROAD, [1, 3])])
+    graph = profile(graph, ground)
+    raised = np.fromiter([np.add(line, (0.0, 0.0, off)) for line in graph.geometry], object)
+    return replace(graph, geometry=raised), ground
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3.0, 3.0))
+def test_surveyed_ground_that_is_graded_again_stays_as_it_is(along, across, off):
+    graph, ground = sloping_street(along, across, off=off)
+    x, y = np.random.default_rng(2).uniform((-100, -40), (100, 70), (3000, 2)).T
+    once = graded_ground(graph, ground, surveyed=True)
+    twice = graded_ground(graph, once, surveyed=True)
+    np.testing.assert_allclose(twice(x, y), once(x, y), atol=1e-9)
+
+
+def test_surveyed_ground_is_kept_beyond_the_shoulder_where_other_ground_is_blended():
+    graph, ground = sloping_street(0.02, 0.15)
+    edge = graph.width.max() / 2 + 2.5
+    beside = np.linspace(1.45 * edge, 20.0, 30)  # from where a slope of 1 to 2 meets the plane
+    x = np.full(30, 40.0)
+    kept = graded_ground(graph, ground, surveyed=True)(x, -beside)
+    np.testing.assert_allclose(kept, ground(x, -beside), atol=1e-6)
+    blended = graded_ground(graph, ground)(x, -beside)
+    assert np.abs(blended - ground(x, -beside)).max() > 0.2
+
+
+def test_roads_on_surveyed_ground_lie_at_their_edges_below_the_crown():
+    def crowned(x, y):
+        return 5.0 + 0.01 * np.asarray(x) + 0.025 * np.maximum(3.5 - np.abs(y), 0.0)
+
+    graph = graph_of({1: (-60, 0), 2: (60, 0)}, [(ROAD | {"width": "7"}, [1, 2])])
+    middle, edges = (
+        profile(graph, crowned, options=ProfileOptions(edges=e)).geometry[0] for e in (False, True)
+    )
+    np.testing.assert_allclose(middle[:, 2] - 5.0 - 0.01 * middle[:, 0], 0.0875, atol=0.01)
+    np.testing.assert_allclose(edges[:, 2] - 5.0 - 0.01 * edges[:, 0], 0.025, atol=0.01)
 
 
 @settings(max_examples=40, deadline=None)
