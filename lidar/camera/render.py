@@ -333,6 +333,7 @@ def _view(
         normals=True,
         precision=options.precision,
         retrace=options.retrace,
+        footprint=(0.0, 1.0 / camera.fx),
     )
     if not seen.all():
         hits = _with_misses(hits, ~seen)

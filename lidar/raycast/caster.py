@@ -19,7 +19,7 @@ from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
-from lidar.raycast.rays import beyond, free_rays, limited, posed_rays, taken
+from lidar.raycast.rays import EXACTLY, beyond, free_rays, limited, posed_rays, taken
 from lidar.raycast.refine import Refiner
 from lidar.raycast.scene import Float64Scene
 
@@ -130,6 +130,7 @@ class Caster:
         normals: bool = False,
         precision: str = "exact",
         retrace: bool = True,
+        footprint: tuple[float, float] = EXACTLY,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray.
@@ -150,6 +151,8 @@ class Caster:
                      starts. Without effect on the float64 backend
         retrace    : whether rays that miss are traced a second time, with a perturbed direction, as rays
                      towards a vertex may pass between faces. Without effect on the float64 backend
+        footprint  : width of a ray, metres, at its start, and its growth per metre: surfaces of refiners may
+                     be averaged over what it covers, for no sensor resolves more; 0: exact first hits
         threads    : threads to use; the result does not depend on it
 
         Raises InputError for rays that are not finite or have a direction of length zero.
@@ -164,6 +167,7 @@ class Caster:
             order=order,
             precision=precision,
             retrace=retrace,
+            footprint=footprint,
         )
         return self._first_hits(rays, on, normals=normals, threads=threads)
 
@@ -182,6 +186,7 @@ class Caster:
         normals: bool = False,
         precision: str = "exact",
         retrace: bool = True,
+        footprint: tuple[float, float] = EXACTLY,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray of a moving sensor; ranges are true metres for unit directions.
@@ -203,6 +208,7 @@ class Caster:
             order=order,
             precision=precision,
             retrace=retrace,
+            footprint=footprint,
         )
         return self._first_hits(rays, None, normals=normals, threads=threads)
 

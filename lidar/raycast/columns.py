@@ -77,6 +77,7 @@ class Rays(NamedTuple):
     mask       : bits
     precision  : index of one of `PRECISIONS`
     retrace    : whether rays that miss are traced a second time
+    footprint  : metres, width of a ray at its start, and its growth per metre
     """
 
     directions: Float
@@ -91,3 +92,4 @@ class Rays(NamedTuple):
     mask: int
     precision: int
     retrace: bool
+    footprint: tuple[float, float]

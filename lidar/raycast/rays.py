@@ -6,8 +6,10 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Float
@@ -15,6 +17,9 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.columns import CHUNK, EXACT, PRECISIONS, Rays
 from lidar.raycast.geometry import ALL
+
+EXACTLY = (0.0, 0.0)
+"""The footprint of rays without width."""
 
 
 def _rows(values: ArrayLike, name: str) -> Float:
@@ -60,7 +65,7 @@ def posed_rays(
 
 def _plain(d: Float, o: Float, *, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
     none, start = np.empty(0, np.int64), np.empty(0, np.float32)
-    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL, EXACT, True)
+    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL, EXACT, True, EXACTLY)
 
 
 def limited(
@@ -73,16 +78,20 @@ def limited(
     order: NDArray[np.integer] | None = None,
     precision: str = PRECISIONS[EXACT],
     retrace: bool = True,
+    footprint: tuple[float, float] = EXACTLY,
 ) -> Rays:
-    """The rays with bounds, mask, times, order of work and precision.
+    """The rays with bounds, mask, times, order of work, precision and footprint.
 
-    Raises InputError unless 0 <= near <= far, times lie within 0 to 1, the order is a permutation and the
-    precision one of `PRECISIONS`.
+    Raises InputError unless 0 <= near <= far, times lie within 0 to 1, the order is a permutation, the
+    precision one of `PRECISIONS` and the footprint finite and not negative.
     """
     n = len(rays.directions)
     reach = np.ascontiguousarray(far, np.float64).reshape(-1)
     if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
         raise InputError("rays need 0 <= near <= far, far one number or one per ray")
+    wide, growth = float(footprint[0]), float(footprint[1])
+    if not (0.0 <= wide < np.inf and 0.0 <= growth < np.inf):
+        raise InputError(f"a footprint of {footprint}: give metres and metres per metre, 0 or more")
     if precision not in PRECISIONS:
         raise InputError(f"precision {precision!r}: choose one of {', '.join(PRECISIONS)}")
     limits = rays._replace(
@@ -91,6 +100,7 @@ def limited(
         mask=int(mask) & ALL,
         precision=PRECISIONS.index(precision),
         retrace=bool(retrace),
+        footprint=(wide, growth),
     )
     if time is not None:
         moments = np.ascontiguousarray(time, np.float32)
@@ -142,10 +152,25 @@ def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
 
 def beyond(rays: Rays, at: Float) -> Rays:
     """The rest of rays from the ray parameters (n,) on; it is exact, as the rays start on a face."""
-    origin, direction = in_scene(rays)
-    return free_rays(origin + at[:, None] * direction, direction)._replace(
-        time=rays.time, far=np.maximum(rays.far - at, 0.0), mask=rays.mask, retrace=rays.retrace
+    if rays.pose.size:
+        origin, direction = in_scene(rays)
+        origin = origin + at[:, None] * direction
+    else:
+        origin, direction = np.empty(rays.directions.shape), rays.directions
+        _advance(rays.offsets, direction, at, origin)
+    far = np.maximum(rays.far - at, 0.0) if np.isfinite(rays.far).any() else rays.far
+    return free_rays(origin, direction)._replace(
+        time=rays.time, far=far, mask=rays.mask, retrace=rays.retrace, footprint=rays.footprint
     )
+
+
+@njit(cache=True, nogil=True)
+def _advance(start: Any, direction: Any, at: Any, out: Any) -> None:
+    """Points (n, 3) of rays at parameters (n,)."""
+    for i in range(len(out)):
+        o = i if len(start) > 1 else 0
+        for k in range(3):
+            out[i, k] = start[o, k] + at[i] * direction[i, k]
 
 
 def _refusal(rays: Rays, bad: int) -> InputError:

@@ -12,9 +12,9 @@ from numba import njit
 
 from geoscene.typing import Float
 from lidar.raycast.memory import called, inlined
-from lidar.relief.roughness import BLOCK, KINDS, NODES, STEP, roughness
+from lidar.relief.roughness import BLOCK, KINDS, LEVELS, NODES, STEP, roughness
 
-DEPTH, _SLOPE, _SCALE = 5, 6, 7
+DEPTH, _SLOPE, _SCALE, _JOINTS, FIELD_SLOPE = range(5, 10)
 """Columns of `Roughness.kinds`."""
 
 _CELLS = 1.0 / STEP
@@ -37,35 +37,57 @@ LANES = 64
 """Rays that are followed by turns."""
 
 _X, _Y, _Z, DX, DY, _DZ, _OVER_X, _OVER_Y, _UNIT, _PASSES = range(10)
-_T, END, _KIND, FOUND, SLOPE_X, SLOPE_Y, GAIN, LENGTH = range(10, 18)
-COLUMNS = 18
+_T, END, _KIND, FOUND, SLOPE_X, SLOPE_Y, GAIN, LENGTH, SIDE, _FIRST, _NODES = range(10, 21)
+COLUMNS = 21
 """Columns of a lane: place in cells and height in units of the field, their changes, one over those along x
 and y, steepness and steps past borders per parameter; parameter, its end, kind, crossing, slopes there,
-height that the ray gains on the plane, and length of the direction."""
+height that the ray gains on the plane, length of the direction, metres along a cell, start of the field and
+its nodes along a side."""
 
 _CLOSE = 1e-8
 """Metres from the surface at which a crossing is found."""
 
 
-def heights(kind: str, xy: Float) -> Float:
-    """Heights (n,) of a kind of ground at places (n, 2), scene metres, relative to the plane: 0 or less."""
+_FINEST = STEP * np.sqrt(2.0)
+"""Metres; a level's cells are nearest to half of the patch that is seen, in powers of two."""
+
+
+def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
+    """Heights (n,) of a kind of ground at places (n, 2), scene metres, relative to the plane: 0 or less.
+
+    level : of detail; 0: all, else cells are 2^level times as wide and stones have no joints
+    """
     out = np.empty(len(xy))
-    _heights(roughness(), list(KINDS).index(kind), np.ascontiguousarray(xy, np.float64), out)
+    _heights(roughness(), list(KINDS).index(kind), level, np.ascontiguousarray(xy, np.float64), out)
     return out
 
 
 @inlined
-def _cell(field: Any, u: float, v: float) -> Any:
-    """Block of a place in cells, the place in its cell, and the surface there, a + p u + q v + r u v."""
+def level_of(patch: float) -> int:
+    """The level of detail of a patch that is seen as one, metres long."""
+    level, cells = 0, patch / _FINEST
+    while cells >= 2.0 and level < LEVELS - 1:
+        level, cells = level + 1, 0.5 * cells
+    return level
+
+
+@inlined
+def _cell(field: Any, first: int, nodes: int, u: float, v: float) -> Any:
+    """Block of a place in cells, the place in its cell, and the surface there, a + p u + q v + r u v.
+
+    first, nodes : start of the level in ``field``, and nodes along its side, a power of two
+    """
     fu, fv = np.floor(u), np.floor(v)
-    last = np.uint64(NODES - 1)
+    start, side = np.uint64(first), np.uint64(nodes)
+    last = side - np.uint64(1)
     i, j = np.uint64(np.int64(fu)) & last, np.uint64(np.int64(fv)) & last
     k, m = (i + np.uint64(1)) & last, (j + np.uint64(1)) & last
-    row, next_row = i * np.uint64(NODES), k * np.uint64(NODES)
+    row, next_row = start + i * side, start + k * side
     a = np.float64(field[row + j])
     p, q = np.float64(field[next_row + j]) - a, np.float64(field[row + m]) - a
     r = np.float64(field[next_row + m]) - a - p - q
-    block = (i // np.uint64(BLOCK)) * np.uint64(NODES // BLOCK) + j // np.uint64(BLOCK)
+    two = np.uint64(BLOCK)
+    block = start // (two * two) + (i // two) * (side // two) + j // two
     return block, u - fu, v - fv, a, p, q, r
 
 
@@ -81,42 +103,50 @@ def _joint(length: float, width: float, joint: float, deep: float, x: float, y: 
 
 
 @inlined
-def _joints(rough: Any, k: int, x: float, y: float) -> Any:
+def joints(rough: Any, k: int, x: float, y: float) -> Any:
     """Height of a kind with stones above its waves."""
     kinds = rough.kinds
     return _joint(kinds[k, 1], kinds[k, 2], kinds[k, 3], kinds[k, 4], x, y)
 
 
 @called
-def _height(rough: Any, k: int, x: float, y: float) -> Any:
-    _, u, v, a, p, q, r = _cell(rough.field[rough.number[k]], x * _CELLS, y * _CELLS)
+def height(rough: Any, k: int, x: float, y: float) -> Any:
+    """Height of a kind at a place, metres."""
+    first = rough.first[rough.number[k], 0]
+    _, u, v, a, p, q, r = _cell(rough.field, first, NODES, x * _CELLS, y * _CELLS)
     h = rough.kinds[k, 0] * (a + p * u + q * v + r * u * v)
-    return h + _joints(rough, k, x, y) if rough.kinds[k, 1] > 0.0 else h
+    return h + joints(rough, k, x, y) if rough.kinds[k, 1] > 0.0 else h
 
 
 @inlined
 def _slopes(rough: Any, k: int, x: float, y: float) -> Any:
-    """Slopes of `_height` along x and y."""
-    _, u, v, _, p, q, r = _cell(rough.field[rough.number[k]], x * _CELLS, y * _CELLS)
+    """Slopes of `height` along x and y."""
+    first = rough.first[rough.number[k], 0]
+    _, u, v, _, p, q, r = _cell(rough.field, first, NODES, x * _CELLS, y * _CELLS)
     factor = rough.kinds[k, 0] * _CELLS
     sx, sy = factor * (p + r * v), factor * (q + r * u)
-    if rough.kinds[k, 1] > 0.0 and _joints(rough, k, x, y) < 0.0:
+    if rough.kinds[k, 1] > 0.0 and joints(rough, k, x, y) < 0.0:
         d = _DIFFERENCE
-        sx += (_joints(rough, k, x + d, y) - _joints(rough, k, x - d, y)) / (2.0 * d)
-        sy += (_joints(rough, k, x, y + d) - _joints(rough, k, x, y - d)) / (2.0 * d)
+        sx += (joints(rough, k, x + d, y) - joints(rough, k, x - d, y)) / (2.0 * d)
+        sy += (joints(rough, k, x, y + d) - joints(rough, k, x, y - d)) / (2.0 * d)
     return sx, sy
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _heights(rough: Any, k: int, xy: Any, out: Any) -> None:
+def _heights(rough: Any, k: int, level: int, xy: Any, out: Any) -> None:
+    side, nodes, first = STEP * 2.0**level, NODES >> level, rough.first[rough.number[k], level]
     for i in range(len(out)):
-        out[i] = _height(rough, k, xy[i, 0], xy[i, 1])
+        if level == 0:
+            out[i] = height(rough, k, xy[i, 0], xy[i, 1])
+            continue
+        _, u, v, a, p, q, r = _cell(rough.field, first, nodes, xy[i, 0] / side, xy[i, 1] / side)
+        out[i] = rough.kinds[k, 0] * (a + p * u + q * v + r * u * v) + rough.kinds[k, _JOINTS]
 
 
 @inlined
 def _gap(rough: Any, k: int, place: Any, way: Any, t: float) -> Any:
     """Metres of a ray above the surface at a parameter."""
-    return place[2] + t * way[2] - _height(rough, k, place[0] + t * way[0], place[1] + t * way[1])
+    return place[2] + t * way[2] - height(rough, k, place[0] + t * way[0], place[1] + t * way[1])
 
 
 @called
@@ -186,38 +216,41 @@ def _inverse(way: float) -> Any:
 
 
 @inlined
-def begin(rough: Any, k: int, place: Any, way: Any, direction: Any, span: Any, lanes: Any, n: int) -> None:
+def begin(rough: Any, k: int, level: int, place: Any, way: Any, span: Any, lanes: Any, n: int) -> None:
     """Put a ray into a lane.
 
-    place     : x, y and height above the plane at parameter 0
-    way       : change of each per parameter
-    direction : of the ray
-    span      : first and last parameter
+    level : of detail
+    place : x, y and height above the plane at parameter 0
+    way   : change of each per parameter
+    span  : first and last parameter
     """
-    scale = rough.kinds[k, _SCALE]
-    lanes[_X, n], lanes[_Y, n], lanes[_Z, n] = place[0] * _CELLS, place[1] * _CELLS, place[2] * scale
-    dx, dy = way[0] * _CELLS, way[1] * _CELLS
+    scale, f = rough.kinds[k, _SCALE], rough.number[k]
+    side, cells = STEP * np.float64(1 << level), _CELLS / np.float64(1 << level)
+    z = place[2] - rough.kinds[k, _JOINTS] if level > 0 else place[2]
+    lanes[_X, n], lanes[_Y, n], lanes[_Z, n] = place[0] * cells, place[1] * cells, z * scale
+    dx, dy = way[0] * cells, way[1] * cells
     lanes[DX, n], lanes[DY, n], lanes[_DZ, n] = dx, dy, way[2] * scale
     lanes[_OVER_X, n], lanes[_OVER_Y, n] = _inverse(dx), _inverse(dy)
     speed = max(abs(dx), abs(dy))
-    lanes[_UNIT, n], lanes[_PASSES, n] = rough.unit[rough.number[k]] * speed, _PAST / speed
+    lanes[_UNIT, n], lanes[_PASSES, n] = rough.unit[f, level] * speed, _PAST / speed
     lanes[_T, n], lanes[END, n] = span
-    lanes[_KIND, n], lanes[GAIN, n] = k, way[2]
-    lanes[LENGTH, n] = np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+    lanes[_KIND, n], lanes[GAIN, n], lanes[SIDE, n] = k, way[2], side
+    lanes[_FIRST, n], lanes[_NODES, n] = rough.first[f, level], NODES >> level
 
 
 @inlined
-def _step(field: Any, steep: Any, lanes: Any, n: int) -> Any:
+def _step(rough: Any, lanes: Any, n: int) -> Any:
     """Advance the ray of a lane by a step; whether it goes on.
 
     A step goes as far as no place ahead of the ray's block can rise to the ray (a cone step, after Dummer
     2006). Within a cell the surface is bilinear, and the crossing the root of a quadratic equation.
     """
     t, dx, dy, dz = lanes[_T, n], lanes[DX, n], lanes[DY, n], lanes[_DZ, n]
-    block, u, v, a, p, q, r = _cell(field, lanes[_X, n] + t * dx, lanes[_Y, n] + t * dy)
+    first, nodes = np.int64(lanes[_FIRST, n]), np.int64(lanes[_NODES, n])
+    block, u, v, a, p, q, r = _cell(rough.field, first, nodes, lanes[_X, n] + t * dx, lanes[_Y, n] + t * dy)
     gap = lanes[_Z, n] + t * dz - (a + p * u + q * v + r * u * v)
     towards = (2 if dx < 0.0 else 0) + (1 if dy < 0.0 else 0)
-    closing = lanes[_UNIT, n] * np.float64(steep[towards, block]) - dz
+    closing = lanes[_UNIT, n] * np.float64(rough.steep[towards, block]) - dz
     border = min(
         ((1.0 if dx >= 0.0 else 0.0) - u) * lanes[_OVER_X, n],
         ((1.0 if dy >= 0.0 else 0.0) - v) * lanes[_OVER_Y, n],
@@ -254,21 +287,20 @@ def follow(rough: Any, lanes: Any, active: Any, count: int) -> None:
         for m in range(left):
             n = active[m]
             active[kept] = n
-            f = rough.number[np.int64(lanes[_KIND, n])]
-            kept += 1 if _step(rough.field[f], rough.steep[f], lanes, n) else 0
+            kept += 1 if _step(rough, lanes, n) else 0
         left = kept
         if left == 0:
             break
     for n in range(count):
         k = np.int64(lanes[_KIND, n])
         factor = rough.kinds[k, 0]
-        slope = factor * _CELLS
+        slope = factor / lanes[SIDE, n]
         lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = slope * lanes[SLOPE_X, n], slope * lanes[SLOPE_Y, n]
         t = lanes[FOUND, n]
-        if rough.kinds[k, 1] > 0.0 and t < np.inf:
+        if rough.kinds[k, 1] > 0.0 and t < np.inf and np.int64(lanes[_NODES, n]) == NODES:
             place = lanes[_X, n] * STEP, lanes[_Y, n] * STEP, lanes[_Z, n] * factor
             way = lanes[DX, n] * STEP, lanes[DY, n] * STEP, lanes[_DZ, n] * factor
-            if _joints(rough, k, place[0] + t * way[0], place[1] + t * way[1]) < 0.0:
+            if joints(rough, k, place[0] + t * way[0], place[1] + t * way[1]) < 0.0:
                 lanes[FOUND, n], lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = _in_joint(
                     rough, k, place, way, t, lanes[END, n]
                 )

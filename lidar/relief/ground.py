@@ -21,17 +21,22 @@ from lidar.relief.crossing import (
     DX,
     DY,
     END,
+    FIELD_SLOPE,
     FOUND,
     GAIN,
     LANES,
     LENGTH,
+    SIDE,
     SLOPE_X,
     SLOPE_Y,
     begin,
     follow,
+    height,
+    joints,
+    level_of,
 )
-from lidar.relief.lines import beyond_plane, direction_of, origin_of
-from lidar.relief.roughness import STEP, kinds_of, roughness
+from lidar.relief.lines import OVER, beyond_plane, direction_of, origin_of
+from lidar.relief.roughness import kinds_of, roughness
 
 
 class GroundTables(NamedTuple):
@@ -71,6 +76,9 @@ def joined_ground(tables: Mapping[int, GroundTables], *, count: int) -> GroundTa
 class GroundRefiner:
     """Refines hits on rough ground; see `lidar.raycast.refine`.
 
+    Rays with a footprint meet the mean of the surface over it: heights whose cells, in powers of two, are
+    nearest to half of its length along the ground.
+
     tables : of the loaded tiles, with scene coordinates
     """
 
@@ -107,6 +115,12 @@ def _on_plane(plane: Any, f: int, origin: Any, direction: Any) -> Any:
 
 
 @inlined
+def _length(direction: Any) -> Any:
+    """Length of a vector."""
+    return np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+
+
+@inlined
 def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: int) -> None:
     """Write the hit of a lane on a face; beyond the end of the ray it is a miss."""
     distance, face, instance, cosine, normal = columns
@@ -119,7 +133,7 @@ def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: in
     sx, sy = lanes[SLOPE_X, n], lanes[SLOPE_Y, n]
     nx, ny = -tables.plane[f, 0] - sx, -tables.plane[f, 1] - sy
     size = np.sqrt(nx * nx + ny * ny + 1.0)
-    falls = sx * lanes[DX, n] * STEP + sy * lanes[DY, n] * STEP - lanes[GAIN, n]
+    falls = (sx * lanes[DX, n] + sy * lanes[DY, n]) * lanes[SIDE, n] - lanes[GAIN, n]
     distance[i], face[i], instance[i] = t, f, -1
     # A ray that grazes the edge of a dip may seem to come from behind.
     cosine[i] = max(falls / (size * lanes[LENGTH, n]), 1e-3)
@@ -143,9 +157,12 @@ def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any,
     if not way[2] < 0.0:
         return 0
     t = distance[i]
+    length, (start, growth) = _length(direction), rays.footprint
+    level = level_of((start + growth * t * length) / cosine[i])
     # The height counts from the hit on the face, so that no ray slips between it and the plane.
     end = t - rough.kinds[k, DEPTH] / way[2]
-    begin(rough, k, (place[0], place[1], -t * way[2]), way, direction, (t, end), lanes, n)
+    begin(rough, k, level, (place[0], place[1], -t * way[2]), way, (t, end), lanes, n)
+    lanes[LENGTH, n] = length
     return 1
 
 
@@ -169,18 +186,32 @@ def _refine(tables: Any, rough: Any, rays: Any, low: int, high: int, columns: An
 
 @inlined
 def _enter_below(tables: Any, rough: Any, rays: Any, f: int, i: int, lanes: Any, n: int) -> Any:
-    """Put a ray that starts between the surface and the plane of a face into a lane; 1 if it does, else 0."""
+    """Put a ray that starts between the surface and the plane of a face into a lane.
+
+    Returns 1 if it does so, else 0, and the parameter at which a ray without a lane has crossed the plane.
+    A ray that starts on the mean over a footprint may start below the surface: it starts just above it.
+    """
     k = tables.kind[f] if f >= 0 else -1
     if k < 0:
-        return 0
+        return 0, 0.0
     direction = direction_of(rays, i)
-    place, way = _on_plane(tables.plane, f, origin_of(rays, i), direction)
-    z, depth = place[2] + rays.near * way[2], rough.kinds[k, DEPTH]
-    if z >= 0.0 or z < -2.0 * depth:
-        return 0
-    end = rays.near + (-z / way[2] if way[2] > 0.0 else (-depth - z) / min(way[2], -1e-12))
-    begin(rough, k, place, way, direction, (rays.near, max(end, rays.near)), lanes, n)
-    return 1
+    (x, y, z), way = _on_plane(tables.plane, f, origin_of(rays, i), direction)
+    near, depth, length = rays.near, rough.kinds[k, DEPTH], _length(direction)
+    below = z + near * way[2]
+    if below >= 0.0 or below < -2.0 * depth:
+        return 0, 0.0
+    px, py, slope = x + near * way[0], y + near * way[1], rough.kinds[k, FIELD_SLOPE]
+    if way[2] > slope * np.sqrt(way[0] ** 2 + way[1] ** 2) and (
+        rough.kinds[k, 1] <= 0.0 or joints(rough, k, px, py) >= 0.0
+    ):
+        return 0, near - below / way[2] + beyond_plane(way[2], length)
+    surface = height(rough, k, px, py)
+    lift = surface + OVER - below if below < surface else 0.0
+    # The ray itself, which goes on from there, crosses the plane after the lifted one.
+    end = near + (-below / way[2] if way[2] > 0.0 else (-depth - below - lift) / min(way[2], -1e-12))
+    begin(rough, k, 0, (x, y, z + lift), way, (near, max(end, near)), lanes, n)
+    lanes[LENGTH, n] = length
+    return 1, 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -192,7 +223,8 @@ def _leave(tables: Any, rough: Any, rays: Any, on: Any, columns: Any, at: Any) -
         count = 0
         while i < len(on) and count < LANES:
             ray[count] = i
-            count += _enter_below(tables, rough, rays, on[i], i, lanes, count)
+            entered, at[i] = _enter_below(tables, rough, rays, on[i], i, lanes, count)
+            count += entered
             i += 1
         follow(rough, lanes, active, count)
         for n in range(count):

@@ -6,7 +6,7 @@ from typing import Any
 
 from lidar.raycast.memory import inlined
 
-_OVER, _FARTHEST = 1e-3, 0.1
+OVER, _FARTHEST = 1e-3, 0.1
 """Metres off a plane at which a ray from behind it goes on, as far as shadow rays keep off surfaces; and
 metres along the ray at most."""
 
@@ -20,7 +20,7 @@ def beyond_plane(leaving: float, length: float) -> Any:
 
     A ray that starts on the plane itself would meet it again in float32.
     """
-    return min(_OVER / leaving, _FARTHEST / length)
+    return min(OVER / leaving, _FARTHEST / length)
 
 
 @inlined

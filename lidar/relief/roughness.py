@@ -34,6 +34,9 @@ _GRAINS = (2.5, 10.0)
 NODES, STEP = 512, 0.025
 """Nodes along a side of a field, a power of two, and metres between them."""
 
+LEVELS = 7
+"""Levels of detail of a field; each has half as many nodes along a side as the one before."""
+
 BLOCK = 2
 """Cells along a side of the blocks whose steepness is known."""
 
@@ -113,19 +116,21 @@ _STEEPEST = 0.5
 class Roughness(NamedTuple):
     """The kinds of ground for compiled code.
 
-    field  : (f, n n) float32, heights of periodic fields, at most 0; the first in units in which
-             Gd(n0) = 1 m^3, the others, with grains, in metres
-    steep  : (f, 4, n n / 4) uint8, bounds of the rise from any place in a block of `BLOCK` cells to any
+    field  : (f t,) float32, heights of periodic fields, at most 0, level by level; the first field in units
+             in which Gd(n0) = 1 m^3, the others, with grains, in metres
+    steep  : (4, f t / 4) uint8, bounds of the rise from any place in a block of `BLOCK` cells to any
              place ahead of it, per cell: along +x +y, +x -y, -x +y and -x -y; cells are counted along
              the axis along which they are more
-    unit   : (f,) unit of ``steep``
+    first  : (f, `LEVELS`) start of each field's levels in ``field``
+    unit   : (f, `LEVELS`) unit of ``steep``
     number : (k,) field of each kind
-    kinds  : (k, 8) factor of the field, stones as in `Kind`, greatest depth, greatest slope, and one over the
-             factor
+    kinds  : (k, 10) factor of the field, stones as in `Kind`, greatest depth, greatest slope, one over the
+             factor, mean height of joints, and greatest slope of the field
     """
 
     field: NDArray[np.float32]
     steep: NDArray[np.uint8]
+    first: NDArray[np.int64]
     unit: Float
     number: NDArray[np.int64]
     kinds: Float
@@ -144,16 +149,24 @@ def roughness() -> Roughness:
         key = (float(factor), kind.grain) if kind.grain else (1.0, 0.0)
         number.append(fields.setdefault(key, len(fields)))
         rows.append([1.0 if kind.grain else factor, *kind.stones, deep, 2.0 * deep / joint if joint else 0.0])
-    field = np.stack([road * waves + grain * grains for road, grain in fields]).astype(np.float32)
+    finest = np.stack([road * waves + grain * grains for road, grain in fields]).astype(np.float32)
     kinds = np.array(rows)
-    kinds[:, 5] -= kinds[:, 0] * field.min(axis=(1, 2))[number]
-    kinds[:, 6] += kinds[:, 0] * np.array([_steepest(f) for f in field])[number]
-    kinds = np.column_stack([kinds, 1.0 / kinds[:, 0]])
-    steep = np.stack([_steepness(f) for f in field])
-    unit = steep.max(axis=(1, 2, 3)) / 254.0
-    steep = np.ceil(steep / unit[:, None, None, None]).astype(np.uint8)
-    n = len(field)
-    return Roughness(field.reshape(n, -1), steep.reshape(n, 4, -1), unit, np.array(number), kinds)
+    kinds[:, 5] -= kinds[:, 0] * finest.min(axis=(1, 2))[number]
+    slope = kinds[:, 0] * np.array([_steepest(f) for f in finest])[number]
+    kinds[:, 6] += slope
+    mean = [_mean_of_joints(kind.stones) for kind in KINDS.values()]
+    kinds = np.column_stack([kinds, 1.0 / kinds[:, 0], mean, slope])
+    levels = [_levels(field) for field in finest]
+    steep = [[_steepness(level) for level in field] for field in levels]
+    unit = np.array([[level.max() / 254.0 for level in field] for field in steep])
+    scaled = [
+        np.ceil(level / one).astype(np.uint8).reshape(4, -1)
+        for field, units in zip(steep, unit, strict=True)
+        for level, one in zip(field, units, strict=True)
+    ]
+    flat = [level.ravel() for field in levels for level in field]
+    first = np.cumsum([0] + [len(level) for level in flat])[:-1].reshape(unit.shape)
+    return Roughness(np.concatenate(flat), np.hstack(scaled), first, unit, np.array(number), kinds)
 
 
 def kinds_of(mesh: Mesh) -> NDArray[np.int8]:
@@ -176,6 +189,30 @@ def _below(field: Float) -> Float:
     most = _PEAK * float(field.std())
     found: Float = np.clip(field, -most, most) - most
     return found
+
+
+def _levels(field: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """A periodic field and its means, each level at every second node of the one before.
+
+    Means are weighted 1 : 2 : 1 along each axis, so that nodes keep their places.
+    """
+    found = [field]
+    while len(found) < LEVELS:
+        wide = found[-1].astype(np.float64)
+        for axis in (0, 1):
+            wide = (np.roll(wide, 1, axis) + 2.0 * wide + np.roll(wide, -1, axis)) / 4.0
+        found.append(np.ascontiguousarray(wide[::2, ::2]).astype(np.float32))
+    return found
+
+
+def _mean_of_joints(stones: tuple[float, float, float, float]) -> float:
+    """Mean height of the joints of a bond: their sides are planes, so that tops are frusta of pyramids."""
+    length, width, joint, deep = stones
+    if not joint:
+        return 0.0
+    top = (length - joint) * (width - joint)
+    middle = (length - 0.5 * joint) * (width - 0.5 * joint)
+    return deep * ((length * width + 4.0 * middle + top) / (6.0 * length * width) - 1.0)
 
 
 def _steepest(field: NDArray[np.float32]) -> float:

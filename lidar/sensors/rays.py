@@ -16,6 +16,9 @@ from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
 from lidar.physics.footprint import Gap, bundle, widest_gap
 from lidar.rig.patterns.beams import Firings
 
+_UNIFORM = 0.5 * np.sqrt(3.0)
+"""Width of a uniform profile with the standard deviation of a Gaussian one, in widths of that at 1/e^2."""
+
 
 @dataclass(frozen=True, slots=True)
 class Beam:
@@ -37,6 +40,15 @@ class Beam:
         """Widest gap between neighbouring rays, in the wider direction of the beam."""
         share = widest_gap(len(self.place))
         return Gap(share * float(self.size.max()), share * float(self.spread.max()))
+
+    @property
+    def footprint(self) -> tuple[float, float]:
+        """Height of a ray's share of the beam, metres, at its start, and its growth per metre.
+
+        A Gaussian profile spreads as far as a uniform one of 0.87 of its width at 1/e^2.
+        """
+        share = 2.0 * float(_UNIFORM / np.sqrt(len(self.place)))
+        return share * float(self.size[1]), share * float(self.spread[1])
 
 
 def beam_of(

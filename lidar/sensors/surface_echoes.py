@@ -60,6 +60,7 @@ def surface_echoes(
     if settings.foliage:
         leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
         foliage = Foliage(world.caster, world.faces, far, leaf_seed)
+    footprint = beam.footprint
     beyond: list[Echoes] = []
     for number, first in enumerate(range(0, len(pulses), batch)):
         cast = moving.rays(number)
@@ -74,6 +75,7 @@ def surface_echoes(
             order=cast.order,
             precision=settings.precision,
             retrace=settings.retrace,
+            footprint=footprint,
             threads=threads,
         )
         pierced = None if foliage is None else foliage.pierce(hits, cast, first=first * rays, time=moments)

@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
 from geoscene.mesh import Mesh
+from lidar.errors import InputError
 from lidar.raycast import Caster
 from lidar.relief import GroundRefiner, ground_tables
 from lidar.relief.crossing import heights
-from lidar.relief.roughness import BLOCK, KINDS, N0, NODES, STEP, roughness
+from lidar.relief.roughness import BLOCK, KINDS, LEVELS, N0, NODES, STEP, roughness
 
 SIDE = 200.0
 KIND_OF = {"asphalt": ("asphalt", Class.ROAD), "paving": ("paving", Class.SIDEWALK)}
@@ -79,7 +80,7 @@ def test_rough_ground_lies_at_or_below_its_plane_within_its_depth_and_slope(kind
     rng = np.random.default_rng(1)
     xy = rng.uniform(-1e4, 1e4, (100_000, 2))
     z = heights(kind, xy)
-    *_, depth, slope, _ = roughness().kinds[list(KINDS).index(kind)]
+    depth, slope = roughness().kinds[list(KINDS).index(kind)][[5, 6]]
     assert (z <= 0).all()
     assert (z >= -depth).all()
     moved = xy + 1e-4 * rng.normal(size=xy.shape)
@@ -91,18 +92,89 @@ def test_rough_ground_lies_at_or_below_its_plane_within_its_depth_and_slope(kind
 @pytest.mark.parametrize("kind", ["asphalt", "soil", "grass", "ballast"])
 @pytest.mark.parametrize("towards", range(4))
 @pytest.mark.parametrize("reach", [0.01, 0.1, 1.0, 6.0])
-def test_no_place_ahead_rises_faster_than_the_steepness_of_a_block(kind, towards, reach):
+@pytest.mark.parametrize("level", [0, 1, LEVELS - 1])
+def test_no_place_ahead_rises_faster_than_the_steepness_of_a_block(kind, towards, reach, level):
     rough, k = roughness(), list(KINDS).index(kind)
     rng = np.random.default_rng(4)
-    start = rng.uniform(0, 30, (200_000, 2))
+    start = rng.uniform(0, 30, (100_000, 2))
     sign = np.array([-1 if towards & 2 else 1, -1 if towards & 1 else 1])
     ahead = reach * rng.uniform(0, 1, start.shape) ** rng.integers(1, 4, (len(start), 1))
-    rise = heights(kind, start + sign * ahead) - heights(kind, start)
-    i, j = (np.floor(start / STEP).astype(int) % NODES // BLOCK).T
-    f = rough.number[k]
-    steep = rough.unit[f] * rough.steep[f, towards, i * (NODES // BLOCK) + j]
-    bound = rough.kinds[k, 0] * steep * ahead.max(axis=1) / STEP
+    rise = heights(kind, start + sign * ahead, level=level) - heights(kind, start, level=level)
+    nodes, side, f = NODES >> level, STEP * 2**level, rough.number[k]
+    i, j = (np.floor(start / side).astype(int) % nodes // BLOCK).T
+    first = rough.first[f, level] // BLOCK**2
+    steep = rough.unit[f, level] * rough.steep[towards, first + i * (nodes // BLOCK) + j]
+    bound = rough.kinds[k, 0] * steep * ahead.max(axis=1) / side
     assert (rise <= bound + 1e-9).all()
+
+
+@pytest.mark.parametrize("kind", KIND_OF)
+@pytest.mark.parametrize("level", range(1, LEVELS))
+def test_levels_have_the_mean_height_of_the_surface(kind, level):
+    xy = np.random.default_rng(6).uniform(0, 12.8 * 25, (2_000_000, 2))
+    exact = heights(kind, xy)
+    assert heights(kind, xy, level=level).mean() == pytest.approx(exact.mean(), abs=0.01 * exact.std())
+
+
+@pytest.mark.parametrize("kind", ["asphalt", "ballast", "grass"])
+@pytest.mark.parametrize("level", range(1, LEVELS))
+def test_levels_are_means_of_the_surface(kind, level):
+    rng = np.random.default_rng(5)
+    side = STEP * 2**level
+    nodes = side * rng.integers(0, NODES >> level, (60, 2))
+    # Nodes are means weighted by a triangle that ends two cells away, but for how nodes between are taken.
+    offset = side * (np.arange(-64, 65) + 0.37) / 64
+    weight = np.maximum(1.0 - np.abs(offset) / side, 0.0)
+    around = np.stack(np.meshgrid(offset, offset, indexing="ij"), axis=-1).reshape(-1, 2)
+    z = heights(kind, (nodes[:, None] + around).reshape(-1, 2)).reshape(len(nodes), -1)
+    mean = z @ np.outer(weight, weight).ravel() / weight.sum() ** 2
+    found = heights(kind, nodes, level=level)
+    spread = z.std(axis=1).mean()
+    assert np.abs(found - mean).mean() < 0.15 * spread
+    assert abs((found - mean).mean()) < 0.05 * spread
+    assert (found <= 0).all()
+
+
+def level_of(patch):
+    """Level of detail of patches (n,), metres: half of a patch is nearest to its cells, in powers of two."""
+    return np.clip(np.rint(np.log2(np.maximum(patch / 2 / STEP, 1e-9))), 0, LEVELS - 1).astype(int)
+
+
+@pytest.mark.parametrize("kind", KIND_OF)
+@pytest.mark.parametrize("footprint", [(0.0, 0.003), (0.01, 0.0), (0.02, 0.03)])
+def test_rays_with_a_footprint_end_on_the_mean_over_it_and_pass_nothing_of_it_before(kind, footprint):
+    start, way = looks(np.random.default_rng(8), 3000, lowest_deg=1.2, highest_deg=60)
+    way *= np.random.default_rng(1).uniform(0.5, 2, (len(way), 1))
+    hits = ground(kind).cast(start, way, footprint=footprint, normals=True, threads=2)
+    plane = bare(kind).cast(start, way)
+    far = plane.range * np.linalg.norm(way, axis=1)
+    level = level_of((footprint[0] + footprint[1] * far) / plane.cosine)
+    assert len(np.unique(level)) > 2
+    for number in np.unique(level):
+        of = level == number
+        for share in (0.0, 0.3, 0.7, 0.95, 0.999, 1.0):
+            points = (start + (plane.range + share * (hits.range - plane.range))[:, None] * way)[of]
+            above = points[:, 2] - points[:, :2] @ SLOPE - heights(kind, points[:, :2], level=number)
+            assert (above > -1e-4).all()
+        assert np.abs(above).max() < 1e-6
+    np.testing.assert_allclose(np.linalg.norm(hits.normal, axis=1), 1.0)
+    assert (hits.range >= plane.range).all()
+
+
+def test_far_rays_with_a_footprint_see_calmer_ground():
+    start, way = looks(np.random.default_rng(8), 5000, lowest_deg=2, highest_deg=3)
+    caster = ground("grass")
+    exact, mean = (caster.cast(start, way, footprint=(0.0, w), normals=True) for w in (0.0, 0.003))
+    tilt = [np.linalg.norm(hits.normal[:, :2] + SLOPE, axis=1).mean() for hits in (exact, mean)]
+    assert tilt[1] < 0.3 * tilt[0]
+    # Flat rays meet the crests of what they resolve, so the mean lies deeper and its ranges are longer.
+    assert mean.range.mean() > exact.range.mean()
+
+
+@pytest.mark.parametrize("footprint", [(-0.1, 0.0), (0.0, np.nan), (np.inf, 0.0)])
+def test_a_footprint_that_is_no_width_is_refused(footprint):
+    with pytest.raises(InputError, match="footprint"):
+        ground("grass").cast([0, 0, 2.0], [[0, 0, -1.0]], footprint=footprint)
 
 
 @pytest.mark.parametrize("kind", KIND_OF)
@@ -132,12 +204,12 @@ def bare(kind):
 
 
 @settings(max_examples=50, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(KIND_OF)))
-def test_hits_do_not_depend_on_other_rays_or_threads(seed, kind):
+@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(KIND_OF)), st.sampled_from([0.0, 0.003]))
+def test_hits_do_not_depend_on_other_rays_or_threads(seed, kind, width):
     start, way = looks(np.random.default_rng(seed), 5, lowest_deg=1.5, highest_deg=60)
-    caster = ground(kind)
-    together = caster.cast(start, way, threads=2)
-    alone = [caster.cast(start[[k]], way[[k]]).range[0] for k in range(5)]
+    caster, footprint = ground(kind), (0.0, width)
+    together = caster.cast(start, way, footprint=footprint, threads=2)
+    alone = [caster.cast(start[[k]], way[[k]], footprint=footprint).range[0] for k in range(5)]
     np.testing.assert_array_equal(together.range, alone)
 
 
@@ -160,6 +232,27 @@ def test_light_leaves_a_point_on_rough_ground_upwards_and_hits_the_surface_sidew
     down = caster.cast(place, -up, on=hits.face)
     assert (down.face >= 0).all()
     assert np.abs(above(kind, place - down.range[:, None] * up)).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", KIND_OF)
+@pytest.mark.parametrize("up_deg", [80.0, 50.0, 20.0, 3.0])
+def test_light_leaves_the_mean_over_a_footprint_as_it_leaves_the_surface_there(kind, up_deg):
+    start, way = looks(np.random.default_rng(9), 2000, lowest_deg=2, highest_deg=10)
+    caster = ground(kind)
+    hits = caster.cast(start, way, footprint=(0.0, 0.003), normals=True)
+    place = start + hits.range[:, None] * way + 1e-3 * hits.normal
+    raised = place.copy()
+    under = above(kind, place) < 0
+    assert under.any()
+    raised[under, 2] += 1e-3 - above(kind, place)[under]
+    turn = np.random.default_rng(3).uniform(0, 2 * np.pi, len(place))
+    rise = np.tan(np.radians(up_deg))
+    sun = np.column_stack([np.cos(turn), np.sin(turn), np.full(len(turn), rise)])
+    sun[:, 2] += sun[:, :2] @ SLOPE
+    seen, there = (caster.cast(p, sun, on=hits.face, far=50.0).face >= 0 for p in (place, raised))
+    assert (seen != there).mean() < 0.005
+    if up_deg > 60:
+        assert seen.mean() < 0.05
 
 
 def test_kerbs_walls_and_water_have_no_roughness():
