@@ -1,6 +1,6 @@
 """First crossings of rays with the rough ground of a kind, as compiled code.
 
-Rays are put into lanes and followed by turns; a lane is a column of a table whose rows are named below.
+Rays are put into lanes and followed by turns; a lane is a row of a table whose columns are named below.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from numba import njit
 
 from geoscene.typing import Float
 from lidar.raycast.memory import called, inlined
-from lidar.relief.roughness import BLOCK, KINDS, LEVELS, NODES, STEP, roughness
+from lidar.relief.roughness import BLOCK, KINDS, LEVELS, NODES, REACH, STEP, roughness
 
 DEPTH, _SLOPE, _SCALE, _JOINTS, FIELD_SLOPE = range(5, 10)
 """Columns of `Roughness.kinds`."""
@@ -227,15 +227,28 @@ def begin(rough: Any, k: int, level: int, place: Any, way: Any, span: Any, lanes
     scale, f = rough.kinds[k, _SCALE], rough.number[k]
     side, cells = STEP * np.float64(1 << level), _CELLS / np.float64(1 << level)
     z = place[2] - rough.kinds[k, _JOINTS] if level > 0 else place[2]
-    lanes[_X, n], lanes[_Y, n], lanes[_Z, n] = place[0] * cells, place[1] * cells, z * scale
+    lanes[n, _X], lanes[n, _Y], lanes[n, _Z] = place[0] * cells, place[1] * cells, z * scale
     dx, dy = way[0] * cells, way[1] * cells
-    lanes[DX, n], lanes[DY, n], lanes[_DZ, n] = dx, dy, way[2] * scale
-    lanes[_OVER_X, n], lanes[_OVER_Y, n] = _inverse(dx), _inverse(dy)
+    lanes[n, DX], lanes[n, DY], lanes[n, _DZ] = dx, dy, way[2] * scale
+    lanes[n, _OVER_X], lanes[n, _OVER_Y] = _inverse(dx), _inverse(dy)
     speed = max(abs(dx), abs(dy))
-    lanes[_UNIT, n], lanes[_PASSES, n] = rough.unit[f, level] * speed, _PAST / speed
-    lanes[_T, n], lanes[END, n] = span
-    lanes[_KIND, n], lanes[GAIN, n], lanes[SIDE, n] = k, way[2], side
-    lanes[_FIRST, n], lanes[_NODES, n] = rough.first[f, level], NODES >> level
+    lanes[n, _UNIT], lanes[n, _PASSES] = rough.unit[f, level] * speed, _PAST / speed
+    lanes[n, _T], lanes[n, END] = span
+    lanes[n, _KIND], lanes[n, GAIN], lanes[n, SIDE] = k, way[2], side
+    lanes[n, _FIRST], lanes[n, _NODES] = rough.first[f, level], NODES >> level
+
+
+@inlined
+def descend(rough: Any, lanes: Any, n: int) -> None:
+    """Advance the ray of a lane from the plane to the highest place near ahead of it."""
+    t, dx, dy, dz = lanes[n, _T], lanes[n, DX], lanes[n, DY], lanes[n, _DZ]
+    first, blocks = np.int64(lanes[n, _FIRST]), np.int64(lanes[n, _NODES]) // REACH
+    i = np.int64(np.floor((lanes[n, _X] + t * dx) * (1.0 / REACH))) & (blocks - 1)
+    j = np.int64(np.floor((lanes[n, _Y] + t * dy) * (1.0 / REACH))) & (blocks - 1)
+    towards = (2 if dx < 0.0 else 0) + (1 if dy < 0.0 else 0)
+    top = np.float64(rough.top[towards, first // (REACH * REACH) + i * blocks + j])
+    falls = (top - lanes[n, _Z] - t * dz) / dz
+    lanes[n, _T] = t + max(min(falls, (REACH - 1) / max(abs(dx), abs(dy))), 0.0)
 
 
 @inlined
@@ -245,15 +258,15 @@ def _step(rough: Any, lanes: Any, n: int) -> Any:
     A step goes as far as no place ahead of the ray's block can rise to the ray (a cone step, after Dummer
     2006). Within a cell the surface is bilinear, and the crossing the root of a quadratic equation.
     """
-    t, dx, dy, dz = lanes[_T, n], lanes[DX, n], lanes[DY, n], lanes[_DZ, n]
-    first, nodes = np.int64(lanes[_FIRST, n]), np.int64(lanes[_NODES, n])
-    block, u, v, a, p, q, r = _cell(rough.field, first, nodes, lanes[_X, n] + t * dx, lanes[_Y, n] + t * dy)
-    gap = lanes[_Z, n] + t * dz - (a + p * u + q * v + r * u * v)
+    t, dx, dy, dz = lanes[n, _T], lanes[n, DX], lanes[n, DY], lanes[n, _DZ]
+    first, nodes = np.int64(lanes[n, _FIRST]), np.int64(lanes[n, _NODES])
+    block, u, v, a, p, q, r = _cell(rough.field, first, nodes, lanes[n, _X] + t * dx, lanes[n, _Y] + t * dy)
+    gap = lanes[n, _Z] + t * dz - (a + p * u + q * v + r * u * v)
     towards = (2 if dx < 0.0 else 0) + (1 if dy < 0.0 else 0)
-    closing = lanes[_UNIT, n] * np.float64(rough.steep[towards, block]) - dz
+    closing = lanes[n, _UNIT] * np.float64(rough.steep[towards, block]) - dz
     border = min(
-        ((1.0 if dx >= 0.0 else 0.0) - u) * lanes[_OVER_X, n],
-        ((1.0 if dy >= 0.0 else 0.0) - v) * lanes[_OVER_Y, n],
+        ((1.0 if dx >= 0.0 else 0.0) - u) * lanes[n, _OVER_X],
+        ((1.0 if dy >= 0.0 else 0.0) - v) * lanes[n, _OVER_Y],
     )
     crosses, ends, step = gap <= 0.0, closing <= 0.0, 0.0
     if gap > border * closing:
@@ -264,12 +277,12 @@ def _step(rough: Any, lanes: Any, n: int) -> Any:
         under = falls * falls - 4.0 * bend * gap
         over = np.sqrt(max(under, 0.0)) - falls
         crosses = (under >= 0.0) & (over > 0.0) & (2.0 * gap <= border * over)
-        step = 2.0 * gap / over if crosses else border + lanes[_PASSES, n]
+        step = 2.0 * gap / over if crosses else border + lanes[n, _PASSES]
     t += step
-    lanes[_T, n] = t
-    lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = p + r * (v + step * dy), q + r * (u + step * dx)
-    ends = (t > lanes[END, n]) | (ends & (not crosses))
-    lanes[FOUND, n] = np.inf if ends else t
+    lanes[n, _T] = t
+    lanes[n, SLOPE_X], lanes[n, SLOPE_Y] = p + r * (v + step * dy), q + r * (u + step * dx)
+    ends = (t > lanes[n, END]) | (ends & (not crosses))
+    lanes[n, FOUND] = np.inf if ends else t
     return not (crosses | ends)
 
 
@@ -292,15 +305,15 @@ def follow(rough: Any, lanes: Any, active: Any, count: int) -> None:
         if left == 0:
             break
     for n in range(count):
-        k = np.int64(lanes[_KIND, n])
+        k = np.int64(lanes[n, _KIND])
         factor = rough.kinds[k, 0]
-        slope = factor / lanes[SIDE, n]
-        lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = slope * lanes[SLOPE_X, n], slope * lanes[SLOPE_Y, n]
-        t = lanes[FOUND, n]
-        if rough.kinds[k, 1] > 0.0 and t < np.inf and np.int64(lanes[_NODES, n]) == NODES:
-            place = lanes[_X, n] * STEP, lanes[_Y, n] * STEP, lanes[_Z, n] * factor
-            way = lanes[DX, n] * STEP, lanes[DY, n] * STEP, lanes[_DZ, n] * factor
+        slope = factor / lanes[n, SIDE]
+        lanes[n, SLOPE_X], lanes[n, SLOPE_Y] = slope * lanes[n, SLOPE_X], slope * lanes[n, SLOPE_Y]
+        t = lanes[n, FOUND]
+        if rough.kinds[k, 1] > 0.0 and t < np.inf and np.int64(lanes[n, _NODES]) == NODES:
+            place = lanes[n, _X] * STEP, lanes[n, _Y] * STEP, lanes[n, _Z] * factor
+            way = lanes[n, DX] * STEP, lanes[n, DY] * STEP, lanes[n, _DZ] * factor
             if joints(rough, k, place[0] + t * way[0], place[1] + t * way[1]) < 0.0:
-                lanes[FOUND, n], lanes[SLOPE_X, n], lanes[SLOPE_Y, n] = _in_joint(
-                    rough, k, place, way, t, lanes[END, n]
+                lanes[n, FOUND], lanes[n, SLOPE_X], lanes[n, SLOPE_Y] = _in_joint(
+                    rough, k, place, way, t, lanes[n, END]
                 )

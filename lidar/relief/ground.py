@@ -30,6 +30,7 @@ from lidar.relief.crossing import (
     SLOPE_X,
     SLOPE_Y,
     begin,
+    descend,
     follow,
     height,
     joints,
@@ -124,19 +125,19 @@ def _length(direction: Any) -> Any:
 def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: int) -> None:
     """Write the hit of a lane on a face; beyond the end of the ray it is a miss."""
     distance, face, instance, cosine, normal = columns
-    t = min(lanes[FOUND, n], lanes[END, n])
+    t = min(lanes[n, FOUND], lanes[n, END])
     if t > rays.far[i if len(rays.far) > 1 else 0]:
         distance[i], face[i], instance[i], cosine[i] = np.inf, -1, -1, 0.0
         if len(normal) > 0:
             normal[i, 0], normal[i, 1], normal[i, 2] = 0.0, 0.0, 0.0
         return
-    sx, sy = lanes[SLOPE_X, n], lanes[SLOPE_Y, n]
+    sx, sy = lanes[n, SLOPE_X], lanes[n, SLOPE_Y]
     nx, ny = -tables.plane[f, 0] - sx, -tables.plane[f, 1] - sy
     size = np.sqrt(nx * nx + ny * ny + 1.0)
-    falls = (sx * lanes[DX, n] + sy * lanes[DY, n]) * lanes[SIDE, n] - lanes[GAIN, n]
+    falls = (sx * lanes[n, DX] + sy * lanes[n, DY]) * lanes[n, SIDE] - lanes[n, GAIN]
     distance[i], face[i], instance[i] = t, f, -1
     # A ray that grazes the edge of a dip may seem to come from behind.
-    cosine[i] = max(falls / (size * lanes[LENGTH, n]), 1e-3)
+    cosine[i] = max(falls / (size * lanes[n, LENGTH]), 1e-3)
     if len(normal) > 0:
         z = 1.0 / size
         normal[i, 0], normal[i, 1], normal[i, 2] = nx * z, ny * z, z
@@ -162,7 +163,8 @@ def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any,
     # The height counts from the hit on the face, so that no ray slips between it and the plane.
     end = t - rough.kinds[k, DEPTH] / way[2]
     begin(rough, k, level, (place[0], place[1], -t * way[2]), way, (t, end), lanes, n)
-    lanes[LENGTH, n] = length
+    descend(rough, lanes, n)
+    lanes[n, LENGTH] = length
     return 1
 
 
@@ -170,7 +172,7 @@ def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any,
 def _refine(tables: Any, rough: Any, rays: Any, low: int, high: int, columns: Any) -> None:
     """Refine the hits ``low`` to ``high`` in the order of work."""
     order, face = rays.order, columns[1]
-    lanes, active, ray = np.empty((COLUMNS, LANES)), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    lanes, active, ray = np.empty((LANES, COLUMNS)), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     j = low
     while j < high:
         count = 0
@@ -210,14 +212,14 @@ def _enter_below(tables: Any, rough: Any, rays: Any, f: int, i: int, lanes: Any,
     # The ray itself, which goes on from there, crosses the plane after the lifted one.
     end = near + (-below / way[2] if way[2] > 0.0 else (-depth - below - lift) / min(way[2], -1e-12))
     begin(rough, k, 0, (x, y, z + lift), way, (near, max(end, near)), lanes, n)
-    lanes[LENGTH, n] = length
+    lanes[n, LENGTH] = length
     return 1, 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _leave(tables: Any, rough: Any, rays: Any, on: Any, columns: Any, at: Any) -> None:
     """Fill ``at``: 0 for a ray that starts above its plane, inf for one that stays below it."""
-    lanes, active, ray = np.empty((COLUMNS, LANES)), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    lanes, active, ray = np.empty((LANES, COLUMNS)), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     i = 0
     while i < len(on):
         count = 0
@@ -229,9 +231,9 @@ def _leave(tables: Any, rough: Any, rays: Any, on: Any, columns: Any, at: Any) -
         follow(rough, lanes, active, count)
         for n in range(count):
             j = ray[n]
-            if lanes[FOUND, n] == np.inf and lanes[GAIN, n] > 0.0:
-                at[j] = lanes[END, n] + beyond_plane(lanes[GAIN, n], lanes[LENGTH, n])
+            if lanes[n, FOUND] == np.inf and lanes[n, GAIN] > 0.0:
+                at[j] = lanes[n, END] + beyond_plane(lanes[n, GAIN], lanes[n, LENGTH])
                 continue
             at[j] = np.inf
-            if not min(lanes[FOUND, n], lanes[END, n]) > rays.far[j if len(rays.far) > 1 else 0]:
+            if not min(lanes[n, FOUND], lanes[n, END]) > rays.far[j if len(rays.far) > 1 else 0]:
                 _put(tables, rays, j, on[j], columns, lanes, n)

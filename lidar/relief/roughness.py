@@ -40,6 +40,9 @@ LEVELS = 7
 BLOCK = 2
 """Cells along a side of the blocks whose steepness is known."""
 
+REACH = 8
+"""Cells along a side of the blocks whose highest places ahead are known, as many cells away."""
+
 _RINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 """Blocks ahead up to which steepness is bounded together; each at most twice the one before."""
 
@@ -121,6 +124,8 @@ class Roughness(NamedTuple):
     steep  : (4, f t / 4) uint8, bounds of the rise from any place in a block of `BLOCK` cells to any
              place ahead of it, per cell: along +x +y, +x -y, -x +y and -x -y; cells are counted along
              the axis along which they are more
+    top    : (4, f t / 64) float32, heights of the highest places ahead of the places in a block of `REACH`
+             cells, up to as many cells away, in the same four directions
     first  : (f, `LEVELS`) start of each field's levels in ``field``
     unit   : (f, `LEVELS`) unit of ``steep``
     number : (k,) field of each kind
@@ -130,6 +135,7 @@ class Roughness(NamedTuple):
 
     field: NDArray[np.float32]
     steep: NDArray[np.uint8]
+    top: NDArray[np.float32]
     first: NDArray[np.int64]
     unit: Float
     number: NDArray[np.int64]
@@ -157,7 +163,8 @@ def roughness() -> Roughness:
     mean = [_mean_of_joints(kind.stones) for kind in KINDS.values()]
     kinds = np.column_stack([kinds, 1.0 / kinds[:, 0], mean, slope])
     levels = [_levels(field) for field in finest]
-    steep = [[_steepness(level) for level in field] for field in levels]
+    steep = [[_towards(_steepness_ahead, level) for level in field] for field in levels]
+    top = [_towards(_highest_ahead, level).reshape(4, -1) for field in levels for level in field]
     unit = np.array([[level.max() / 254.0 for level in field] for field in steep])
     scaled = [
         np.ceil(level / one).astype(np.uint8).reshape(4, -1)
@@ -166,7 +173,15 @@ def roughness() -> Roughness:
     ]
     flat = [level.ravel() for field in levels for level in field]
     first = np.cumsum([0] + [len(level) for level in flat])[:-1].reshape(unit.shape)
-    return Roughness(np.concatenate(flat), np.hstack(scaled), first, unit, np.array(number), kinds)
+    return Roughness(
+        np.concatenate(flat),
+        np.hstack(scaled),
+        np.hstack(top).astype(np.float32),
+        first,
+        unit,
+        np.array(number),
+        kinds,
+    )
 
 
 def kinds_of(mesh: Mesh) -> NDArray[np.int8]:
@@ -221,14 +236,19 @@ def _steepest(field: NDArray[np.float32]) -> float:
     return float(np.hypot(*changes)) / STEP
 
 
-def _steepness(field: NDArray[np.float32]) -> Float:
-    """`Roughness.steep` (4, n / 2, n / 2) of a field, in heights per cell."""
+def _towards(ahead: Callable[[Float], Float], field: NDArray[np.float32]) -> Float:
+    """What lies ahead of blocks (4, ...) of a field in the four directions, by a function for +x +y."""
     found = []
     for sx, sy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         # Mirrored such that cells, not nodes, keep their blocks.
-        ahead = np.roll(field[::sx, ::sy], (sx < 0, sy < 0), (0, 1))
-        found.append(_steepness_ahead(ahead.astype(np.float64))[::sx, ::sy])
+        mirrored = np.roll(field[::sx, ::sy], (sx < 0, sy < 0), (0, 1))
+        found.append(ahead(mirrored.astype(np.float64))[::sx, ::sy])
     return np.stack(found)
+
+
+def _highest_ahead(h: Float) -> Float:
+    """Height (n / 8, n / 8) of the highest place in a block and in those next to it at +x and +y."""
+    return _grown(_blocks(_of_corners(h, np.maximum), np.max, REACH), 1)
 
 
 def _steepness_ahead(h: Float) -> Float:
@@ -240,9 +260,9 @@ def _steepness_ahead(h: Float) -> Float:
     right, up, both = (np.roll(h, shift, (0, 1)) for shift in ((-1, 0), (0, -1), (-1, -1)))
     along_x = np.maximum(np.maximum(right - h, both - up), 0.0)
     along_y = np.maximum(np.maximum(up - h, both - right), 0.0)
-    rise = _blocks(along_x + along_y, np.max)
-    top = _blocks(np.maximum(np.maximum(h, right), np.maximum(up, both)), np.max)
-    low = _blocks(np.minimum(np.minimum(h, right), np.minimum(up, both)), np.min)
+    rise = _blocks(along_x + along_y, np.max, BLOCK)
+    top = _blocks(_of_corners(h, np.maximum), np.max, BLOCK)
+    low = _blocks(_of_corners(h, np.minimum), np.min, BLOCK)
     bound, before = rise.copy(), 0
     for ring in _RINGS:
         rise, top = (_grown(values, ring - before) for values in (rise, top))
@@ -253,10 +273,16 @@ def _steepness_ahead(h: Float) -> Float:
     return found
 
 
-def _blocks(values: Float, reduce: Callable[..., Float]) -> Float:
-    """The greatest or least (n / 2, n / 2) of blocks of cells."""
-    n = len(values) // BLOCK
-    found: Float = reduce(values.reshape(n, BLOCK, n, BLOCK), axis=(1, 3))
+def _of_corners(h: Float, choose: Callable[[Float, Float], Float]) -> Float:
+    """The greatest or least of the corners of each cell."""
+    along_x = choose(h, np.roll(h, -1, 0))
+    return choose(along_x, np.roll(along_x, -1, 1))
+
+
+def _blocks(values: Float, reduce: Callable[..., Float], side: int) -> Float:
+    """The greatest or least of blocks of cells."""
+    n = len(values) // side
+    found: Float = reduce(values.reshape(n, side, n, side), axis=(1, 3))
     return found
 
 

@@ -11,7 +11,7 @@ from lidar.errors import InputError
 from lidar.raycast import Caster
 from lidar.relief import GroundRefiner, ground_tables
 from lidar.relief.crossing import heights
-from lidar.relief.roughness import BLOCK, KINDS, LEVELS, N0, NODES, STEP, roughness
+from lidar.relief.roughness import BLOCK, KINDS, LEVELS, N0, NODES, REACH, STEP, roughness
 
 SIDE = 200.0
 KIND_OF = {"asphalt": ("asphalt", Class.ROAD), "paving": ("paving", Class.SIDEWALK)}
@@ -106,6 +106,24 @@ def test_no_place_ahead_rises_faster_than_the_steepness_of_a_block(kind, towards
     steep = rough.unit[f, level] * rough.steep[towards, first + i * (nodes // BLOCK) + j]
     bound = rough.kinds[k, 0] * steep * ahead.max(axis=1) / side
     assert (rise <= bound + 1e-9).all()
+
+
+@pytest.mark.parametrize("kind", ["asphalt", "ballast"])
+@pytest.mark.parametrize("towards", range(4))
+@pytest.mark.parametrize("level", range(LEVELS))
+def test_no_place_near_ahead_is_higher_than_the_top_of_a_block(kind, towards, level):
+    rough, k = roughness(), list(KINDS).index(kind)
+    rng = np.random.default_rng(4)
+    nodes, side, f = NODES >> level, STEP * 2**level, rough.number[k]
+    start = rng.uniform(0, nodes * side, (100_000, 2))
+    sign = np.array([-1 if towards & 2 else 1, -1 if towards & 1 else 1])
+    ahead = start + sign * side * REACH * rng.uniform(0, 1, start.shape)
+    i, j = (np.floor(start / side).astype(int) // REACH).T
+    first = rough.first[f, level] // REACH**2
+    top = rough.top[towards, first + i * (nodes // REACH) + j] * rough.kinds[k, 0]
+    higher = heights(kind, ahead, level=level) - (rough.kinds[k, 8] if level else 0.0) - top
+    assert (higher <= 1e-9).all()
+    assert higher.max() > -0.1 * heights(kind, ahead, level=level).std()
 
 
 @pytest.mark.parametrize("kind", KIND_OF)
