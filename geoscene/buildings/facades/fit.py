@@ -20,6 +20,9 @@ OUT = 0.08
 _EDGE = 0.05
 """Metres, at least, from a panel to the edge of its wall, besides the depth of the opening."""
 
+_SKIN = 0.01
+"""Metres behind a wall within which other faces belong to its plane."""
+
 
 def obstacles(at: Elevations, wall: Ints, *, shape: NDArray[np.object_]) -> tuple[Ints, Float]:
     """Which shapes (p,) in plan before walls (n,) buildings intersect.
@@ -50,6 +53,10 @@ class Fit:
     def __init__(self, at: Elevations) -> None:
         self._at = at
         self._column, self._span = self._obstacles()
+        self._faces = at.mesh.vertices[at.mesh.faces]
+        low, high = self._faces.min(axis=1), self._faces.max(axis=1)
+        self._levels = np.stack([low[:, 2], high[:, 2]], axis=1)
+        self._tree = shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T))
 
     def _obstacles(self) -> tuple[Ints, Float]:
         """Columns (p,), sorted, and the lower and upper height (p, 2) of what stands before them."""
@@ -111,15 +118,55 @@ class Fit:
         return free
 
     def _backed(self, wall: Ints, box: Float, *, depth: Float) -> Bools:
-        """Whether no other wall is as near to the inner corners of openings as their own."""
-        table = self._at.setting.buildings
-        outline = shapely.boundary(table.footprint[self._at.grids.row[wall]])
-        deep = depth + _EDGE
-        near = [
-            shapely.distance(shapely.points(self._at.walls.points(wall, box[:, k], out=-deep)), outline)
-            for k in (0, 2)
-        ]
-        return np.min(near, axis=0) >= deep - 0.01 if len(wall) else np.empty(0, np.bool_)
+        """Whether no other face of the building is behind openings, nor an opening as deep of such a face.
+
+        Roofs, passages and parts cut walls off from behind.
+        """
+        at = self._at
+        low = np.column_stack([box[:, 0] - depth, np.full(len(box), _SKIN), box[:, 1] - _EDGE + _SKIN])
+        high = np.column_stack([box[:, 2] + depth, 2 * depth + _EDGE, box[:, 3] + depth])
+        corners = np.stack(
+            [
+                at.walls.points(wall, u, out=-v)
+                for u in (low[:, 0], high[:, 0])
+                for v in (low[:, 1], high[:, 1])
+            ]
+        )
+        which, face = self._tree.query(shapely.box(*corners.min(axis=0).T, *corners.max(axis=0).T))
+        zero = at.grids.zero[wall[which]]
+        near = (at.mesh.feature[face] == at.walls.feature[wall[which]]) & (at.of_face[face] != wall[which])
+        near &= self._levels[face, 0] <= zero + high[which, 2]
+        near &= self._levels[face, 1] >= zero + low[which, 2]
+        which, face, zero = which[near], face[near], zero[near]
+        own = wall[which]
+        flat = self._faces[face][:, :, :2] - at.walls.foot[own, None, :2]
+        placed = np.stack(
+            [
+                np.einsum("ijk,ik->ij", flat, at.walls.tangent[own]),
+                -np.einsum("ijk,ik->ij", flat, at.walls.outwards[own]),
+                self._faces[face][:, :, 2] - zero[:, None],
+            ],
+            axis=2,
+        )
+        backed = np.ones(len(wall), np.bool_)
+        backed[which[_enter(placed, low=low[which], high=high[which])]] = False
+        return backed
+
+
+def _enter(triangles: Float, *, low: Float, high: Float) -> Bools:
+    """Whether triangles (n, 3, 3) have points in boxes (n, 3): no axis of either separates them.
+
+    Separating axes of a triangle and a box: Akenine-Moeller, "Fast 3D triangle-box overlap testing" (2001).
+    """
+    corners = triangles - ((low + high) / 2)[:, None]
+    sides = np.roll(corners, -1, axis=1) - corners
+    across = np.cross(sides[:, :, None], np.eye(3)).reshape(-1, 9, 3)
+    normal = np.cross(sides[:, :1], sides[:, 1:2])
+    axes = np.concatenate([np.broadcast_to(np.eye(3), (len(corners), 3, 3)), across, normal], axis=1)
+    reach = np.einsum("nij,nj->ni", np.abs(axes), (high - low) / 2)
+    along = np.einsum("nij,nkj->nik", axes, corners)
+    apart = (along.min(axis=2) > reach) | (along.max(axis=2) < -reach)
+    return np.asarray(~apart.any(axis=1), np.bool_)
 
 
 class Sheet:

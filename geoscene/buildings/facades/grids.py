@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from geoscene.buildings.facades.setting import Setting
 from geoscene.buildings.facades.styles import Styles
 from geoscene.buildings.facades.walls import Walls
 from geoscene.columns import Columns
+from geoscene.mesh import Mesh
 from geoscene.typing import Bools, Float, Height, Ints
 
 _BESIDE = 0.3
@@ -76,6 +78,8 @@ class Elevations:
     styles  : likewise
     cells   : of all walls
     setting : map-wide data
+    mesh    : the tile's buildings, scene metres
+    of_face : (m,) row of ``walls`` of each face of the mesh, -1 for others
     base    : (count,) z of each building's base, NaN where it is not known
     height  : z of the ground at x, y; None if it is 0 everywhere
     """
@@ -85,21 +89,36 @@ class Elevations:
     styles: Styles
     cells: Cells
     setting: Setting
+    mesh: Mesh
+    of_face: NDArray[np.int32]
     base: Float
     height: Height | None
 
     @classmethod
     def of(
-        cls, walls: Walls, setting: Setting, *, usable: Bools, base: Float, height: Height | None
-    ) -> tuple[Elevations, Ints]:
-        """The elevations of usable walls, and the rows of those of them with room for cells."""
+        cls,
+        walls: Walls,
+        setting: Setting,
+        *,
+        mesh: Mesh,
+        of_face: NDArray[np.int32],
+        usable: Bools,
+        base: Float,
+        height: Height | None,
+    ) -> Elevations:
+        """The elevations of those usable walls that have room for cells.
+
+        of_face : (m,) wall of each face of the mesh, -1 for none
+        """
         row = _table_rows(walls, setting, base=base)
         grids = _grids(walls, setting, row=row, base=base)
         some = np.flatnonzero(usable & (grids.count.min(axis=1) > 0))
         walls, grids = walls.take(some), grids.take(some)
         styles = setting.styles.take(grids.row)
         cells = _cells(walls, grids, styles=styles, height=height)
-        return cls(walls, grids, styles, cells, setting, base, height), some
+        number = np.full(len(usable) + 1, -1, np.int32)  # the last row is for faces of no wall
+        number[some] = np.arange(len(some))
+        return cls(walls, grids, styles, cells, setting, mesh, number[of_face], base, height)
 
 
 def _table_rows(walls: Walls, setting: Setting, *, base: Float) -> Ints:

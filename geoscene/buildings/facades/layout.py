@@ -60,11 +60,9 @@ def wall_relief(
     """
     walls, of_face = find_walls(mesh)
     simple = np.array([o is not None for o in outlines(mesh, of_face, count=len(walls))], np.bool_)
-    at, some = Elevations.of(walls, setting, usable=simple, base=base, height=height)
-    planes = {"touching": int((~simple).sum()), "small": int(simple.sum()) - len(some)}
-    number = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
-    number[some] = np.arange(len(some))
+    at = Elevations.of(walls, setting, mesh=mesh, of_face=of_face, usable=simple, base=base, height=height)
     walls, grids, cells = at.walls, at.grids, at.cells
+    planes = {"touching": int((~simple).sum()), "small": int(simple.sum()) - len(walls)}
     chosen, parts = _choose(at, guess=guess)
     parts, touching = without_touching(parts, mesh)
     openings, index = make_openings(chosen, at.styles, wall=cells.wall)
@@ -72,7 +70,7 @@ def wall_relief(
     kept[cells.wall[index >= 0]] = True
     again = np.full(len(walls) + 1, -1, np.int32)  # the last row is for faces of no wall
     again[:-1][kept] = np.arange(np.count_nonzero(kept))
-    of_face = again[number[of_face]]
+    of_face = again[at.of_face]
     index = index[kept[cells.wall]]
     walls, grids = walls.take(kept), grids.take(kept)
     sizes = grids.count.prod(axis=1)
@@ -87,7 +85,7 @@ def wall_relief(
         grids.count.astype(np.int32),
         (np.cumsum(sizes) - sizes).astype(np.int32),
     )
-    planes["blank"] = len(some) - len(walls)
+    planes["blank"] = int((~kept).sum())
     left = {f"walls_{why}": n for why, n in planes.items()}
     counts = {"walls": len(walls), **left, **parts.counts, "parts_left_out": touching}
     relief = WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32))

@@ -42,10 +42,14 @@ def entrance(xy, kind="yes"):
     return node(xy, entrance=kind)
 
 
-def facades_of(*areas, points=(), ways=(), street=None, height=None, guess=False):
-    """Table, mesh and layout of a map, whose only street is a line of scene coordinates."""
+def facades_of(*areas, points=(), ways=(), street=None, height=None, guess=False, passages=()):
+    """Table, mesh and layout of a map, whose only street is a line of scene coordinates.
+
+    passages : polygons in plan with their heights, through the first building
+    """
     osm = OsmData((8.6, 49.3, 8.8, 49.5), list(ways), list(areas), list(points), [])
     table, _ = read_buildings(osm, FRAME)
+    table.passages[0] = tuple(passages)
     mesh, _ = build_solids(table, base=np.zeros(table.count))
     lines = np.array([] if street is None else [shapely.LineString(street)], object)
     setting = read_setting(osm, FRAME, buildings=table, streets=lines)
@@ -336,6 +340,41 @@ def test_modelled_facades_are_closed_solids_less_their_recesses(shape, height, u
     assert [after.fault(k) for k in range(len(after))] == [""] * len(before)
     lost, (volume, tolerance) = before.volume.sum() - after.volume.sum(), recesses(layout.relief)
     assert lost == pytest.approx(volume, abs=tolerance + 1e-6)
+
+
+@given(
+    st.floats(-0.2, 0.2),
+    st.floats(0.02, 0.5),
+    st.floats(5, 25),
+    st.floats(3, 7.5),
+    st.sampled_from(["house", "office", "retail", "parking"]),
+    st.integers(1, 10**9),
+)
+@settings(max_examples=25, deadline=None)
+def test_openings_keep_clear_of_passages_behind_their_walls(turn, gap, x, top, use, number):
+    passage = affinity.rotate(shapely.box(x - 3, 0, x + 3, 20), turn, use_radians=True)
+    passage = affinity.translate(passage, 0, gap - passage.bounds[1])
+    shape = shapely.box(0, 0, 30, 12)
+    _, mesh, layout = facades_of(
+        house(number, shape, building=use, height="9"),
+        street=[(-60, -8), (60, -8)],
+        passages=[(passage, top)],
+    )
+    before, after = (validate_mesh(m) for m in (mesh, relief_mesh(mesh, layout.relief)))
+    assert [after.fault(k) for k in range(len(after))] == [before.fault(k) for k in range(len(before))]
+
+
+def test_windows_stay_out_of_a_passage_that_runs_close_behind_their_wall():
+    shape, street = shapely.box(0, 0, 30, 12), [(-60, -8), (60, -8)]
+    houses = [house(7, shape, building="house", height="15")]
+    passage = shapely.box(-1, 0.1, 31, 5)
+    whole, cut = (facades_of(*houses, street=street, passages=p)[2].relief for p in ((), [(passage, 7.0)]))
+    lowest = [
+        min(box[1] for w, _, _, box, _ in panels_of(relief) if relief.facades.tangent[w, 0] > 0.99)
+        for relief in (whole, cut)
+    ]
+    assert lowest[0] < 3.0
+    assert lowest[1] > 7.0
 
 
 def test_windows_and_doors_of_a_modelled_facade_are_marked():
