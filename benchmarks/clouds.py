@@ -8,7 +8,7 @@
 ``scene`` builds the truth; with ``--draw`` it gives buildings of the map without heights some, and roofs, at
 random by OSM id. ``spoil`` takes the classes from a cloud, moves it by 0.6 m east and 0.4 m south, and adds
 noise of 5 cm in plan and 4 cm in height. ``measure`` withholds heights, roofs and trees of the map, measures
-them in the cloud, builds the tables of the scene and of the truth, and compares them.
+them in the cloud, plans the scene and the truth, and compares their tables.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ import resource
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyogrio
+import pandas as pd
 import shapely
 from scipy.spatial import cKDTree
 
-from geoscene.buildings import read_buildings
 from geoscene.clouds.survey import with_clouds
+from geoscene.ground.terrain import base_heights
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build
-from geoscene.scene import Scene
+from geoscene.plan import Plan, make_plan
+from geoscene.progress import silent
 from geoscene.sources import OsmData, read_osm
 from geoscene.sources.data import Tags
 
@@ -87,29 +89,46 @@ def spoil(given: argparse.Namespace) -> None:
             target.write_points(points)
 
 
-def table(scene: Scene) -> Any:
-    """Bodies of a scene by OSM id: base, height, top and roof; of several with one id the largest."""
-    rows = pyogrio.read_dataframe(scene.files.features, layer="buildings")
+def table(plan: Plan) -> Any:
+    """Buildings of a scene by OSM id: base, height, top, roof, area, and slope of the ground.
+
+    slope  : rise of the ground along the outline over the diagonal of its box
+    buried : the ground reaches the eaves somewhere along the outline, as drawn heights on steep slopes allow
+    """
+    buildings, height = plan.buildings, plan.height
+    rows = pd.DataFrame({
+        name: getattr(buildings, name)[: buildings.count]
+        for name in ("height", "roof_height", "roof_shape", "height_source", "drawn", "footprint")
+    }, index=buildings.osm_id[: buildings.count])  # fmt: skip
+    rows["base"], rows["area"] = plan.base, shapely.area(rows["footprint"])
     rows["top"] = rows["base"] + rows["height"]
-    rows["area"] = rows.geometry.area
-    return rows.sort_values("area").drop_duplicates("osm_id", keep="last").set_index("osm_id")
+    highest = rows["base"]
+    if height is not None:
+        highest = -base_heights(rows["footprint"].to_numpy(), lambda x, y: -height(x, y))
+    low, high = np.split(shapely.bounds(rows["footprint"].to_numpy()), 2, axis=1)
+    rows["slope"] = (highest - rows["base"]) / np.hypot(*(high - low).T)
+    rows["buried"] = highest > rows["top"] - rows["roof_height"]
+    return rows[~rows.index.duplicated()]
 
 
 def compare_buildings(truth: Any, made: Any) -> None:
-    """Print errors of tops, heights and bases, and the confusion of roof shapes."""
+    """Print errors of tops, heights and bases by slope of the ground, and the confusion of roof shapes."""
     both = truth.join(made.add_suffix("_made"), how="inner")
     both = both[both["height_source_made"] == "cloud"]
-    print(f"buildings {len(truth)}, measured {len(both)}")
-    for name in ("top", "height", "base"):
-        error = (both[f"{name}_made"] - both[name]).to_numpy()
-        size = np.abs(error)
-        within = int((size < NEAR).sum())
-        print(
-            f"{name}: median {np.median(error):.3f} m; absolute 50 % {np.median(size):.3f},"
-            f" 95 % {np.percentile(size, 95):.3f}, largest {size.max():.2f} m;"
-            f" within 10 cm {100 * within / len(both):.1f} % of measured,"
-            f" {100 * within / len(truth):.1f} % of all"
-        )
+    buried = both["buried"].sum()
+    print(f"buildings {len(truth)}, measured {len(both)}, of these {buried} in the ground up to their eaves")
+    both = both[~both["buried"]]
+    for low, high in ((0.0, np.inf), (0.0, 0.05), (0.05, 0.15), (0.15, np.inf)):
+        some = both[(both["slope"] >= low) & (both["slope"] < high)]
+        print(f"ground slopes by {low} to {high}: {len(some)} buildings")
+        for name in ("top", "height", "base") if len(some) else ():
+            error = (some[f"{name}_made"] - some[name]).to_numpy(float)
+            size = np.abs(error)
+            print(
+                f"  {name}: median {np.median(error):+.3f} m; absolute 50 % {np.median(size):.3f},"
+                f" 95 % {np.percentile(size, 95):.3f}, largest {size.max():.2f} m;"
+                f" within 10 cm {100 * (size < NEAR).mean():.1f} %"
+            )
     pairs = Counter(zip(both["roof_shape"], both["roof_shape_made"], strict=True))
     right = sum(n for (one, two), n in pairs.items() if one == two)
     print(f"roof shapes: {100 * right / len(both):.1f} % right;", sorted(pairs.items()))
@@ -117,21 +136,22 @@ def compare_buildings(truth: Any, made: Any) -> None:
     for row in worst.itertuples():
         print(
             f"  {row.Index}: {row.area:.0f} m2, top {row.top_made - row.top:+.2f}, base"
-            f" {row.base_made - row.base:+.2f} m, {row.roof_shape} {row.roof_shape_made}"
+            f" {row.base_made - row.base:+.2f} m, slope {row.slope:.2f},"
+            f" {row.roof_shape} {row.roof_shape_made}"
         )
 
 
-def compare_trees(truth: Scene, made: Scene) -> None:
-    """Print trees that were found, missed and false, and their errors."""
-    counts = [s.manifest["counts"]["trees"] for s in (truth, made)]
-    print(f"trees: {counts[0]} in the scene, {counts[1]} found")
-    if not all(counts):
-        return
-    mapped, found = (pyogrio.read_dataframe(s.files.features, layer="trees") for s in (truth, made))
-    xy, other = (
-        shapely.get_coordinates(t.to_crs(truth.frame.crs.to_wkt()).geometry) for t in (mapped, found)
+def compare_trees(truth: Plan, made: Plan, *, bounds: Sequence[float]) -> None:
+    """Print trees that were found, missed and false within the map's bounds in degrees, and their errors."""
+    corners = truth.frame.from_geographic(np.array(bounds[::2]), np.array(bounds[1::2]))
+    low, high = np.column_stack(corners)
+    mapped, found = (
+        trees.take(((trees.xy > low) & (trees.xy < high)).all(axis=1)) for trees in (truth.trees, made.trees)
     )
-    distance, near = cKDTree(other).query(xy)
+    print(f"trees: {len(mapped)} in the scene, {len(found)} found")
+    if not len(mapped) or not len(found):
+        return
+    distance, near = cKDTree(found.xy).query(mapped.xy)
     close = distance < 2.5
     false = len(found) - len(set(near[close].tolist()))
     print(f"  {close.sum()} of those in the scene, {false} false")
@@ -139,9 +159,12 @@ def compare_trees(truth: Scene, made: Scene) -> None:
         return
     print(f"  place: 50 % {np.median(distance[close]):.2f}, 95 % {np.percentile(distance[close], 95):.2f} m")
     for name in ("height", "crown"):
-        error = (found[name].to_numpy()[near] - mapped[name].to_numpy())[close]
-        off = np.percentile(np.abs(error), 95)
-        print(f"  {name}: median {np.median(error):+.2f}, absolute 95 % {off:.2f} m")
+        error = (getattr(found, name)[near] - getattr(mapped, name))[close]
+        size = np.abs(error)
+        print(
+            f"  {name}: median {np.median(error):+.2f}, absolute 50 % {np.median(size):.2f},"
+            f" 95 % {np.percentile(size, 95):.2f} m"
+        )
 
 
 def measure(given: argparse.Namespace) -> None:
@@ -158,13 +181,11 @@ def measure(given: argparse.Namespace) -> None:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"{spent[0]:.0f} s, {spent[1]:.0f} s of CPU, at most {peak:.0f} MiB, one process")
         print(json.dumps(measured.cloud))
-        made = build(measured, Path(folder) / "made", options=options)
-        truth = build(osm, Path(folder) / "truth", options=BuildOptions(dem=tuple(given.dem), use="gis"))
-        whole, _ = read_buildings(osm, truth.frame)
-        whole = whole.where(whole.drawn & ~whole.is_part)
-        rows = table(truth)
-        compare_buildings(rows[rows.index.isin(whole.osm_id)], table(made))
-        compare_trees(truth, made)
+        made, _ = make_plan(measured, options, progress=silent)
+        truth, _ = make_plan(osm, BuildOptions(dem=tuple(given.dem), use="gis"), progress=silent)
+    rows = table(truth)
+    compare_buildings(rows[rows["drawn"]], table(made))
+    compare_trees(truth, made, bounds=osm.bounds)
 
 
 def main() -> None:

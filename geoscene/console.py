@@ -145,6 +145,7 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
     )
     gc.set_threshold(*_COLLECTED)
     os.environ.setdefault(_THREADS, "1")
+    logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     logging.getLogger("geoscene.cluster").setLevel(logging.INFO)  # it names the page with the progress
     try:
         with _ended_by_interruptions(app):

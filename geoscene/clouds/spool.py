@@ -50,7 +50,7 @@ class Spool:
 
     squares : those with points, sorted
     read    : points of all files
-    outside : points beyond the bounds
+    within  : points of each file within the bounds
     noise   : points of class noise, withheld ones, and those at impossible heights
     ground  : points of the classes of ground within the bounds
     vegetation : points of the classes of vegetation within the bounds
@@ -59,10 +59,15 @@ class Spool:
     folder: Path
     squares: tuple[Square, ...]
     read: int
-    outside: int
+    within: tuple[int, ...]
     noise: int
     ground: int
     vegetation: int
+
+    @property
+    def outside(self) -> int:
+        """Points beyond the bounds."""
+        return self.read - sum(self.within)
 
     def around(self, bounds: Sequence[float], *, shift: tuple[float, float] = (0.0, 0.0)) -> Points:
         """The points within bounds (xmin, ymin, xmax, ymax) after a shift in metres is added to all."""
@@ -95,10 +100,11 @@ def spool_clouds(
     """
     held: dict[Square, list[NDArray[np.void]]] = defaultdict(list)
     squares: set[Square] = set()
-    waiting = read = inside = noise = ground = plants = 0
+    waiting = read = noise = ground = plants = 0
+    inside = [0] * len(clouds)
     total = sum(cloud.count for cloud in clouds)
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for cloud in clouds:
+    for k, cloud in enumerate(clouds):
         for chunk in cloud.chunks():
             try:
                 x, y = frame.from_crs(chunk.xyz[:, 0], chunk.xyz[:, 1], crs=cloud.crs)
@@ -119,7 +125,8 @@ def spool_clouds(
             for square, some in _by_square(rows):
                 held[square].append(some)
                 squares.add(square)
-            read, inside, noise = read + len(xyz), inside + int(within.sum()), noise + int(bad.sum())
+            inside[k] += int(within.sum())
+            read, noise = read + len(xyz), noise + int(bad.sum())
             ground += int(np.isin(rows["klass"], GROUND).sum())
             plants += int(np.isin(rows["klass"], VEGETATION).sum())
             waiting += len(rows)
@@ -130,7 +137,7 @@ def spool_clouds(
     _flush(held, folder)
     if not squares:
         raise InputError(_beside(clouds, frame, bounds=bounds, covered=(*low.tolist(), *high.tolist())))
-    return Spool(folder, tuple(sorted(squares)), read, read - inside, noise, ground, plants)
+    return Spool(folder, tuple(sorted(squares)), read, tuple(inside), noise, ground, plants)
 
 
 def without_outliers(points: Points) -> Points:

@@ -24,6 +24,7 @@ from geoscene.frames import Frame, extent_of, wrapped
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.progress import Progress, silent
+from geoscene.report import Problem
 from geoscene.sources.data import Credit, OsmData
 
 _FAR = 100.0  # metres from a ground return beyond which the ground is not known
@@ -95,8 +96,9 @@ def with_clouds(
     known = sum(int(np.isfinite(g.heights).sum()) for g in grounds)
     about = {
         "files": [
-            {"name": f.path.name, "digest": key, "points": f.count, "crs": f.crs.name, "datum": f.datum}
-            for f, key in zip(files, keys, strict=True)
+            {"name": f.path.name, "digest": key, "points": f.count, "within": many, "crs": f.crs.name,
+             "datum": f.datum}
+            for f, key, many in zip(files, keys, spool.within, strict=True)
         ],
         "points": {
             "read": spool.read,
@@ -115,9 +117,14 @@ def with_clouds(
     }  # fmt: skip
     osm, found = with_measurements(osm, measured, prefer_tags=cloud.prefer == "tags")
     about |= found
+    beside = [
+        Problem("", "cloud", "dropped", "beside-the-map", f"{f.path.name}: no point within the map")
+        for f, many in zip(files, spool.within, strict=True)
+        if not many
+    ]
     tolerance = _TOLERANCE if options.dem_tolerance is None else options.dem_tolerance
     return (
-        replace(osm, added=(*osm.added, credit), cloud=about),
+        replace(osm, added=(*osm.added, credit), cloud=about, problems=osm.problems + beside),
         replace(options, dem=dem, dem_tolerance=tolerance),
     )
 

@@ -7,8 +7,10 @@ import shlex
 import subprocess
 import sys
 
+import numpy as np
 import pytest
-from helpers.programs import ENVIRONMENT, SMALL_FILES, command, run_program
+from helpers.clouds import write_las
+from helpers.programs import ENVIRONMENT, SMALL_FILES, command, run_process, run_program
 
 from geoscene import cli
 from geoscene.sources import demo_path
@@ -200,3 +202,26 @@ def test_steep_roads_are_told_only_of_terrain_that_has_some():
     assert cli._steep_roads(none, terrain=True) == ""
     assert cli._steep_roads(some, terrain=False) == ""
     assert "0.1 km steeper" in cli._steep_roads(some, terrain=True)
+
+
+def test_a_cloud_that_is_cut_off_is_refused_in_one_line(tmp_path):
+    rng = np.random.default_rng(0)
+    xyz = np.column_stack([rng.uniform((24.940, 60.165), (24.948, 60.170), (60_000, 2)), rng.random(60_000)])
+    path = write_las(tmp_path / "cut.laz", xyz, crs="EPSG:4326")
+    path.write_bytes(path.read_bytes()[:100_000])
+    words = [
+        "build",
+        "--osm",
+        demo_path(),
+        "--bbox",
+        BOX,
+        "--cloud",
+        path,
+        "-o",
+        tmp_path / "scene",
+        "--quiet",
+    ]
+    done = run_process("geoscene", *words, "--cache", tmp_path)
+    assert done.returncode == 2
+    assert re.fullmatch(r"geoscene: .*cut\.laz: damaged .*\n", done.stderr)
+    assert not (tmp_path / "scene").exists()

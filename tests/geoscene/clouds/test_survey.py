@@ -137,6 +137,26 @@ def test_the_result_does_not_depend_on_the_number_of_workers(cloud_file, tmp_pat
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
+def test_several_files_are_one_cloud_and_a_file_beside_the_map_is_named(cloud_file, tmp_path):
+    xyz = village_cloud()
+    west = xyz[:, 0] < 3.0
+    files = [
+        las_of(xyz[west], tmp_path / "west.laz"),
+        las_of(xyz[~west], tmp_path / "east.las"),
+        las_of(xyz[west] + (5000.0, 0.0, 0.0), tmp_path / "far.laz"),
+    ]
+    one, _ = measured(village_map(), cloud_file, tmp_path)
+    cloud = CloudOptions(cloud=tuple(map(str, files)))
+    several, _ = with_clouds(village_map(), BuildOptions(), cloud=cloud, cache_dir=tmp_path)
+    assert tags_of(several) == tags_of(one)
+    within = [row["within"] for row in several.cloud["files"]]
+    assert within[2] == 0
+    assert within[0] + within[1] == one.cloud["files"][0]["within"] == one.cloud["points"]["read"]
+    assert several.cloud["points"]["beside_the_map"] == west.sum()
+    told = [p.detail for p in several.problems if p.reason == "beside-the-map"]
+    assert told == ["far.laz: no point within the map"]
+
+
 def test_tags_win_when_they_are_preferred_and_disagreements_are_reported_anyway(cloud_file, tmp_path):
     tagged = {"way/1": {"height": "14", "roof:shape": "hipped", "roof:height": "3"}}
     for prefer, height, shape in (("tags", "14", "hipped"), ("cloud", "8.9", "gabled")):
