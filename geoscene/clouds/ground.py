@@ -126,7 +126,7 @@ def ground_returns(points: Points, grid: Grid, *, built: Bools) -> Bools:
 
 
 def bridged_by_blocks(heights: Float) -> Float:
-    """Heights without gaps as by `bridged`, for rasters of any size; cells (rows, columns) of float32."""
+    """Heights (rows, columns) with gaps between measured cells bridged, for rasters of any size."""
     out = heights.copy()
     for row in range(0, heights.shape[0], _BLOCK):
         for column in range(0, heights.shape[1], _BLOCK):
@@ -135,20 +135,25 @@ def bridged_by_blocks(heights: Float) -> Float:
             block = out[row : row + _BLOCK, column : column + _BLOCK]
             if np.isnan(block).any():
                 first = row - low[0], column - low[1]
-                filled = bridged(around.astype(float))
+                filled = bridged(around.astype(float), beyond=False)
                 block[:] = filled[first[0] : first[0] + block.shape[0], first[1] : first[1] + block.shape[1]]
     return out
 
 
-def bridged(heights: Float) -> Float:
-    """Heights without gaps: NaN cells by linear interpolation between the cells around, else the nearest."""
+def bridged(heights: Float, *, beyond: bool = True) -> Float:
+    """Heights with NaN cells by linear interpolation between the cells around.
+
+    beyond : cells that are not between others take the nearest height, else they stay NaN
+    """
     from scipy.ndimage import binary_dilation, distance_transform_edt  # noqa: PLC0415 - slow to import
 
     gap = np.isnan(heights)
     if not gap.any() or gap.all():
         return heights
-    row, column = distance_transform_edt(gap, return_distances=False, return_indices=True)
-    filled = np.asarray(heights[row, column], float)
+    filled = heights.copy()
+    if beyond:
+        row, column = distance_transform_edt(gap, return_distances=False, return_indices=True)
+        filled = np.asarray(heights[row, column], float)
     rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
     if len(rim) > 3 and np.ptp(rim, axis=0).all():
         linear = _interpolated(heights, rim)

@@ -166,7 +166,8 @@ def _ground_file(
     """The GeoTIFF of the ground within the extent, in the scene's CRS, and the cells that were bridged.
 
     Cells without ground returns, as under buildings, are bridged by triangles between those around. Cells
-    over 100 m from any ground return, buildings aside, take the height of the elevation files, or stay empty.
+    over 100 m from any ground return, buildings aside, take the height of the elevation files. Others, as at
+    the rim, stay empty.
     """
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import
 
