@@ -22,7 +22,7 @@ from geoscene.files import exclusive, json_bytes, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from lidar.cluster import record_on_cluster
-from lidar.dataset.boxes import merge_box_files
+from lidar.dataset.boxes import merge_box_files, merge_signal_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
@@ -189,6 +189,8 @@ def _driven(
         journal.close()
         if plan.actors is not None:
             merge_box_files(out)
+        if plan.signals is not None:
+            merge_signal_files(out)
         manifest |= {"points": points, "frames_done": manifest["frames"]}
         checking_from = time.perf_counter()
         if check is not None:

@@ -38,6 +38,7 @@ from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
 from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.fcd_replay import replay
 from lidar.traffic.populate import populate
+from lidar.traffic.signal_heads import SignalStates, signal_states
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
 from lidar.world.settings import check_relief, origin_limit
@@ -104,6 +105,7 @@ class DrivePlan:
     start       : UTC time of the drive's start
     trajectory  : of the ego vehicle
     actors      : other road users; None without traffic
+    signals     : what signal heads show in images; None without cameras or heads, and where it is not known
     scanning_ns : (k, 2) times from and until which scanners work; None for always
     geo         : from the scene frame to the export CRS
     jobs        : frames of all sensors in order of time
@@ -116,6 +118,7 @@ class DrivePlan:
     start: datetime
     trajectory: Trajectory
     actors: Actors | None
+    signals: SignalStates | None
     scanning_ns: Ints | None
     geo: Georeference
     jobs: Jobs
@@ -168,6 +171,7 @@ class DrivePlan:
             geo=self.geo,
             contents=self.options.contents(),
             actors=self.actors,
+            signals=self.signals,
             max_range=self.max_range,
             scanning_ns=self.scanning_ns,
         )
@@ -237,6 +241,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         start=start,
         trajectory=trajectory,
         actors=actors,
+        signals=_signals(scene, options, vehicle=vehicle, motion=motion, sensors=sensors),
         scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=jobs,
@@ -384,6 +389,34 @@ def flight_options(options: DriveOptions) -> FlightOptions:
         seed=options.seed,
         duration=seconds,
         from_rest=options.from_rest,
+    )
+
+
+def _signals(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    motion: Trajectory | RoadMotion | Flight,
+    sensors: Sequence[Scanner | Camera],
+) -> SignalStates | None:
+    """What signal heads show: the plan that traffic obeys; None where no image shows them.
+
+    Traffic of SUMO has signals of its own, whose states are not known.
+    """
+    traffic = options.traffic
+    coloured = any(isinstance(sensor, Camera) and "rgb" in sensor.spec.images for sensor in sensors)
+    if not coloured or isinstance(traffic, SumoOptions | TrafficFile):
+        return None
+    road = isinstance(motion, RoadMotion)
+    fixed = None if road or (traffic is None and vehicle.kind == "air") else motion
+    return signal_states(
+        scene,
+        motion.plan.graph if isinstance(motion, RoadMotion) else None,
+        seed=options.seed,
+        side=options.side_in(scene),
+        vehicle=vehicle,
+        fixed=fixed.trajectory if isinstance(fixed, RoadMotion | Flight) else fixed,
     )
 
 

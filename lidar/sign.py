@@ -251,7 +251,7 @@ def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
         format_of(path)
     except (FormatError, InputError):
         return None
-    if path.parent.name == "boxes":
+    if path.parent.name in ("boxes", "signals"):
         return None
     return blocks_in(path, rate_hz=rate_hz)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.typing import Float
 from lidar.camera.sign_faces import OF_SHAPE, PLATE, SIDE, face_levels, plate_levels, sampled
+from lidar.camera.signal_lamps import LENSES
 from lidar.camera.texture import compiled, hashed
 from lidar.raycast import Caster
 from lidar.world.actor_shapes import CLOTHES, FLEET
@@ -29,9 +30,6 @@ _PLATED = (Class.CAR, Class.VAN, Class.TRUCK, Class.BUS)
 
 SIGN_HEIGHT = 2.5
 """Height in metres of the centre of a sign's plate in its shape, see `geoscene.objects.shapes`."""
-
-_SIGNAL_HEIGHT = 2.875
-"""The same of the lenses of signals."""
 
 _JACKETS = np.array(
     [[36, 44, 78], [120, 122, 126], [150, 40, 42], [206, 198, 182], [28, 28, 32], [62, 66, 70], [58, 74, 52],
@@ -116,7 +114,7 @@ def _draw_signs(
             out[own] = sampled(face_levels(faces.get(number, "plain")), where, width=width[own], side=SIDE)
     signals = np.flatnonzero((klass == _SIGNAL) & (material == _GLASS))
     if len(signals):
-        where = place[signals, 1:] - [0.0, _SIGNAL_HEIGHT]
+        where = place[signals, 1:] - [0.0, LENSES]
         out[signals] = sampled(face_levels("signal"), where, width=width[signals], side=SIDE)
 
 

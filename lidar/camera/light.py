@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from geoscene.typing import Float
+from lidar.camera.signal_lamps import Lamps
 
 # A clear atmosphere in three bands (red, green, blue: 615, 535, 465 nm). Extraterrestrial light relative to
 # green from the sun at 5772 K. Rayleigh optical depths by Hansen and Travis (Space Science Reviews 16, 1974):
@@ -44,6 +45,7 @@ class Light:
     horizon   : (3,) mean radiance at the horizon, the colour of haze
     mean      : (3,) mean radiance from all directions, the sun's beam included: the colour of dense fog
     exposure  : factor that brings a level surface of 18 % in sun and sky to a quarter of full scale
+    lamps     : signal heads that are lit; None for none
     """
 
     direction: Float
@@ -53,6 +55,7 @@ class Light:
     horizon: Float
     mean: Float
     exposure: float
+    lamps: Lamps | None = None
 
 
 def _air_mass(sine: Float) -> Float:

@@ -15,6 +15,7 @@ from lidar.camera import appearance, shade
 from lidar.camera.edges import edge_pixels
 from lidar.camera.facades import Facades, bare, facades_of, flatten, walls_of
 from lidar.camera.light import Light, daylight
+from lidar.camera.signal_lamps import Lamps, emitted
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.physics.fresnel import mirrored
@@ -142,6 +143,7 @@ def render(
     world: World,
     sun: ArrayLike,
     times: Float | None = None,
+    lamps: Lamps | None = None,
     random: np.random.Generator | None = None,
     options: RenderOptions | None = None,
 ) -> Frame:
@@ -152,6 +154,7 @@ def render(
               their mean, depth and labels are the middle sample's
     sun     : (3,) direction towards the sun, scene axes, from `lidar.camera.sun.sun_direction`
     times   : ray times 0 to 1 of the poses, for actors that move
+    lamps   : signal heads that are lit; none by default
     random  : source of the noise of a finite ``options.full_well``
 
     Raises InputError for a number of poses that does not fit the camera.
@@ -165,7 +168,7 @@ def render(
         raise InputError(f"camera {camera.name}: `full_well` adds noise and needs `random`")
     h, w = camera.height, camera.width
     coloured = "rgb" in camera.images
-    light = light_of(sun, cloud=options.cloud, snow=world.settings.snow)
+    light = replace(light_of(sun, cloud=options.cloud, snow=world.settings.snow), lamps=lamps)
     exposure = light.exposure * 2.0**options.exposure
     walls = facades_of(world)
     k = options.supersample
@@ -477,8 +480,29 @@ def _shaded(
         gloss,
         facet,
     )
+    if light.lamps is not None:
+        rows, state = light.lamps.lit(surfaces.feature, surfaces.klass, material=surfaces.material)
+        standing = hits.instance[rows] >= 0
+        rows, state = rows[standing], state[standing]
+        away = hits.range[rows] * np.linalg.norm(view.direction[rows], axis=1)
+        seen = emitted(
+            state,
+            place=_on_shapes(world, view, rows=rows),
+            width=size[0] + size[1] * away,
+            exposure=light.exposure,
+        )
+        out[rows] += seen * np.exp(-3.912 / options.visibility * away)[:, None].astype(np.float32)
     out[~view.seen] = 0.0
     return out, gloss, facet
+
+
+def _on_shapes(world: World, view: View, *, rows: NDArray[np.intp]) -> Float:
+    """Places (k, 3) of some hits on instances, in the instances' own frames."""
+    point = view.origin[view.row[rows]] + view.hits.range[rows, None] * view.direction[rows]
+    time = np.zeros(len(rows)) if view.time is None else view.time[rows]
+    transform = _transforms(world, view.hits.instance[rows], time=time)
+    offset = (point - transform[:, :, 3])[..., None]
+    return np.linalg.solve(transform[:, :, :3], offset)[..., 0].astype(np.float64)
 
 
 def _drawn(world: World, view: View, *, size: tuple[float, float]) -> NDArray[np.uint8]:
@@ -487,10 +511,6 @@ def _drawn(world: World, view: View, *, size: tuple[float, float]) -> NDArray[np
     on = np.flatnonzero(hits.instance >= 0)
     if not len(on):
         return found.color
-    point = view.origin[view.row[on]] + hits.range[on, None] * view.direction[on]
-    time = np.zeros(len(on)) if view.time is None else view.time[on]
-    transform = _transforms(world, hits.instance[on], time=time)
-    offset = (point - transform[:, :, 3])[..., None]
     distance = hits.range[on] * np.linalg.norm(view.direction[on], axis=1)
     color = found.color.copy()
     color[on] = appearance.colors(
@@ -501,7 +521,7 @@ def _drawn(world: World, view: View, *, size: tuple[float, float]) -> NDArray[np
         material=found.material[on],
         feature=found.feature[on],
         color=color[on],
-        place=np.linalg.solve(transform[:, :, :3], offset)[..., 0].astype(np.float64),
+        place=_on_shapes(world, view, rows=on),
         width=size[0] + size[1] * distance,
     )
     return color

@@ -236,7 +236,7 @@ def _bus(canvas: _Canvas, _: str) -> None:
 
 
 def _signal(canvas: _Canvas, _: str) -> None:
-    """Three lenses, none of them lit."""
+    """Three lenses, none of them lit; lit ones shine, see `lidar.camera.signal_lamps`."""
     for k, fill in enumerate(((92, 20, 20), (104, 76, 18), (16, 76, 48))):
         canvas.disc(0.1, fill, y=0.283 * (1 - k))
 

@@ -221,7 +221,9 @@ def merge_box_files(out: Path) -> None:
     paths = Paths(out)
     calibration = read_sensors(paths)
     headers = {
-        name: _merge(paths, name) for name, s in calibration.items() if s["kind"] in ("lidar", "camera")
+        name: _merge(paths.frame_boxes(name, 0).parent, paths.sensor_boxes(name))
+        for name, s in calibration.items()
+        if s["kind"] in ("lidar", "camera")
     }
     scanners = [name for name in headers if calibration[name]["kind"] == "lidar"]
     if not scanners or not headers[scanners[0]]:
@@ -281,18 +283,24 @@ def _step(time_ns: int, *, first_ns: int, step_ns: float) -> int:
     return int((time_ns - first_ns + 1) // step_ns)
 
 
-def _merge(paths: Paths, name: str) -> str:
-    """Write all box files of a sensor as one, its ``boxes.csv``; return the header, empty without files.
+def merge_signal_files(out: Path) -> None:
+    """Write the signal heads of all frames of each camera as one file, its ``signals.csv``."""
+    paths = Paths(out)
+    for name in read_sensors(paths, "camera"):
+        _merge(paths.frame_signals(name, 0).parent, paths.sensor_signals(name))
+
+
+def _merge(folder: Path, target: Path) -> str:
+    """Write the tables of all frames in a folder as one; return the header, empty without files.
 
     Raises DatasetError for a damaged file.
     """
     header = ""
-    frames = frame_numbers(paths.frame_boxes(name, 0).parent, ".csv").tolist()
+    frames = frame_numbers(folder, ".csv").tolist()
     if not frames:
         return header
-    target = paths.sensor_boxes(name)
     with atomic_path(target) as whole, whole.open("w", encoding="utf-8", newline="") as file:
-        for part in (paths.frame_boxes(name, frame) for frame in frames):
+        for part in (folder / f"{frame:06d}.csv" for frame in frames):
             with reading_file(part):
                 own, *rows = part.read_text("utf-8").splitlines()
                 names = own.split(",")

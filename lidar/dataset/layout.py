@@ -10,6 +10,7 @@ DATASET/
   frames.csv              finished frames, with their points and digests of their files
   checksums.sha256        checksums of all other files
   <sensor>/<format>/<frame>.<ext>
+  <camera>/signals.csv    states of traffic lights in images
   <sensor>/truth/<frame>.npz  changes by stages; only with stages
   integrity/              digests and the signature of `lidar sign`
 """
@@ -116,6 +117,14 @@ class Paths:
     def frame_boxes(self, name: str, frame: int) -> Path:
         """Boxes of one frame of a sensor."""
         return self.root / name / "boxes" / f"{frame:06d}.csv"
+
+    def sensor_signals(self, name: str) -> Path:
+        """Signal heads in all frames of a camera."""
+        return self.root / name / "signals.csv"
+
+    def frame_signals(self, name: str, frame: int) -> Path:
+        """Signal heads in one frame of a camera."""
+        return self.root / name / "signals" / f"{frame:06d}.csv"
 
     def image(self, name: str, frame: int, *, kind: str) -> Path:
         """An image of a camera: ``rgb``, ``depth``, ``semantic``, ``instance`` or ``flow``."""
@@ -422,7 +431,7 @@ def _own_names(paths: Paths) -> tuple[set[str], set[Path]]:
 
 
 _FRAME_FILE = re.compile(r"\d{6,}[._][\w.]+")
-_SENSOR_FILES = {"timestamps.csv", "boxes.csv", "calib.txt", "times.txt", "poses.txt"}
+_SENSOR_FILES = {"timestamps.csv", "boxes.csv", "signals.csv", "calib.txt", "times.txt", "poses.txt"}
 
 
 def _of_a_sensor(place: Sequence[str]) -> bool:

@@ -94,13 +94,16 @@ class MeasuredCloud(Measured):
 class MeasuredImages(Measured):
     """A frame of a camera.
 
-    camera : intrinsics and exposure
-    image  : colour, depth, classes and instances
-    flow   : (h, w, 2) optical flow to the next frame in pixels, NaN where unknown; None if not recorded
+    camera  : intrinsics and exposure
+    image   : colour, depth, classes and instances
+    signals : columns of the signal heads in it: as in ``signals.csv``, see
+              `lidar.dataset.signals.signal_columns`; empty where their states are not known
+    flow    : (h, w, 2) optical flow to the next frame in pixels, NaN where unknown; None if not recorded
     """
 
     camera: CameraSpec
     image: Image
+    signals: Columns
     flow: NDArray[np.float32] | None = None
 
 

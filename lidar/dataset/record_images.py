@@ -1,4 +1,4 @@
-"""A frame of a camera: its images as PNG, with the 2D bounding boxes of road users."""
+"""A frame of a camera: its images as PNG, with the 2D bounding boxes of road users and signal heads."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ from geoscene.csv_tables import write_columns
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render
+from lidar.camera.signal_lamps import Lamps
 from lidar.dataset.boxes import ImageBoxes, image_boxes
 from lidar.dataset.measured import MeasuredImages
 from lidar.dataset.recording import Recording
+from lidar.dataset.signals import lamps_at, signal_columns
 from lidar.dataset.situations import situation_of, sun_during
 from lidar.geometry.poses import Poses
 from lidar.random_streams import generator
@@ -33,6 +35,8 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
     if "boxes" in paths:
         with watch.stage("boxes"):
             write_columns(paths["boxes"], measured.boxes)
+    if "signals" in paths:
+        write_columns(paths["signals"], measured.signals)
     if "truth" in paths:
         write_truth(paths["truth"], measured.truth)
     for kind in camera.spec.images:
@@ -50,12 +54,17 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
     start = camera.frame_start_ns(frame)
     span_ns = start, max(int(times[-1]), start + 1)
     world = worlds.during(*span_ns)
-    image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world)
+    middle = int(times[first + rows // 2])
+    pose = _poses(recording, camera, times=times[[first + rows // 2]])
+    shown = recording.signals
+    lamps = None if shown is None else lamps_at(shown, middle)
+    image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world, lamps=lamps)
     boxes, truth = dict[str, NDArray[Any]](), dict[str, NDArray[Any]]()
+    signals = dict[str, NDArray[Any]]()
+    if shown is not None:
+        signals = signal_columns(shown, image, pose=pose, frame=frame, time_ns=middle)
     if recording.actors is not None:
         with recording.watch.stage("boxes"):
-            middle = int(times[first + rows // 2])
-            pose = _poses(recording, camera, times=times[[first + rows // 2]])
             found = image_boxes(
                 recording.actors,
                 camera.spec,
@@ -84,6 +93,7 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
         truth,
         camera=camera.spec,
         image=image,
+        signals=signals,
         flow=flow,
     )
 
@@ -96,6 +106,7 @@ def _rendered(
     times: NDArray[np.int64],
     span_ns: tuple[int, int],
     world: World,
+    lamps: Lamps | None,
 ) -> Image:
     """A frame of a camera; ``times`` are its exposure times, ``span_ns`` the times of the world's motion."""
     contents, (start, end) = recording.contents, span_ns
@@ -106,6 +117,7 @@ def _rendered(
             world=world,
             sun=sun_during(recording, start),
             times=None if recording.actors is None else (times - start) / (end - start),
+            lamps=lamps,
             random=generator(contents.seed, camera.name, frame, "image"),
             options=contents.camera.options(camera.spec),
         )

@@ -30,6 +30,7 @@ from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Camera, Scanner
 from lidar.signal.effects import Effects
 from lidar.signal.registry import NO_STAGES, Stages
+from lidar.traffic.signal_heads import SignalStates
 from lidar.world.actors import Actors
 from lidar.world.settings import PLAIN as PLAIN_WORLD
 from lidar.world.settings import WorldSettings
@@ -130,6 +131,7 @@ class Recording:
     watch       : measures the time of each stage
     effects     : counts what stages do
     actors      : other road users; None without traffic, and then without boxes
+    signals     : what signal heads show; None without any, or where it is not known
     max_range   : metres from the ego vehicle within which road users get 3D boxes
     scanning_ns : (k, 2) times from and until which scanners work; None for always
     """
@@ -143,6 +145,7 @@ class Recording:
     watch: Stopwatch = field(default_factory=Stopwatch)
     effects: Effects = field(default_factory=Effects)
     actors: Actors | None = None
+    signals: SignalStates | None = None
     max_range: float = 0.0
     scanning_ns: NDArray[np.int64] | None = None
 
@@ -163,12 +166,17 @@ class Recording:
             self.actors.release()
 
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
-        """Files of one frame, by image, format, ``deskewed <format>``, ``labels <format>``, boxes, truth."""
+        """Files of one frame.
+
+        By image, format, ``deskewed <format>``, ``labels <format>``, boxes, signals, truth.
+        """
         name, paths = sensor.name, Paths(self.out)
         files = {} if self.actors is None else {"boxes": paths.frame_boxes(name, frame)}
         if self.has_stages(sensor):
             files["truth"] = paths.truth(name, frame)
         if isinstance(sensor, Camera):
+            if self.signals is not None:
+                files["signals"] = paths.frame_signals(name, frame)
             return files | {kind: paths.image(name, frame, kind=kind) for kind in sensor.spec.images}
         for form in self.contents.cloud_formats:
             files[form.name] = form.path(paths.sensor(name), frame)

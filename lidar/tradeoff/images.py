@@ -13,6 +13,7 @@ from geoscene.typing import Float, Ints
 from lidar.camera.png import depth_to_counts, encode_png, feature_to_image
 from lidar.camera.render import Frame, exposure_times, render
 from lidar.camera.settings import CameraSettings
+from lidar.camera.signal_lamps import Lamps
 from lidar.geometry.poses import Trajectory
 from lidar.rig.devices import Camera
 from lidar.rig.specs import CameraSpec
@@ -30,13 +31,15 @@ _STEPS = (0.7548776662466927, 0.5698402909980532)
 class Shot:
     """A frame of a camera.
 
-    sun : (3,) direction towards the sun, scene axes
+    sun   : (3,) direction towards the sun, scene axes
+    lamps : signal heads that are lit
     """
 
     camera: Camera
     frame: int
     trajectory: Trajectory
     sun: Float
+    lamps: Lamps | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +143,7 @@ def _rendered(shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSet
         shot.trajectory.at(times).mounted(mount.translation, mount.rotation),
         world=world,
         sun=shot.sun,
+        lamps=shot.lamps,
         times=np.clip((times - start) / shot.camera.period_ns, 0.0, 1.0),
         options=settings.options(spec),
     )

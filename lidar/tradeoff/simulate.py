@@ -14,6 +14,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.camera.sun import sun_direction
 from lidar.dataset.formats.table import cloud_table, records
+from lidar.dataset.signals import lamps_at
 from lidar.physics.settings import ScannerSettings
 from lidar.plan import DrivePlan
 from lidar.rig.devices import Camera, Scanner
@@ -89,7 +90,9 @@ class Bench:
 
     def shot(self, camera: Camera, frame: int) -> Shot:
         """A frame of a camera, to be rendered."""
-        return Shot(camera, frame, self.plan.trajectory, self.sun(camera.frame_start_ns(frame)))
+        start, signals = camera.frame_start_ns(frame), self.plan.signals
+        lamps = None if signals is None else lamps_at(signals, start)
+        return Shot(camera, frame, self.plan.trajectory, self.sun(start), lamps)
 
     def sun(self, time_ns: int) -> Float:
         """Direction (3,) towards the sun at a time of the drive."""

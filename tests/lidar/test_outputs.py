@@ -36,8 +36,10 @@ from lidar.maps.aggregate import aggregate
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
 from lidar.rig.scanner import load_sensor
+from lidar.rig.vehicle import load_vehicle
 from lidar.sensors.scan import scan
 from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.signal_heads import STATES, signal_states
 
 ROADS = [k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST]
 
@@ -186,6 +188,31 @@ def test_every_camera_frame_has_boxes_around_its_instances(dataset):
                 shown += 1
     assert shown > 20
     assert hidden > 20
+
+
+def test_every_camera_frame_tells_what_its_signal_heads_show(dataset, scene):
+    side = "left" if scene.left_hand else "right"
+    states = signal_states(scene, None, seed=OPTIONS.seed, side=side, vehicle=load_vehicle("car"))
+    rows = 0
+    for camera, frames in (("front", 40), ("side", 20)):
+        files = sorted((dataset.path / camera / "signals").glob("*.csv"))
+        assert len(files) == frames
+        whole = (dataset.path / camera / "signals.csv").read_text().splitlines()
+        assert whole[1:] == [line for path in files for line in path.read_text().splitlines()[1:]]
+        for path in files:
+            image = instance_image(dataset.path / camera / "instance" / f"{path.stem}.png")
+            for row in table(path):
+                v, u = np.nonzero(image == int(row["instance"]))
+                box = [float(row[k]) for k in ("left", "top", "right", "bottom")]
+                assert u.min() - 0.5 <= box[0] < box[2] <= u.max() + 0.5
+                assert v.min() - 0.5 <= box[1] < box[3] <= v.max() + 0.5
+                assert 0 < int(row["pixels"]) <= len(u)
+                head = np.flatnonzero(states.heads.feature == int(row["instance"]))
+                shown = states.at(int(row["time_ns"]) * 1e-9)[head]
+                assert [row["state"]] == [STATES[k] for k in shown.tolist()]
+                assert 0 <= float(row["angle_deg"]) <= 180
+                rows += 1
+    assert rows > 2
 
 
 def _layers(dataset):
