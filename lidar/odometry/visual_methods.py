@@ -15,7 +15,7 @@ from lidar.odometry.deskewing import still
 from lidar.odometry.estimate import Estimate, propagated
 from lidar.odometry.feature_depths import laser_distances, stereo_distances
 from lidar.odometry.features import Features, camera_of, read_features
-from lidar.odometry.keyframes import close_loops
+from lidar.odometry.keyframes import Keyframe, close_loops
 from lidar.odometry.scans import Scans, scans_of
 from lidar.odometry.settings import OdometrySettings
 from lidar.odometry.view_geometry import scaled_motion
@@ -26,8 +26,9 @@ VISUAL_METHODS = ("orb", "orb+depth", "stereo")
 """Methods by their names."""
 
 _ROAD = (-0.15, -0.7)  # vertical component of the bearings of the road ahead
-_ROAD_POINTS = 6  # of a keyframe, from which its scale counts
-_ROAD_WIDTH = 0.05  # share of a height by which points are of the same plane
+_ROAD_POINTS = 4  # of a keyframe and those beside it, from which its scale counts
+_BESIDE = 2  # keyframes before and after, whose points count, too: a road shows few that hold
+_ROAD_WIDTH = 0.1  # share of a height by which points are of the same plane; a road is cambered and rough
 _NEAR_ROAD = 3.0  # metres to the side of the camera, within which the road is
 
 
@@ -154,14 +155,13 @@ def _by_stereo(images: Stream, other: Stream, *, settings: OdometrySettings) -> 
 def _scale_by_road(found: Tracked, images: Stream, *, height: float) -> tuple[Float, str]:
     """Factors (k,) of the distances of keyframes by the height over the road, and what they are from.
 
-    The points of the road ahead lie on a plane, whose distance below the camera is known.
+    The points of the road ahead lie on a plane, whose distance below the camera is known. Keyframes that
+    follow one another share points of the map, hence a scale, which drifts slowly.
     """
-    turn, factor = images.mount.matrix[:3, :3], np.full(len(found.keyframes), np.nan)
-    for k, frame in enumerate(found.keyframes):
-        ahead = frame.features.bearing @ turn.T
-        known = np.isfinite(frame.distance) & (ahead[:, 2] < _ROAD[0]) & (ahead[:, 2] > _ROAD[1])
-        known &= np.abs(ahead[:, 1]) < -ahead[:, 2] * _NEAR_ROAD / max(height, 0.1)
-        below = np.log(-(frame.distance * ahead[:, 2])[known])
+    factor = np.full(len(found.keyframes), np.nan)
+    heights = [_below(frame, turn=images.mount.matrix[:3, :3], height=height) for frame in found.keyframes]
+    for k in range(len(heights)):
+        below = np.concatenate(heights[max(k - _BESIDE, 0) : k + _BESIDE + 1])
         if len(below) >= _ROAD_POINTS:
             votes = (np.abs(below[:, None] - below) < _ROAD_WIDTH).sum(axis=1)
             same = np.abs(below - below[np.argmax(votes)]) < _ROAD_WIDTH
@@ -172,6 +172,19 @@ def _scale_by_road(found: Tracked, images: Stream, *, height: float) -> tuple[Fl
         return np.ones(len(factor)), "unknown: the first two keyframes are a unit apart"
     smooth = np.array([np.median(factor[seen[max(0, i - 2) : i + 3]]) for i in range(len(seen))])
     return np.interp(np.arange(len(factor)), seen, smooth), "height of the camera over the road"
+
+
+def _below(frame: Keyframe, *, turn: Float, height: float) -> Float:
+    """Logarithms (n,) of how far the points of a keyframe that may be of the road lie below the camera.
+
+    turn   : (3, 3) camera in the vehicle's axes
+    height : of the camera over the road, metres
+    """
+    ahead = frame.features.bearing @ turn.T
+    known = np.isfinite(frame.distance) & (ahead[:, 2] < _ROAD[0]) & (ahead[:, 2] > _ROAD[1])
+    known &= np.abs(ahead[:, 1]) < -ahead[:, 2] * _NEAR_ROAD / max(height, 0.1)
+    below: Float = np.log(-(frame.distance * ahead[:, 2])[known])
+    return below
 
 
 def _rescaled(poses: Float, factor: Float) -> Float:
