@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 from lidar.detection.boxes import Rectangle, fitted
 from lidar.detection.detector import Points
 from lidar.detection.ground import height_above_ground
@@ -44,6 +45,15 @@ PLAIN = DetectorSettings()
 _SPACING = 0.035
 """Largest angle between beams in radians, as of a scanner with 16 over 30 degrees."""
 
+_BEYOND = np.arange(0.7, 14.0, 0.7)
+"""Metres beyond the end of a side at which walls are looked for."""
+_GAP = 3
+"""Number of these places without a wall at which it ends."""
+_BESIDE = 0.4
+"""Metres from there within which points count: walls of openings stand back."""
+WALL = 1.9
+"""Metres above the ground from which on points are of a wall and not of a car."""
+
 
 @dataclass(frozen=True, slots=True)
 class Shape:
@@ -57,6 +67,7 @@ class Shape:
     above  : share of the points at its place that follow above the clustered heights; what hangs higher
              over it, such as a tree's crown, does not count
     roof   : height of all points at its place, but for 2 % of them
+    line   : length of what is higher than a car in line with its longer side, over gaps as of doors
     distance : from the sensor
     across : cosine between its longer side and the line of sight, 0 for one that is seen from the side
     """
@@ -68,6 +79,7 @@ class Shape:
     bottom: float
     above: float
     roof: float
+    line: float
     distance: float
     across: float
 
@@ -153,9 +165,22 @@ def _shape(height: Float, middle: NDArray[np.floating], *, tall: _Tall, settings
         bottom=float(height.min()),
         above=np.count_nonzero(following > settings.band[1]) / max(len(following), 1),
         roof=float(np.quantile(around, 0.98)),
+        line=_line(seen, tall=tall),
         distance=distance,
         across=_aspect(seen),
     )
+
+
+def _line(seen: Rectangle, *, tall: _Tall) -> float:
+    """Metres of a longer side, together with what is as high as a wall and goes on in line with it."""
+    axis = np.array([np.cos(seen.yaw), np.sin(seen.yaw)])
+    side = np.array([-axis[1], axis[0]]) * seen.size[1] / 2
+    beyond = seen.size[0] / 2 + _BEYOND
+    ends = [seen.centre + line + end * np.outer(beyond, axis) for line in (side, -side) for end in (1, -1)]
+    high = tall.high(np.concatenate(ends)).reshape(2, 2, len(_BEYOND))
+    ended = ~np.any(sliding_window_view(high, _GAP, axis=2), axis=-1)
+    steps = np.where(ended.any(axis=2), ended.argmax(axis=2), high.shape[2])
+    return float(seen.size[0] + _BEYOND[0] * steps.sum(axis=1).max())
 
 
 class _Tall:
@@ -163,11 +188,17 @@ class _Tall:
 
     def __init__(self, xyz: Float, height: Float) -> None:
         self._tree, self.height = cKDTree(xyz[:, :2]), height
+        self._walls = cKDTree(xyz[height > WALL, :2])
 
     def near(self, xy: NDArray[np.floating], *, radius: float) -> Float:
         """Heights of points within a radius of places (k, 2)."""
         rows = self._tree.query_ball_point(xy, radius)
         return self.height[np.unique(np.concatenate([*rows, []]).astype(np.int64))]
+
+    def high(self, xy: NDArray[np.floating]) -> Bools:
+        """Whether there are points as high as a wall near places (k, 2)."""
+        found: Bools = self._walls.query(xy, distance_upper_bound=_BESIDE)[0] < np.inf
+        return found
 
 
 def _clusters(xy: NDArray[np.floating], *, settings: DetectorSettings) -> Ints:

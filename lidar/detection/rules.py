@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar.detection.boxes import Rectangle, completed
-from lidar.detection.clusters import PLAIN, DetectorSettings, Shape, clustered, ramp
+from lidar.detection.clusters import PLAIN, WALL, DetectorSettings, Shape, clustered, ramp
 from lidar.detection.detector import Detections, Found, Points, apart, table
 
 
@@ -74,20 +74,26 @@ def _as_car(shape: Shape) -> float:
     """0 to 1: of a car's or van's length, width and height, with points along two edges and nothing above."""
     length, width = shape.sides
     size = ramp(-length, -6.4, -5.4) * ramp(length, 0.9, 1.5) * ramp(-width, -2.6, -2.1)
-    return _many(shape) * size * ramp(shape.top, 0.8, 1.2) * ramp(-shape.above, -0.05, 0.0) * _edge(shape)
+    high = ramp(shape.top, 0.8, 1.2) * (_alone(shape) if shape.top > WALL else 1.0)
+    return _many(shape) * size * high * ramp(-shape.above, -0.05, 0.0) * _edge(shape)
 
 
 def _as_truck(shape: Shape) -> float:
-    """0 to 0.6: of a truck's or bus's size; so are some walls, if one side is seen."""
+    """0 to 0.6: of a truck's or bus's size, and in no line that is longer; so are some walls."""
     length, width = shape.sides
-    size = ramp(length, 1.8, 2.4) * ramp(-length, -14.0, -12.0) * ramp(-width, -3.4, -2.8)
+    size = ramp(length, 1.8, 2.4) * ramp(-width, -3.4, -2.8)
     high = ramp(shape.roof, 2.0, 2.5) * ramp(-shape.roof, -4.5, -3.6)
-    return 0.6 * _many(shape) * size * high * _edge(shape) * ramp(width, -1.0, 1.2)
+    return 0.6 * _many(shape) * size * high * _alone(shape) * _edge(shape) * ramp(width, -1.0, 1.2)
 
 
 def _many(shape: Shape) -> float:
     """0 to 1 by the number of cells and, as a single beam tells little, by the heights that they span."""
     return shape.standing * ramp(shape.cells, 2, 12) * (0.5 + 0.5 * ramp(shape.top - shape.bottom, 0.1, 0.5))
+
+
+def _alone(shape: Shape) -> float:
+    """0 to 1: no longer than a bus, and in no line of walls that is."""
+    return ramp(-max(shape.line, shape.sides[0]), -14.0, -12.0)
 
 
 def _edge(shape: Shape) -> float:

@@ -25,11 +25,11 @@ class _Box:
 
 
 def _cloud(
-    *boxes: _Box, gradient: float = 0.0, beams: int = 16, lowest: float = -15.0
+    *boxes: _Box, gradient: float = 0.0, beams: int = 16, lowest: float = -15.0, highest: float = 15.0
 ) -> NDArray[np.float64]:
     """Returns (n, 3) of a scanner 1.8 m over a plane that rises with x."""
     azimuth = np.deg2rad(np.arange(0, 360, 0.2))
-    elevation = np.deg2rad(np.linspace(lowest, 15.0, beams))
+    elevation = np.deg2rad(np.linspace(lowest, highest, beams))
     a, e = (part.ravel() for part in np.meshgrid(azimuth, elevation))
     ray = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     with np.errstate(divide="ignore"):
@@ -80,6 +80,30 @@ def test_on_a_gradient_the_ground_is_removed(gradient: float) -> None:
     assert found.kind.tolist() == ["vehicle"]
 
 
+@pytest.mark.parametrize("gradient", [-0.08, 0.0, 0.08])
+@pytest.mark.parametrize("x", [6.5, 7.5, 9.0])
+def test_a_car_that_hides_the_ground_ahead_is_not_taken_for_it(x: float, gradient: float) -> None:
+    xyz = _cloud(_Box(x + 2.2, 0, CAR, bottom=0.25), gradient=gradient)
+    height = xyz[:, 2] - gradient * xyz[:, 0] + _HEIGHT
+    np.testing.assert_allclose(height_above_ground(xyz)[height > 0.2], height[height > 0.2], atol=0.25)
+    assert _detected(xyz).kind.tolist() == ["vehicle"]
+
+
+def test_the_ground_beyond_a_crest_is_followed_where_it_is_flat() -> None:
+    xyz = _cloud(beams=64)
+    away = np.maximum(np.hypot(*xyz[:, :2].T) - 10, 0)
+    fallen = xyz - np.outer(0.06 * away, [0, 0, 1])
+    near = np.hypot(*xyz[:, :2].T) < 50
+    assert np.abs(height_above_ground(fallen)[near]).max() < 0.3
+
+
+def test_a_road_beside_a_lower_field_is_ground_as_the_field_is() -> None:
+    xyz = _cloud(beams=64)
+    lower = xyz - np.outer(0.12 * np.clip(xyz[:, 1] - 2, 0, 20), [0, 0, 1])
+    near = np.hypot(*xyz[:, :2].T) < 30
+    assert np.quantile(np.abs(height_above_ground(lower)[near]), 0.99) < 0.3
+
+
 def test_a_rear_seen_alone_is_completed_away_from_the_sensor() -> None:
     found = _detected(_cloud(_Box(15, 0, CAR)))
     assert np.hypot(*(found.centre[0, :2] - [15, 0])) < 0.5
@@ -91,6 +115,16 @@ def test_walls_poles_and_bare_ground_are_no_road_users() -> None:
     pole = _Box(9, -4, (0.2, 0.2, 6), bottom=0)
     assert len(_detected(_cloud(wall, house, pole))) == 0
     assert len(_detected(_cloud())) == 0
+
+
+def test_pieces_of_a_wall_between_its_openings_are_no_trucks() -> None:
+    pieces = [_Box(x, 9, (4.0, 0.3, 9), bottom=0) for x in range(-13, 15, 5)]
+    assert _detected(_cloud(*pieces, beams=64, lowest=-25, highest=2)).score.max(initial=0) < 0.2
+    truck = _Box(18, -6, (8.0, 2.5, 3.4), bottom=0.3)
+    found = _detected(_cloud(*pieces, truck, beams=64, lowest=-25, highest=2))
+    assert found.kind[0] == "vehicle"
+    assert found.score[0] > 0.3
+    assert np.hypot(*(found.centre[0, :2] - [18, -6])) < 1.5
 
 
 def test_kinds_are_told_apart() -> None:

@@ -10,14 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers import DEMO_BOX
 from helpers.programs import run_program
 
 from geoscene.classes import Class
-from geoscene.options import BuildOptions
-from geoscene.pipeline import build
 from geoscene.scene import Scene
-from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.redteam import redteam
 from lidar.redteam.evaluate import Figures, evaluated
@@ -29,13 +25,6 @@ from lidar.sweep.grid import read_grid
 
 PHANTOM = '[[attack]]\nname = "phantom"\nattack = "inject:shape=object"\ngoal = "forge"\npublished = "pla"\n'
 DAZZLE = '[[attack]]\nname = "dazzle"\nattack = "remove:method=saturation,width=40"\ngoal = "hide"\n'
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    """The middle of the demo map with level carriageways."""
-    osm = read_osm(demo_path(), bounds=DEMO_BOX)
-    return build(osm, tmp_path_factory.mktemp("level") / "scene", options=BuildOptions(relief="off"))
 
 
 @pytest.fixture
