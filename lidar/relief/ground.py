@@ -135,7 +135,7 @@ def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: in
     nx, ny = -tables.plane[f, 0] - sx, -tables.plane[f, 1] - sy
     size = np.sqrt(nx * nx + ny * ny + 1.0)
     falls = (sx * lanes[n, DX] + sy * lanes[n, DY]) * lanes[n, SIDE] - lanes[n, GAIN]
-    distance[i], face[i], instance[i] = t, f, -1
+    distance[i] = t
     # A ray that grazes the edge of a dip may seem to come from behind.
     cosine[i] = max(falls / (size * lanes[n, LENGTH]), 1e-3)
     if len(normal) > 0:
@@ -236,4 +236,5 @@ def _leave(tables: Any, rough: Any, rays: Any, on: Any, columns: Any, at: Any) -
                 continue
             at[j] = np.inf
             if not min(lanes[n, FOUND], lanes[n, END]) > rays.far[j if len(rays.far) > 1 else 0]:
+                columns[1][j] = on[j]
                 _put(tables, rays, j, on[j], columns, lanes, n)
