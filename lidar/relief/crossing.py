@@ -48,8 +48,8 @@ _CLOSE = 1e-8
 """Metres from the surface at which a crossing is found."""
 
 
-_FINEST = STEP * np.sqrt(2.0)
-"""Metres; a level's cells are nearest to half of the patch that is seen, in powers of two."""
+_SCATTER = 39916801.0, 27644437.0
+"""Multiplied by these numbers, places that are close to each other have fractions that differ at random."""
 
 
 def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
@@ -63,12 +63,17 @@ def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
 
 
 @inlined
-def level_of(patch: float) -> int:
-    """The level of detail of a patch that is seen as one, metres long."""
-    level, cells = 0, patch / _FINEST
+def level_of(patch: float, x: float, y: float) -> int:
+    """The level of detail of a patch that is seen as one, metres long, about a place.
+
+    Cells are as wide as half of the patch. Between two levels, rays take either, the nearer one more often,
+    by a random number of the place, so that no edge is seen where a level ends.
+    """
+    level, cells, chance = 0, patch * (0.5 / STEP), x * _SCATTER[0] + y * _SCATTER[1]
     while cells >= 2.0 and level < LEVELS - 1:
         level, cells = level + 1, 0.5 * cells
-    return level
+    further = cells > 1.0 + chance - np.floor(chance) and level < LEVELS - 1
+    return level + 1 if further else level
 
 
 @inlined

@@ -77,8 +77,8 @@ def joined_ground(tables: Mapping[int, GroundTables], *, count: int) -> GroundTa
 class GroundRefiner:
     """Refines hits on rough ground; see `lidar.raycast.refine`.
 
-    Rays with a footprint meet the mean of the surface over it: heights whose cells, in powers of two, are
-    nearest to half of its length along the ground.
+    Rays with a footprint meet the mean of the surface over it: heights whose cells are, in powers of two, as
+    wide as half of its length along the ground.
 
     tables : of the loaded tiles, with scene coordinates
     """
@@ -159,7 +159,8 @@ def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any,
         return 0
     t = distance[i]
     length, (start, growth) = _length(direction), rays.footprint
-    level = level_of((start + growth * t * length) / cosine[i])
+    patch = (start + growth * t * length) / cosine[i]
+    level = level_of(patch, place[0] + t * way[0], place[1] + t * way[1])
     # The height counts from the hit on the face, so that no ray slips between it and the plane.
     end = t - rough.kinds[k, DEPTH] / way[2]
     begin(rough, k, level, (place[0], place[1], -t * way[2]), way, (t, end), lanes, n)
