@@ -48,8 +48,14 @@ _CLOSE = 1e-8
 """Metres from the surface at which a crossing is found."""
 
 
+_FINEST = STEP * np.sqrt(2.0)
+"""Metres; a level's cells are nearest to half of the patch that is seen, in powers of two."""
+
 _SCATTER = 39916801.0, 27644437.0
 """Multiplied by these numbers, places that are close to each other have fractions that differ at random."""
+
+_SPREAD = 0.84, 0.35
+"""Least factor by which patches are scattered, and the range of factors: half an octave in all."""
 
 
 def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
@@ -63,17 +69,19 @@ def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
 
 
 @inlined
-def level_of(patch: float, x: float, y: float) -> int:
+def level_of(patch: float, scattered: Any, x: float, y: float) -> int:
     """The level of detail of a patch that is seen as one, metres long, about a place.
 
-    Cells are as wide as half of the patch. Between two levels, rays take either, the nearer one more often,
-    by a random number of the place, so that no edge is seen where a level ends.
+    scattered : whether rays near the border of two levels take either, by a random number of the place, so
+                that no edge is seen in images where a level ends
     """
-    level, cells, chance = 0, patch * (0.5 / STEP), x * _SCATTER[0] + y * _SCATTER[1]
+    level, cells = 0, patch / _FINEST
+    if scattered:
+        chance = x * _SCATTER[0] + y * _SCATTER[1]
+        cells *= _SPREAD[0] + _SPREAD[1] * (chance - np.floor(chance))
     while cells >= 2.0 and level < LEVELS - 1:
         level, cells = level + 1, 0.5 * cells
-    further = cells > 1.0 + chance - np.floor(chance) and level < LEVELS - 1
-    return level + 1 if further else level
+    return level
 
 
 @inlined
