@@ -41,9 +41,9 @@ class WorldSettings:
     trees     : single trees and those of rows
     furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
     barriers  : walls, fences and hedges
-    relief    : of `RELIEFS`: ``scene``, what the scene holds; ``off``: walls are planes and the ground is
-                smooth; ``plain``: without the small parts that full relief adds; ``full``: only of a
-                scene that has them; ``mesh``: openings of walls as triangles
+    relief    : of `RELIEFS`: ``scene``, what the scene holds; ``plain``: without the small parts
+                that full relief adds; ``off``: walls are planes and the ground is smooth, too; ``full``:
+                only of a scene that has them; ``mesh``: openings of walls as triangles
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
     """

@@ -40,7 +40,7 @@ def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: M
     i, j = scene.tile_indices[rank]
     tile = scene.tile(i, j, forests=settings.forests)
     without = [code for name, codes in _CLASSES.items() if not getattr(settings, name) for code in codes]
-    extras = tile.extras if settings.relief == "plain" else None
+    extras = tile.extras if settings.relief in {"off", "plain"} else None
     if not without and extras is None:
         return tile
     mapped = tile.instances

@@ -57,6 +57,10 @@ def test_plain_leaves_out_of_a_full_scene_what_full_adds(scenes):
     assert contents(scenes["plain"], "plain") == wanted
 
 
+def test_off_leaves_out_what_full_adds(scenes):
+    assert contents(scenes["full"], "off") == contents(scenes["plain"], "off")
+
+
 def test_full_is_all_that_a_full_scene_holds(scenes):
     assert contents(scenes["full"], "full") == contents(scenes["full"], "scene")
 
