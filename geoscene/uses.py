@@ -59,7 +59,7 @@ USES: Mapping[str, Use] = {
     ),
     "camera": Use(
         "what cameras, laser scanners, GNSS, IMU and traffic need",
-        tables={**_DRIVEN, "furniture": Needed(("shape", "face"))},
+        tables={**_DRIVEN, "furniture": Needed(("shape", "face", "heading"))},
         indexed=False,
     ),
     "gis": Use("tables and road graph only", tiles=False),

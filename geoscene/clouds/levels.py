@@ -36,6 +36,9 @@ _SMALLEST, _NARROWEST = 6.0, 1.5
 _SHARE = 0.6
 """Share of its points that the roof of a body explains, at least."""
 
+_GAIN = 0.05
+"""Share of the points that bodies explain and one roof over all of them does not, at least."""
+
 _CUTS = 3
 """Cuts of a footprint, at most."""
 
@@ -51,8 +54,9 @@ def split_bodies(polygon: Any, xyz: Float, *, inset: float, seed: str) -> tuple[
     """Bodies of a footprint with roofs at different heights, the highest first; empty if no cuts explain it.
 
     Cuts are straight, parallel to a main direction of the walls, and go where the roof steps by 1 m or more
-    along three quarters of their length. Each piece must have a roof of its own that explains its points;
-    else the footprint stays whole.
+    along three quarters of their length. Each piece must have a roof of its own that explains its points,
+    and together they must explain more than one roof does, which may be steep; else the footprint stays
+    whole.
 
     polygon : valid footprint, scene metres
     xyz     : (n, 3) points above it, those near its walls left out
@@ -62,13 +66,18 @@ def split_bodies(polygon: Any, xyz: Float, *, inset: float, seed: str) -> tuple[
     pieces = _pieces(polygon, xyz, left=_CUTS)
     if len(pieces) < 2:
         return ()
-    bodies = []
+    bodies, points = [], []
     for k, (piece, some) in enumerate(pieces):
         own = some[roof_points(piece, some, inset=inset)]
         roof = fit_roof(piece, own, seed=f"{seed}.{k}")
         if roof is None or roof.share < _SHARE:
             return ()
         bodies.append(Body(piece, roof))
+        points.append(len(own))
+    single = fit_roof(polygon, xyz[roof_points(polygon, xyz, inset=inset)], seed=seed)
+    share = np.average([body.roof.share for body in bodies], weights=points)
+    if single is not None and share < single.share + _GAIN:
+        return ()
     return tuple(sorted(bodies, key=lambda body: -body.roof.top))
 
 

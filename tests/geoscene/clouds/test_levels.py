@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from geoscene.clouds.levels import split_bodies
@@ -60,6 +60,8 @@ def test_cuts_go_through_corners_of_the_footprint_near_them():
 
 @FEW
 @given(st.floats(20, 55), st.floats(0, 3.1), st.integers(0, 99))
+@example(44.0, 0.0, 0)
+@example(55.0, 0.3, 1)
 def test_a_single_roof_however_steep_is_not_cut(pitch, turn, seed):
     rng = np.random.default_rng(seed)
     uv = rng.uniform((0, 0), (12, 8), (900, 2))
