@@ -42,6 +42,7 @@ OPTIONS = DriveOptions(
     route="random",
     duration=0.5,
     seed=5,
+    relief="off",
     formats=("pcd",),
     traffic=TrafficOptions(vehicles=60.0, parked=0.9, pedestrians=40.0, cyclists=10.0),
 )

@@ -78,6 +78,7 @@ def dataset(scene, tmp_path_factory):
         formats=("pcd",),
         settings=(("supersample", "1"), ("shadows", "off")),
         workers=1,
+        relief="off",
         traffic=TrafficOptions(vehicles=60, parked=0.9, pedestrians=60, cyclists=20),
         rig=str(folder / "rig.toml"),
     )

@@ -79,6 +79,7 @@ OPTIONS = DriveOptions(
     formats=("pcd",),
     settings=(("supersample", "1"), ("shadows", "off")),
     workers=1,
+    relief="off",
     traffic=TrafficOptions(vehicles=60, parked=0.9, pedestrians=60, cyclists=20),
 )
 

@@ -101,6 +101,7 @@ def recorded(scene_utm, tmp_path_factory):
         rig=str(folder / "rig.toml"),
         duration=0.5,
         seed=4,
+        relief="off",
         formats=("pcd",),
         start=datetime(2026, 6, 21, 8, 0, 0, 250_000, tzinfo=UTC),
         traffic=TrafficOptions(vehicles=40, parked=0.8, pedestrians=30, cyclists=5),

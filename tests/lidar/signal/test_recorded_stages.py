@@ -52,6 +52,7 @@ def options(tmp_path_factory):
         rig=str(rig),
         duration=0.5,
         seed=3,
+        relief="off",
         formats=("pcd", "laz", "kitti", "nuscenes"),
         labels=("semantickitti", "nuscenes"),
         deskew="end",

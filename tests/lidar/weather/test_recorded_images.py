@@ -32,7 +32,7 @@ CLEAR = (("cloud", "0"), ("wetness", "0"))
 def options(tmp_path):
     rig = tmp_path / "eye.toml"
     rig.write_text(RIG.format(images='["rgb", "depth", "semantic"]'))
-    return DriveOptions(rig=str(rig), duration=0.5, seed=3, settings=CLEAR)
+    return DriveOptions(rig=str(rig), duration=0.5, seed=3, settings=CLEAR, relief="off")
 
 
 def images(folder):
