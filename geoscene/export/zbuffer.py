@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def draw_triangles(
     corners: Float, label: NDArray[np.uint8], height: NDArray[np.float32], labels: NDArray[np.uint8]
 ) -> None:

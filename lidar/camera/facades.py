@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
+from geoscene.compiled import njit
 from lidar.raycast import Hits
 from lidar.raycast.memory import called, inlined
 from lidar.relief import FRAME, INFILL, ROOM, SILL, WallTables, march

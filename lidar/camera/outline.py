@@ -7,8 +7,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 
 

@@ -8,10 +8,10 @@ import math
 from statistics import NormalDist
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.camera import ground_texture, texture
 from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, PAINTED, SEEN, UPRIGHT, Facades, facade

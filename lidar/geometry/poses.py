@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from geoscene.columns import Columns, row_blocks
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 

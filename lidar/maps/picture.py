@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.classes import Class, class_codes
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.camera.render import RenderOptions, render
 from lidar.errors import InputError

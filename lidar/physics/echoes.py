@@ -7,11 +7,11 @@ from enum import IntEnum
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.columns import Columns
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.physics.footprint import AXIS_ONLY, Gap
 from lidar.raycast.memory import inlined

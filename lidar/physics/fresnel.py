@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import inlined
 

@@ -10,9 +10,9 @@ moved vertices, which rays along their displacements meet, and narrow faces.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 
 ROUNDING = 2.0**-22

@@ -17,9 +17,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Rays, Target
 from lidar.raycast.exact import STACK, first_hit

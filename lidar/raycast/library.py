@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.compiled import level
 from lidar.errors import BackendError
 
 TRIANGLE, INSTANCE_ARRAY = 0, 122
@@ -24,6 +25,8 @@ INVALID = 0xFFFFFFFF
 
 _PACKETS = ((16, 34), (8, 33), (4, 32))
 _VERSION = 0
+_INSTRUCTIONS = {"x86-64-v3": b",max_isa=avx2"}
+"""Embree's settings by level of x86-64: as wide packets as code for that level on any machine."""
 _TRACERS = [f"rtc{query}{width}" for query in ("Intersect", "Occluded") for width in (1, 4, 8, 16)]
 
 _P, _U, _Z, _I = c.c_void_p, c.c_uint, c.c_size_t, c.c_int
@@ -101,7 +104,7 @@ def library() -> Library:
         raise BackendError(f"{path.name}: not a usable Embree 4 library ({error})") from error
     # With one build thread the order of triangles in the tree, and so the face hit at a shared edge, does not
     # depend on the machine, and no threads are lost in a fork.
-    device = embree.rtcNewDevice(b"threads=1,start_threads=0")
+    device = embree.rtcNewDevice(b"threads=1,start_threads=0" + _INSTRUCTIONS.get(level(), b""))
     if not device:
         raise BackendError(f"{path.name}: no device (error {embree.rtcGetDeviceError(None)})")
     version = embree.rtcGetDeviceProperty(device, _VERSION)

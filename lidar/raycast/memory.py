@@ -6,8 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from geoscene.compiled import njit
 
 intersect1: Any = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
 occluded1: Any = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))

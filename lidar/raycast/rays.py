@@ -9,9 +9,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses

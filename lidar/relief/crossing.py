@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import called, inlined
 from lidar.relief.roughness import BLOCK, KINDS, LEVELS, NODES, REACH, STEP, roughness

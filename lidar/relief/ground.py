@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
 from lidar.raycast.columns import Rays

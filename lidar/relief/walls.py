@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.buildings.facades import WallRelief
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory

@@ -6,10 +6,10 @@ import functools
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, depth_of, gather, insert
 from lidar.physics.footprint import Gap

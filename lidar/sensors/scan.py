@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float, Ints
 from lidar.random_streams import generator

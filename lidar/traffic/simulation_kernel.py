@@ -18,9 +18,9 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float, Ints
 from lidar.traffic.junctions import Signals, is_green
 from lidar.traffic.lanes import STEP

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.columns import Columns
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 

@@ -8,9 +8,9 @@ from math import inf, pi, radians
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError

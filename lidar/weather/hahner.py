@@ -8,9 +8,9 @@ from math import log, pi
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.weather.lisa import SCATTERED, TARGET, Returns
 

@@ -8,9 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.rig.specs import CameraSpec

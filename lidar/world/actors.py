@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.columns import Columns, row_blocks
+from geoscene.compiled import njit
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
 from lidar.geometry.poses import BLOCK_POSES, release, room

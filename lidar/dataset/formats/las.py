@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.classes import class_codes
+from geoscene.compiled import njit
 from geoscene.files import atomic_path
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError

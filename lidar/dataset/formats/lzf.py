@@ -11,8 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from geoscene.compiled import njit
 
 _LITERALS = 32
 _FARTHEST = 1 << 13

@@ -6,10 +6,10 @@ from io import StringIO
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.files import write_atomically
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
@@ -27,7 +27,7 @@ _TYPES: dict[str, Any] = {
 }
 
 
-@numba.njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True)
 def _format(values: NDArray[np.int64], decimals: NDArray[np.int64], out: NDArray[np.uint8]) -> int:
     """Write fixed-point rows as text into ``out``, 22 bytes per value; return the number of bytes."""
     digits = np.empty(24, np.uint8)
