@@ -18,8 +18,9 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.errors import GeosceneError, InputError
+from geoscene.errors import InputError
 from geoscene.ground.camber import Kerbs, Raised
+from geoscene.ground.faces import Faces, faces
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.typing import Bools, Float, Ints
@@ -195,19 +196,17 @@ def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
         *_strings(plan.start[mine], plan.end[mine], string=plan.string[mine]),
         *_ruling(plan, i, j=j, box=box),
     ]
-    cells = _faces(shapely.union_all(lines, grid_size=PRECISION), box)
-    inside = shapely.get_coordinates(shapely.point_on_surface(cells))
-    row = rows_at(plan, inside)
-    edges = _Edges.of(cells)
-    row, slivers = _without_slivers(edges, cells, row=row)
+    cells = _noded_faces(lines, box)
+    row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(cells.polygon)))
+    row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
-    cells, row = _dissolve(edges, row, box=box, lines=_spacing(plan, i, j=j), level=level)
-    cells = shapely.coverage_simplify(cells, BEND, simplify_boundary=False)
+    joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
+    polygon = shapely.coverage_simplify(joined, BEND, simplify_boundary=False)
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
     material = values_at(plan.layers.material, row, base=plan.base[1])
     feature = values_at(plan.layers.feature, row, base=-1)
-    tile = np.broadcast_to(np.array([i, j], np.int32), (len(cells), 2)).copy()
-    return Partition(cells, row.astype(np.int32), klass, material, feature, tile, slivers)
+    tile = np.broadcast_to(np.array([i, j], np.int32), (len(polygon), 2)).copy()
+    return Partition(polygon, row.astype(np.int32), klass, material, feature, tile, slivers)
 
 
 def partition(
@@ -441,52 +440,28 @@ def _stops(
     return np.concatenate(stops)[1:]
 
 
-def _faces(linework: object, box: tuple[float, float, float, float]) -> NDArray[np.object_]:
-    """The polygons that noded lines bound within the box."""
-    cells = shapely.get_parts(shapely.polygonize([linework]))
-    x0, y0, x1, y1 = shapely.bounds(cells).T
-    inside: NDArray[np.object_] = cells[(x0 >= box[0]) & (y0 >= box[1]) & (x1 <= box[2]) & (y1 <= box[3])]
-    area, whole = float(shapely.area(inside).sum()), (box[2] - box[0]) * (box[3] - box[1])
-    if abs(area - whole) > 1e-7 * whole:
-        raise GeosceneError(f"ground cells of the tile at {box} cover {area:.6f} m2 of {whole:.6f}")
-    return inside
+def _noded_faces(lines: Sequence[object], box: tuple[float, float, float, float]) -> Faces:
+    """The cells within the box between lines, which are noded together first."""
+    noded = shapely.get_parts(shapely.union_all(lines, grid_size=PRECISION))
+    coords, line = shapely.get_coordinates(noded, return_index=True)
+    points, number = distinct(coords)
+    count = shapely.get_num_points(noded) - 1
+    begin = np.repeat(np.cumsum(count) - count, count)
+    nth, count = np.arange(len(begin)) - begin, np.repeat(count, count)
+    follows = line[:-1] == line[1:]
+    return faces(
+        points,
+        np.stack([number[:-1][follows], number[1:][follows]]),
+        rank=2 * begin + np.stack([nth, 2 * count - 1 - nth]),
+        box=box,
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class _Edges:
-    """Directed edges of cells, the interior always on the same side.
-
-    a, b   : (m,) int64, numbers of the ends
-    cell   : (m,) int64
-    other  : (m,) int64, the cell on the other side, -1 on the border
-    points : (k, 2) float64, metres
-    """
-
-    a: Ints
-    b: Ints
-    cell: Ints
-    other: Ints
-    points: Float
-
-    @classmethod
-    def of(cls, cells: NDArray[np.object_]) -> _Edges:
-        rings, owner = shapely.get_rings(cells, return_index=True)
-        coords, ring = shapely.get_coordinates(rings, return_index=True)
-        points, number = distinct(coords)
-        follows = ring[:-1] == ring[1:]
-        a, b, cell = number[:-1][follows], number[1:][follows], owner[ring[:-1][follows]]
-        there, back = a * len(points) + b, b * len(points) + a
-        order = np.argsort(there)
-        place = np.minimum(np.searchsorted(there[order], back), len(order) - 1)
-        twin = order[place]
-        other = np.where(there[twin] == back, cell[twin], -1)
-        return cls(a, b, cell.astype(np.int64), other.astype(np.int64), points)
-
-
-def _without_slivers(edges: _Edges, cells: NDArray[np.object_], *, row: Ints) -> tuple[Ints, int]:
+def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
     """Rows after each sliver took that of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
     # slivers are among the few cells that pass this; those with a wider spot are then excluded.
+    cells = edges.polygon
     thin = 2.0 * shapely.area(cells) < SLIVER * shapely.length(cells)
     thin[thin] = shapely.is_empty(shapely.buffer(cells[thin], -SLIVER / 2, quad_segs=4))
     if not thin.any():
@@ -514,7 +489,7 @@ def _without_slivers(edges: _Edges, cells: NDArray[np.object_], *, row: Ints) ->
 
 
 def _dissolve(
-    edges: _Edges, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
+    edges: Faces, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
 ) -> tuple[NDArray[np.object_], Ints]:
     """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 
@@ -525,26 +500,11 @@ def _dissolve(
         p, q = edges.points[edges.a], edges.points[edges.b]
         on_line = (p == q) & (p == np.round(p / lines) * lines)
         kept |= on_line.any(axis=1) & ~level[edges.cell]
-    drawn = kept & ((edges.a < edges.b) | (edges.other < 0))
-    segments = np.stack([edges.points[edges.a[drawn]], edges.points[edges.b[drawn]]], axis=1)
-    cells = _faces(shapely.multilinestrings(shapely.linestrings(segments)), box)
-    # A joined cell's first edge, in its direction, is an edge of one of the cells it was made of.
-    first = shapely.get_coordinates(shapely.get_exterior_ring(cells))
-    count = shapely.get_num_points(shapely.get_exterior_ring(cells))
-    begin = np.cumsum(count) - count
-    number = _numbers(edges.points, np.stack([first[begin], first[begin + 1]], axis=1))
+    drawn = np.flatnonzero(kept & ((edges.a < edges.b) | (edges.other < 0)))
+    ends = np.stack([edges.a[drawn], edges.b[drawn]])
+    joined = faces(edges.points, ends, rank=np.arange(2 * len(drawn)).reshape(-1, 2).T, box=box)
+    # A joined cell's first half-edge is one of the cells it was made of.
     key = edges.a * len(edges.points) + edges.b
     order = np.argsort(key)
-    place = np.searchsorted(key[order], number[:, 0] * len(edges.points) + number[:, 1])
-    return cells, row[edges.cell[order[place]]]
-
-
-def _numbers(points: Float, wanted: Float) -> Ints:
-    """The number (...,) of each wanted point (..., 2) in points (k, 2), which are sorted by x, then y."""
-    grid = np.round(points / PRECISION).astype(np.int64)
-    low, high = grid.min(axis=0), grid.max(axis=0)
-    width = high[1] - low[1] + 1
-    key = (grid[:, 0] - low[0]) * width + grid[:, 1] - low[1]
-    target = np.round(wanted / PRECISION).astype(np.int64) - low
-    number: Ints = np.searchsorted(key, target[..., 0] * width + target[..., 1])
-    return number
+    first = joined.a[joined.first] * len(edges.points) + joined.b[joined.first]
+    return joined.polygon, row[edges.cell[order[np.searchsorted(key[order], first)]]]
