@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.compiled import njit
 from lidar.raycast import Hits
-from lidar.raycast.memory import called, inlined
+from lidar.raycast.memory import inlined
 from lidar.relief import FRAME, INFILL, ROOM, SILL, WallTables, march
 from lidar.relief.walls import depth_of, height_of, on_wall, outwards
 from lidar.world.surfaces import Surfaces
@@ -183,7 +183,7 @@ def _row(y: float, ground: float, height: float) -> Any:
     return 1.0 + math.floor((y - ground) / height)
 
 
-@called
+@inlined
 def facade(facades: Any, w: int, place: Any, direction: Any, size: float, linear: Any, out: Any) -> None:
     """Fill ``out`` (`SEEN`,) with what a pixel sees of the openings of a wall.
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import math
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +17,12 @@ from geoscene.typing import Float
 from lidar.camera import ground_texture, texture
 from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, PAINTED, SEEN, UPRIGHT, Facades, facade
 from lidar.camera.ground_texture import HIGHEST, LOWEST, ground
-from lidar.camera.texture import detail, grain, hashed, noise
+from lidar.camera.texture import compiled, detail, grain, hashed, inlined, noise
 
 Single = NDArray[np.float32]
 
 _BUILDING, _MARKING = int(Class.BUILDING), int(Class.LANE_MARKING)
 _ASPHALT = ground_texture.ASPHALT
-
-compiled = njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp", "nsz"})
 
 _KINDS = {
     texture.SPECKLED: ("asphalt", "asphalt_fresh", "gravel", "soil", "sand", "ballast", "tar_roof"),
@@ -172,7 +171,7 @@ def shadow_rays(
     return k
 
 
-@compiled
+@inlined
 def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> None:
     """Radiance of the sky towards a unit vector with z >= 0, between the entries of the table."""
     rows, columns = sky.shape[0] - 1, sky.shape[1] - 1
@@ -188,7 +187,7 @@ def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> No
         out[c] = low + a * (high - low)
 
 
-@compiled
+@inlined
 def _mirrored(
     sky: Float, sun: Float, d: Float, nx: float, ny: float, nz: float, town: Float, out: Float
 ) -> None:
@@ -207,7 +206,7 @@ def _step(value: float, level: float, edge: float) -> float:
     return min(max((value - level) / edge + 0.5, 0.0), 1.0)
 
 
-@compiled
+@inlined
 def _painted(feature: int, wall: int, albedo: Float) -> None:
     """Replace a building's default colour by one derived from its number."""
     shade = hashed(feature, 7, 20)
@@ -225,7 +224,7 @@ def _fresnel(straight: float, cosine: float) -> float:
     return straight + (1.0 - straight) * k * k * k * k * k
 
 
-@compiled
+@inlined
 def _irradiance(
     ambient: Float,
     beam: Float,
@@ -248,6 +247,160 @@ def _irradiance(
         e += b4 * ambient[4, c] + b5 * ambient[5, c] + b6 * ambient[6, c]
         e += b7 * ambient[7, c] + b8 * ambient[8, c]
         out[c] = max(e, 0.0) * open_sky + beam[c] * facing
+
+
+@inlined
+def _pixel(
+    i: int,
+    view: Any,
+    found: Any,
+    walls: Any,
+    lit: Any,
+    light: Any,
+    tables: Any,
+    settings: Any,
+    covers: Any,
+    scratch: Any,
+    out: Any,
+    gloss: Any,
+    facet: Any,
+) -> None:
+    """Fill row ``i`` of what `shade` fills; ``scratch`` is overwritten."""
+    origin, row, direction, range_, normal = view
+    klass, material, color, feature, wall = found
+    frame = walls.tables.frame
+    sun, beam, ambient, sky, horizon = light
+    kinds, floors, mirrors, plain, soaked, linear = tables
+    blur, angle, extinction, detailed = settings
+    wetness, pools, snow, patches = covers
+    colors, seen, town = scratch
+    d, glow, albedo, sides, aslant, irradiance = (
+        colors[0],
+        colors[1],
+        colors[2],
+        colors[3],
+        colors[4],
+        colors[5],
+    )
+    dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    d[0], d[1], d[2] = dx / length, dy / length, dz / length
+    t = range_[i]
+    if not t < np.inf:
+        _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
+        below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
+        facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
+        disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
+        for c in range(3):
+            out[i, c] = glow[c] + below * (horizon[c] - glow[c]) + disc * beam[c] * 100.0
+        return
+    o = row[i]
+    x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
+    w = wall[i]
+    nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
+    if w >= 0:
+        nx, ny, nz = frame[w, 4], -frame[w, 3], 0.0
+    cosine = max(-(nx * d[0] + ny * d[1] + nz * d[2]), 0.0)
+    distance = t * length
+    size = blur + distance * angle
+    footprint = size / math.sqrt(max(cosine, 0.02))
+    m = material[i] & 127
+    is_open = material[i] > 127
+    kind = kinds[m]
+    mirror = mirrors[m]
+    upright = abs(nz) < 0.3
+    u = 0.0
+    if w >= 0:
+        u = x * frame[w, 3] + y * frame[w, 4]
+    elif upright:
+        flat = math.sqrt(nx * nx + ny * ny)
+        u = (y * nx - x * ny) / flat
+
+    factor = 1.0
+    if detailed and nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kind != texture.LIQUID:
+        flat = math.sqrt(d[0] * d[0] + d[1] * d[1])
+        hx, hy = (d[0] / flat, d[1] / flat) if flat > 1e-9 else (1.0, 0.0)
+        painted = klass[i] == _MARKING
+        floor = _ASPHALT if painted else floors[m]
+        factor = ground(floor, painted, x, y, hx, hy, size, size / max(cosine, 0.02))
+    elif detailed:
+        factor = detail(kind, upright, x, y, z, u, footprint)
+    for c in range(3):
+        albedo[c] = linear[color[i, c]] * factor
+    if detailed and klass[i] == _BUILDING:
+        r, g, b = color[i, 0], color[i, 1], color[i, 2]
+        if r == plain[m, 0] and g == plain[m, 1] and b == plain[m, 2]:
+            _painted(feature[i], w >= 0, albedo)
+    glass = aside = upwards = 0.0
+    open_sky = 1.0
+    if w >= 0:
+        open_sky = 0.6 + 0.4 * min(max((z - frame[w, 2]) / 9.0, 0.0), 1.0)
+        if detailed:
+            facade(walls, w, (x, y, z), (d[0], d[1], d[2]), size, linear, seen)
+            glass, aside, upwards = seen[GLASS], seen[ASIDE], seen[UPRIGHT]
+            front = 1.0 - glass - aside - upwards - seen[PAINTED]
+            for c in range(3):
+                sides[c] = albedo[c]
+                albedo[c] = front * albedo[c] + seen[LIGHT + c] + seen[BEHIND + c]
+
+    film = pool = 0.0
+    if is_open:
+        edge = 0.1 + 0.5 * min(footprint, 1.0)
+        bumps, hollows = 0.0, 0.0
+        if 0.0 < snow < 1.0:
+            bumps = 0.6 * noise(x / 2.3, y / 2.3, 34) + 0.4 * noise(x / 0.6, y / 0.6, 35)
+        white = _step(bumps, patches, edge)
+        if wetness > 0.0 and nz > 0.97:
+            hollows = 0.7 * noise(x / 3.1, y / 3.1, 36) + 0.3 * noise(x / 0.8, y / 0.8, 37)
+            pool = _step(hollows, pools, edge)
+        damp = max(wetness, pool) * (1.0 - white)
+        bright = 1.0
+        if detailed and white > 0.0:
+            bright += 0.05 * grain(x, y, 1.3, footprint, 38) + 0.04 * grain(x, y, 0.16, footprint, 39)
+        for c in range(3):
+            albedo[c] *= 1.0 - damp * (1.0 - soaked[m])
+            albedo[c] += white * (_SNOW[c] * bright - albedo[c])
+        film = (0.25 * damp + 0.75 * min(pool, damp)) * _fresnel(0.02, cosine)
+
+    rx, ry, rz = nx, ny, nz
+    if kind == texture.LIQUID and detailed:
+        ripple = 0.02 / (1.0 + footprint)
+        rx += ripple * noise(x / 0.7, y / 0.7, 30)
+        ry += ripple * noise(x / 0.7 + 40.0, y / 0.7, 31)
+    shine = glass * _fresnel(0.08, cosine)
+    if mirror > 0.0:
+        shine = max(shine, _fresnel(mirror, cosine))
+
+    _irradiance(ambient, beam, sun, nx, ny, nz, lit[i], open_sky, irradiance)
+    if shine > 0.0:
+        _mirrored(sky, sun, d, rx, ry, rz, town, glow)
+    for c in range(3):
+        irradiance[c] *= albedo[c]
+    if aside > 0.0:
+        along = 1.0 if d[0] * frame[w, 3] + d[1] * frame[w, 4] < 0.0 else -1.0
+        _irradiance(
+            ambient, beam, sun, along * frame[w, 3], along * frame[w, 4], 0.0, lit[i], open_sky, aslant
+        )
+        for c in range(3):
+            irradiance[c] += aside * sides[c] * aslant[c]
+    if upwards > 0.0:
+        up = 1.0 if d[2] < 0.0 else -1.0
+        _irradiance(ambient, beam, sun, 0.0, 0.0, up, lit[i], open_sky, aslant)
+        for c in range(3):
+            irradiance[c] += upwards * sides[c] * aslant[c]
+    clear = math.exp(-extinction * distance)
+    for c in range(3):
+        r = (1.0 - shine) * (1.0 - film) * irradiance[c] / math.pi
+        if shine > 0.0:
+            r += shine * glow[c]
+        out[i, c] = r * clear + horizon[c] * (1.0 - clear)
+    if len(gloss):
+        # The texture of the surface shows through a thin film, puddles are smooth but for ripples.
+        rough = (0.12 * (1.0 - pool) + 0.006) / (1.0 + 8.0 * footprint) if film > 0.0 else 0.0
+        gloss[i] = film * clear
+        facet[i, 0] = nx + rough * noise(x / 0.03, y / 0.03, 32)
+        facet[i, 1] = ny + rough * noise(x / 0.03 + 40.0, y / 0.03, 33)
+        facet[i, 2] = nz
 
 
 @compiled
@@ -284,134 +437,8 @@ def shade(
                haze (1/m), whether detail is drawn
     covers   : `covers` of the world
     """
-    frame = walls.tables.frame
-    sun, beam, ambient, sky, horizon = light
-    kinds, floors, mirrors, plain, soaked, linear = tables
-    blur, angle, extinction, detailed = settings
-    wetness, pools, snow, patches = covers
-    glow = np.empty(3)
-    seen = np.zeros(SEEN)
-    d = np.empty(3)
-    albedo, sides, aslant = np.empty(3), np.empty(3), np.empty(3)
-    irradiance = np.empty(3)
-    town = 0.6 * horizon
+    scratch = np.empty((6, 3)), np.zeros(SEEN), 0.6 * light[4]
+    view = origin, row, direction, range_, normal
+    found = klass, material, color, feature, wall
     for i in range(len(range_)):
-        dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        d[0], d[1], d[2] = dx / length, dy / length, dz / length
-        t = range_[i]
-        if not t < np.inf:
-            _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
-            below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
-            facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
-            disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
-            for c in range(3):
-                out[i, c] = glow[c] + below * (horizon[c] - glow[c]) + disc * beam[c] * 100.0
-            continue
-        o = row[i]
-        x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
-        w = wall[i]
-        nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-        if w >= 0:
-            nx, ny, nz = frame[w, 4], -frame[w, 3], 0.0
-        cosine = max(-(nx * d[0] + ny * d[1] + nz * d[2]), 0.0)
-        distance = t * length
-        size = blur + distance * angle
-        footprint = size / math.sqrt(max(cosine, 0.02))
-        m = material[i] & 127
-        is_open = material[i] > 127
-        kind = kinds[m]
-        mirror = mirrors[m]
-        upright = abs(nz) < 0.3
-        u = 0.0
-        if w >= 0:
-            u = x * frame[w, 3] + y * frame[w, 4]
-        elif upright:
-            flat = math.sqrt(nx * nx + ny * ny)
-            u = (y * nx - x * ny) / flat
-
-        factor = 1.0
-        if detailed and nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kind != texture.LIQUID:
-            flat = math.sqrt(d[0] * d[0] + d[1] * d[1])
-            hx, hy = (d[0] / flat, d[1] / flat) if flat > 1e-9 else (1.0, 0.0)
-            painted = klass[i] == _MARKING
-            floor = _ASPHALT if painted else floors[m]
-            factor = ground(floor, painted, x, y, hx, hy, size, size / max(cosine, 0.02))
-        elif detailed:
-            factor = detail(kind, upright, x, y, z, u, footprint)
-        for c in range(3):
-            albedo[c] = linear[color[i, c]] * factor
-        if detailed and klass[i] == _BUILDING:
-            r, g, b = color[i, 0], color[i, 1], color[i, 2]
-            if r == plain[m, 0] and g == plain[m, 1] and b == plain[m, 2]:
-                _painted(feature[i], w >= 0, albedo)
-        glass = aside = upwards = 0.0
-        open_sky = 1.0
-        if w >= 0:
-            open_sky = 0.6 + 0.4 * min(max((z - frame[w, 2]) / 9.0, 0.0), 1.0)
-            if detailed:
-                facade(walls, w, (x, y, z), (d[0], d[1], d[2]), size, linear, seen)
-                glass, aside, upwards = seen[GLASS], seen[ASIDE], seen[UPRIGHT]
-                front = 1.0 - glass - aside - upwards - seen[PAINTED]
-                for c in range(3):
-                    sides[c] = albedo[c]
-                    albedo[c] = front * albedo[c] + seen[LIGHT + c] + seen[BEHIND + c]
-
-        film = pool = 0.0
-        if is_open:
-            edge = 0.1 + 0.5 * min(footprint, 1.0)
-            bumps, hollows = 0.0, 0.0
-            if 0.0 < snow < 1.0:
-                bumps = 0.6 * noise(x / 2.3, y / 2.3, 34) + 0.4 * noise(x / 0.6, y / 0.6, 35)
-            white = _step(bumps, patches, edge)
-            if wetness > 0.0 and nz > 0.97:
-                hollows = 0.7 * noise(x / 3.1, y / 3.1, 36) + 0.3 * noise(x / 0.8, y / 0.8, 37)
-                pool = _step(hollows, pools, edge)
-            damp = max(wetness, pool) * (1.0 - white)
-            bright = 1.0
-            if detailed and white > 0.0:
-                bright += 0.05 * grain(x, y, 1.3, footprint, 38) + 0.04 * grain(x, y, 0.16, footprint, 39)
-            for c in range(3):
-                albedo[c] *= 1.0 - damp * (1.0 - soaked[m])
-                albedo[c] += white * (_SNOW[c] * bright - albedo[c])
-            film = (0.25 * damp + 0.75 * min(pool, damp)) * _fresnel(0.02, cosine)
-
-        rx, ry, rz = nx, ny, nz
-        if kind == texture.LIQUID and detailed:
-            ripple = 0.02 / (1.0 + footprint)
-            rx += ripple * noise(x / 0.7, y / 0.7, 30)
-            ry += ripple * noise(x / 0.7 + 40.0, y / 0.7, 31)
-        shine = glass * _fresnel(0.08, cosine)
-        if mirror > 0.0:
-            shine = max(shine, _fresnel(mirror, cosine))
-
-        _irradiance(ambient, beam, sun, nx, ny, nz, lit[i], open_sky, irradiance)
-        if shine > 0.0:
-            _mirrored(sky, sun, d, rx, ry, rz, town, glow)
-        for c in range(3):
-            irradiance[c] *= albedo[c]
-        if aside > 0.0:
-            along = 1.0 if d[0] * frame[w, 3] + d[1] * frame[w, 4] < 0.0 else -1.0
-            _irradiance(
-                ambient, beam, sun, along * frame[w, 3], along * frame[w, 4], 0.0, lit[i], open_sky, aslant
-            )
-            for c in range(3):
-                irradiance[c] += aside * sides[c] * aslant[c]
-        if upwards > 0.0:
-            up = 1.0 if d[2] < 0.0 else -1.0
-            _irradiance(ambient, beam, sun, 0.0, 0.0, up, lit[i], open_sky, aslant)
-            for c in range(3):
-                irradiance[c] += upwards * sides[c] * aslant[c]
-        clear = math.exp(-extinction * distance)
-        for c in range(3):
-            r = (1.0 - shine) * (1.0 - film) * irradiance[c] / math.pi
-            if shine > 0.0:
-                r += shine * glow[c]
-            out[i, c] = r * clear + horizon[c] * (1.0 - clear)
-        if len(gloss):
-            # The texture of the surface shows through a thin film, puddles are smooth but for ripples.
-            rough = (0.12 * (1.0 - pool) + 0.006) / (1.0 + 8.0 * footprint) if film > 0.0 else 0.0
-            gloss[i] = film * clear
-            facet[i, 0] = nx + rough * noise(x / 0.03, y / 0.03, 32)
-            facet[i, 1] = ny + rough * noise(x / 0.03 + 40.0, y / 0.03, 33)
-            facet[i, 2] = nz
+        _pixel(i, view, found, walls, lit, light, tables, settings, covers, scratch, out, gloss, facet)
