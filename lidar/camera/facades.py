@@ -61,23 +61,35 @@ def facades_of(world: World) -> Facades:
     return Facades(world.walls.tables, deep, surfaces.color, surfaces.material, materials()["glass"].code)
 
 
-def walls_of(facades: Facades, hits: Hits) -> NDArray[np.int32]:
-    """Wall (n,) of each hit, a row of the tables; -1 for none."""
+def walls_of(facades: Facades, surfaces: Surfaces, *, hits: Hits) -> tuple[Surfaces, NDArray[np.int32]]:
+    """The surfaces of hits, those of parts of openings being their walls', and the wall (n,) of each hit.
+
+    A wall is a row of the tables; -1 for none.
+    """
+    wall = np.full(len(hits), -1, np.int32)
     if not len(facades.tables.first):
-        return np.full(len(hits), -1, np.int32)
-    return np.where(hits.instance < 0, facades.tables.wall[hits.face], np.int32(-1))
-
-
-def bare(facades: Facades, surfaces: Surfaces, *, hits: Hits, wall: NDArray[np.int32]) -> Surfaces:
-    """The surfaces of hits; those of parts of openings are the surfaces of their walls."""
-    row = np.flatnonzero(wall >= 0)
-    row = row[facades.tables.part[hits.face[row]] > 0]
-    if not len(row):
-        return surfaces
-    own = facades.tables.own[wall[row]]
+        return surfaces, wall
     color, material = surfaces.color.copy(), surfaces.material.copy()
-    color[row], material[row] = facades.color[own], facades.material[own]
-    return replace(surfaces, color=color, material=material)
+    _walls(facades, hits.face, hits.instance, wall, color, material)
+    return replace(surfaces, color=color, material=material), wall
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _walls(facades: Any, face: Any, instance: Any, wall: Any, color: Any, material: Any) -> None:
+    for i in range(len(face)):
+        if face[i] >= 0 and instance[i] < 0:
+            _wall_one(facades, face[i], i, wall, color, material)
+
+
+@inlined
+def _wall_one(facades: Any, f: int, i: int, wall: Any, color: Any, material: Any) -> None:
+    w = facades.tables.wall[f]
+    wall[i] = w
+    if w >= 0 and facades.tables.part[f] > 0:
+        own = facades.tables.own[w]
+        material[i] = facades.material[own]
+        for c in range(3):
+            color[i, c] = facades.color[own, c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -13,7 +13,7 @@ from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.camera import appearance, shade
 from lidar.camera.edges import edge_pixels
-from lidar.camera.facades import Facades, bare, facades_of, flatten, walls_of
+from lidar.camera.facades import Facades, facades_of, flatten, walls_of
 from lidar.camera.light import Light, daylight
 from lidar.camera.signal_lamps import Lamps, emitted
 from lidar.errors import InputError
@@ -198,33 +198,29 @@ def render(
 
     step = max(1, _BAND // (w * k * k))
     bands = [(a, min(a + step, h)) for a in range(0, h, step)]
-    total = np.zeros((h * w if coloured else 0, 3), np.float32)
+    total = None
     with ThreadPoolExecutor(options.threads) as pool:
         run = map if options.threads == 1 else pool.map
         for sample in range(samples) if coloured else [samples // 2]:
             image = _Image.of(h * w, coloured=coloured)
             list(run(functools.partial(band, image=image, sample=sample), bands))
             if coloured and options.edge_rays > k:
-                bytes_ = np.empty((h * w, 3), np.uint8)
-                shade.develop(image.light, exposure, shade.transfer_table(), bytes_)
-                edge = edge_pixels(
-                    bytes_.reshape(h, w, 3), image.feature.reshape(h, w), klass=image.klass.reshape(h, w)
-                )
+                rgb = shade.developed(image.light, exposure).reshape(h, w, 3)
+                edge = edge_pixels(rgb, image.feature.reshape(h, w), klass=image.klass.reshape(h, w))
                 parts = np.split(edge, range(_EDGES, len(edge), _EDGES))
                 list(run(functools.partial(refine, image=image, sample=sample), parts))
-            total += image.light
+            total = image.light if total is None else total + image.light
             if sample == samples // 2:
                 middle = image
-    rgb = np.empty((h * w, 3), np.uint8)
-    if coloured:
+    if coloured and total is not None:
         exposure /= samples
         if random is not None and np.isfinite(options.full_well):
             electrons = random.standard_normal((h, w, 3), np.float32).reshape(-1, 3)
             total = _noisy(total, exposure, normal=electrons, options=options)
-        shade.develop(total, exposure, shade.transfer_table(), rgb)
+        rgb = shade.developed(total, exposure).reshape(h, w, 3)
     depth = np.where(middle.range <= camera.far, middle.range, np.float32(np.inf))
     return Frame(
-        rgb.reshape(h, w, 3) if coloured else None,
+        rgb if coloured else None,
         depth.reshape(h, w),
         middle.klass.reshape(h, w),
         middle.feature.reshape(h, w),
@@ -344,7 +340,7 @@ def _view(
 
 
 @functools.lru_cache(maxsize=4)
-def _pinhole_rays(camera: CameraSpec) -> Float:
+def _distorted_rays(camera: CameraSpec) -> Float:
     rays = pixel_rays(camera)
     return rays / rays[:, 2:]
 
@@ -352,9 +348,16 @@ def _pinhole_rays(camera: CameraSpec) -> Float:
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
     """Directions of pixels whose ray parameter is the depth as defined in `Frame`."""
     w, fisheye = camera.width, camera.model == "fisheye"
-    if w * camera.height <= _SHARED:
-        return (pixel_rays(camera) if fisheye else _pinhole_rays(camera))[pixels]
+    shared = w * camera.height <= _SHARED
+    if shared and fisheye:
+        return pixel_rays(camera)[pixels]
+    if shared and any(camera.distortion):
+        return _distorted_rays(camera)[pixels]
     number = np.arange(pixels.start, pixels.stop) if isinstance(pixels, slice) else pixels
+    if not (fisheye or any(camera.distortion)):
+        rays = np.empty((len(number), 3))
+        shade.straight_rays(number, w, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
+        return rays
     rays = unproject(camera, np.stack([number % w, number // w], axis=-1))
     return rays if fisheye else rays / rays[:, 2:]
 
@@ -436,8 +439,7 @@ def _shaded(
     """
     hits = view.hits
     n = len(hits)
-    wall = walls_of(walls, hits)
-    surfaces = bare(walls, view.surfaces, hits=hits, wall=wall)
+    surfaces, wall = walls_of(walls, view.surfaces, hits=hits)
     view = replace(view, surfaces=surfaces)
     distance, normal = hits.range, hits.normal
     if walls.deep and (wall >= 0).any():
@@ -453,7 +455,7 @@ def _shaded(
         if options.shadows:
             towards = np.broadcast_to(light.direction, (k, 3))
             time = None if view.time is None else view.time[which]
-            on = own_faces(hits.take(which))
+            on = own_faces(hits)[which]
             lit[which] = ~world.caster.occluded(start[:k], towards, time=time, on=on)
         else:
             lit[which] = True
@@ -492,7 +494,8 @@ def _shaded(
             exposure=light.exposure,
         )
         out[rows] += seen * np.exp(-3.912 / options.visibility * away)[:, None].astype(np.float32)
-    out[~view.seen] = 0.0
+    if not view.seen.all():
+        out[~view.seen] = 0.0
     return out, gloss, facet
 
 

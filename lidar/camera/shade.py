@@ -117,6 +117,33 @@ def develop(radiance: Single, exposure: float, table: NDArray[np.uint8], out: ND
             out[i, c] = table[int(math.sqrt(x) * (_STEPS - 1) + 0.5)]
 
 
+def developed(radiance: Single, exposure: float) -> NDArray[np.uint8]:
+    """The sRGB bytes (n, 3) of radiances (n, 3) times the exposure."""
+    out = np.empty(radiance.shape, np.uint8)
+    develop(radiance, exposure, transfer_table(), out)
+    return out
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def straight_rays(
+    pixels: NDArray[np.int64], width: int, lens: tuple[float, float, float, float], out: Float
+) -> None:
+    """Fill ``out`` (n, 3) with the directions of pixels of a pinhole without distortion, of z = 1.
+
+    They are those of `lidar.rig.camera_model.unproject` divided by their z, to the last bit.
+
+    pixels : (n,) numbers, row by row
+    lens   : fx, fy, cx, cy
+    """
+    fx, fy, cx, cy = lens
+    for i in range(len(pixels)):
+        row = pixels[i] // width
+        x, y = (pixels[i] - row * width - cx) / fx, (row - cy) / fy
+        length = math.sqrt(x * x + y * y + 1.0)
+        z = 1.0 / length
+        out[i, 0], out[i, 1], out[i, 2] = x / length / z, y / length / z, 1.0
+
+
 @compiled
 def aim(
     rays: Float, row: NDArray[np.int32], rotation: Float, scale: Float, out: Float, seen: NDArray[np.bool_]

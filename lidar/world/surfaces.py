@@ -1,17 +1,20 @@
 """Attributes of the surfaces of a world."""
 
+# mypy: disallow-untyped-decorators=False
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.columns import Columns
+from geoscene.compiled import njit
 from geoscene.mesh import Mesh
 from geoscene.typing import Float
+from lidar.raycast.memory import inlined
 from lidar.world.settings import WorldSettings
 
 SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
@@ -75,6 +78,40 @@ def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDA
     column |= surfaces.klass.astype(np.int64) << 8
     column |= surfaces.material
     return column
+
+
+def surfaces_at(
+    table: Surfaces,
+    face: NDArray[np.int32],
+    instance: NDArray[np.int32],
+    *,
+    start: NDArray[np.int64],
+    named: NDArray[np.int32],
+) -> Surfaces:
+    """Rows of a table of surfaces for hits (n,), as `Faces` describes ``start`` and ``named``."""
+    n = len(face)
+    out = Surfaces(*(np.empty((n, *column.shape[1:]), column.dtype) for column in table.columns().values()))
+    _take(tuple(table.columns().values()), face, instance, start, named, tuple(out.columns().values()))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _take(table: Any, face: Any, instance: Any, start: Any, named: Any, out: Any) -> None:
+    for i in range(len(face)):
+        _take_one(table, face, instance, start, named, out, i)
+
+
+@inlined
+def _take_one(table: Any, face: Any, instance: Any, start: Any, named: Any, out: Any, i: int) -> None:
+    feature, klass, material, surface, color = table
+    copy = instance[i]
+    row = face[i] + start[copy]
+    if row < 0:
+        row += len(feature)
+    out[0][i] = feature[row] if copy < 0 else named[copy]
+    out[1][i], out[2][i], out[3][i] = klass[row], material[row], surface[row]
+    for c in range(3):
+        out[4][i, c] = color[row, c]
 
 
 def surfaces_of(mesh: Mesh, settings: WorldSettings) -> Surfaces:

@@ -40,6 +40,7 @@ from lidar.world.surfaces import (
     Surfaces,
     mask_bits,
     packed,
+    surfaces_at,
     surfaces_of,
 )
 from lidar.world.tile_selection import selected_tile
@@ -206,11 +207,7 @@ class World:
 
     def lookup(self, hits: Hits) -> Surfaces:
         """Surfaces that the rays hit."""
-        rows = hits.face + self._base[hits.instance]
-        found = self._surfaces.take(rows)
-        copied = np.flatnonzero(hits.instance >= 0)
-        found.feature[copied] = self._feature[hits.instance[copied]]
-        return found
+        return surfaces_at(self._surfaces, hits.face, hits.instance, start=self._base, named=self._feature)
 
     def shelter(self, position: Float) -> Shelter | None:
         """The air under roofs, bridges and in tunnels around a place; None if there is none.

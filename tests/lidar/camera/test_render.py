@@ -13,6 +13,7 @@ from geoscene.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.camera.edges import edge_pixels
 from lidar.camera.png import encode_png
 from lidar.camera.render import RenderOptions, exposure_times, optical_flow, render
+from lidar.camera.shade import straight_rays
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
@@ -547,3 +548,12 @@ def test_depth_and_labels_are_those_of_the_dry_world():
     )
     for name in ("depth", "klass", "feature"):
         assert np.array_equal(getattr(dry, name), getattr(wet, name))
+
+
+def test_rays_of_an_undistorted_pinhole_are_those_of_the_camera_model_to_the_last_bit():
+    camera = replace(CAMERA, width=41, height=23, fx=37.3, fy=36.1, cx=19.7, cy=11.2)
+    number = np.arange(camera.width * camera.height)
+    rays = np.empty((len(number), 3))
+    straight_rays(number, camera.width, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
+    expected = pixel_rays(camera)
+    np.testing.assert_array_equal(rays, expected / expected[:, 2:])
