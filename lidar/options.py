@@ -269,7 +269,7 @@ _EXAMPLES = {float: "0.5", Path: "map.net.xml"}
 _ROADS = ("dry", "by-weather", "wet", "snow", "ice")
 """What vehicles drive on."""
 
-_NOT_IN_RECIPE = ("relief", "stages", "weather", "attacks", "road", "workers", "scheduler")
+_NOT_IN_RECIPE = ("relief", "device", "stages", "weather", "attacks", "road", "workers", "scheduler")
 """Options that the recipe states otherwise, or on which no byte depends."""
 
 
@@ -366,6 +366,10 @@ class DriveOptions:
     smooth), plain (windows and doors in depth, kerbs, rough ground), full (also guessed small parts), or mesh
     (openings as triangles). By default what the scene holds; the scene of a map is built plain."""
 
+    device: str = ""
+    """What casts the rays, short for --set device: cpu, or, with the extra gpu, cuda or cuda:N (a CUDA
+    device) or warp-cpu (the kernels of CUDA on the CPU, to test them). The CPU by default."""
+
     stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or
     a TOML file with tables [[stage]]; repeat for more. lidar stages lists them."""
@@ -391,12 +395,13 @@ class DriveOptions:
     need the scene's and the output folder under the same paths. The bytes do not depend on it."""
 
     def __post_init__(self) -> None:
-        """Validate the options, and enter ``relief`` among the settings."""
-        if self.relief:
-            if any(name == "relief" for name, _ in self.settings):
-                raise InputError(f"`relief` {self.relief}: `settings` relief is given, too; give one of both")
-            object.__setattr__(self, "settings", (*self.settings, ("relief", self.relief)))
-            object.__setattr__(self, "relief", "")
+        """Validate the options, and enter ``relief`` and ``device`` among the settings."""
+        for short in ("relief", "device"):
+            if value := getattr(self, short):
+                if any(name == short for name, _ in self.settings):
+                    raise InputError(f"`{short}` {value}: `settings` {short} is given, too; give one of both")
+                object.__setattr__(self, "settings", (*self.settings, (short, value)))
+                object.__setattr__(self, short, "")
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
             raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
         if self.side not in ("", "left", "right"):

@@ -25,6 +25,7 @@ from lidar.dataset.recording import Recording
 from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory, blocks_of
+from lidar.gpu.device import check_device
 from lidar.options import DriveOptions
 from lidar.planning.flight import Flight
 from lidar.planning.road_conditions import vehicle_on
@@ -212,7 +213,9 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
 
     Raises InputError (also as RouteError, RigError) for what cannot be driven.
     """
-    check_relief(scene, options.contents().world)
+    settings = options.contents().world
+    check_relief(scene, settings)
+    check_device(settings.device)
     start = options.start or solar_start(scene)
     check_start(start, 0)
     rig = load_rig(options.rig)

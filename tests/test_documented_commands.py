@@ -34,7 +34,17 @@ from lidar.traffic.populate import TrafficOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
-ONLY_PARSED = {"--place", "--point", "--scheduler", "tiles", "--serve", "--open3d", "--poses", "--live"}
+ONLY_PARSED = {
+    "--place",
+    "--point",
+    "--scheduler",
+    "tiles",
+    "--serve",
+    "--open3d",
+    "--poses",
+    "--live",
+    "--device",
+}
 ONLY_PARSED |= {"evaluate", "detect", "image", "stereo", "fused"}  # they need estimates, or other sensors
 BOX = (24.9400, 60.1653, 24.9420, 60.1666)
 RIG = """

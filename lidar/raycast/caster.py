@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
+from lidar.gpu.device import CPU
+from lidar.gpu.device import device as warp_device
 from lidar.raycast.columns import Rays
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
@@ -46,6 +48,17 @@ def _uses_embree(backend: str) -> bool:
     return True
 
 
+def _scene(origin: Float, *, backend: str, device: str, dynamic: bool) -> Float64Scene:
+    """An empty scene of a backend, on a device."""
+    if device != CPU:
+        if backend not in ("auto", "float64"):
+            raise InputError(f"backend {backend!r} is of the CPU; `device` {device} needs auto or float64")
+        from lidar.raycast.warp_scene import WarpScene  # noqa: PLC0415
+
+        return WarpScene(origin, device=warp_device(device))
+    return EmbreeScene(origin, dynamic=dynamic) if _uses_embree(backend) else Float64Scene(origin)
+
+
 class Caster:
     """Casts rays at a mesh and at instances of other casters' meshes.
 
@@ -60,11 +73,14 @@ class Caster:
     dynamic         : whether `update` will exchange parts of the mesh
     backend         : ``embree``; ``float64``, the same hits without Embree, 10 to 50 times slower; or
                       ``auto``: Embree if it is available, else float64
+    device          : ``cpu``, or a device of NVIDIA Warp: ``cuda``, ``cuda:N`` or ``warp-cpu``. These return
+                      the hits of the backend float64; ``backend`` must be ``auto`` or ``float64`` then
 
     ``refiners`` replace hits on faces of the own mesh by hits on the surfaces behind them; every cast goes
     through them.
 
-    Raises InputError for an invalid mesh and BackendError if Embree is not available.
+    Raises InputError for an invalid mesh or a device that is not there, BackendError if Embree is not
+    available, and MissingExtraError if Warp is not.
     """
 
     refiners: Sequence[Refiner] = ()
@@ -79,12 +95,11 @@ class Caster:
         origin: ArrayLike | None = None,
         dynamic: bool = False,
         backend: str = "auto",
+        device: str = CPU,
     ) -> None:
         v, f = checked(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
-        self.scene: Float64Scene = (
-            EmbreeScene(self.origin, dynamic=dynamic) if _uses_embree(backend) else Float64Scene(self.origin)
-        )
+        self.scene = _scene(self.origin, backend=backend, device=device, dynamic=dynamic)
         self.instances: tuple[Instances, ...] = ()
         self.update(attach=dict(enumerate(split(v - self.origin, f, mask=mask))), instances=instances)
 

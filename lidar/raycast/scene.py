@@ -101,7 +101,7 @@ class Float64Scene:
         """The tables for the kernels, without those of Embree."""
         parts = [self.parts[number] for number in sorted(self.parts)]
         # Keep the columns alive while the kernels use their addresses.
-        self._own = parts, np.array([_row(part) for part in parts], np.int64).reshape(-1, PART)
+        self._own = parts, np.array([self._row(part) for part in parts], np.int64).reshape(-1, PART)
         kept = [self._own]
         roots = [part.tree.nodes[:1] for part in parts]
         bounds = np.concatenate([np.empty((0, 8), np.float32), *roots]).astype(np.float64)
@@ -139,11 +139,29 @@ class Float64Scene:
             transforms=np.concatenate(transforms),
             groups=np.array(
                 [
-                    (tree.nodes.ctypes.data, tree.order.ctypes.data, len(tree.order), start)
+                    (self.pointer(tree.nodes), self.pointer(tree.order), len(tree.order), start)
                     for tree, start in zip(trees, [-1, *starts[:-1]], strict=True)
                 ],
                 np.int64,
             ),
+        )
+
+    def pointer(self, column: NDArray[Any]) -> int:
+        """Address at which the kernels read a column of a geometry or a tree."""
+        return column.ctypes.data
+
+    def _row(self, part: Geometry) -> tuple[int, ...]:
+        """Row of `Target.parts`."""
+        return (
+            self.pointer(part.planes),
+            self.pointer(part.vertices),
+            self.pointer(part.faces),
+            self.pointer(part.numbers) if len(part.numbers) else 0,
+            part.first,
+            self.pointer(part.tree.nodes),
+            self.pointer(part.tree.order),
+            len(part),
+            part.mask,
         )
 
     def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:
@@ -158,18 +176,3 @@ class Float64Scene:
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
         """Whether each ray hits anything."""
         return self.cast(rays, normals=False, threads=threads).face >= 0
-
-
-def _row(part: Geometry) -> tuple[int, ...]:
-    """Row of `Target.parts`."""
-    return (
-        part.planes.ctypes.data,
-        part.vertices.ctypes.data,
-        part.faces.ctypes.data,
-        part.numbers.ctypes.data if len(part.numbers) else 0,
-        part.first,
-        part.tree.nodes.ctypes.data,
-        part.tree.order.ctypes.data,
-        len(part),
-        part.mask,
-    )

@@ -11,6 +11,7 @@ import numpy as np
 from geoscene.limits import Limit
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.gpu.device import CPU, name_fault
 
 if TYPE_CHECKING:
     from geoscene.scene import Scene
@@ -46,6 +47,7 @@ class WorldSettings:
                 only of a scene that has them; ``mesh``: openings of walls as triangles
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
+    device    : that casts the rays: ``cpu``, or ``cuda``, ``cuda:N`` or ``warp-cpu`` with the extra ``gpu``
     """
 
     origin: str = "near"
@@ -57,6 +59,7 @@ class WorldSettings:
     relief: str = "scene"
     wetness: float = 0.0
     snow: float = 0.0
+    device: str = CPU
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
@@ -67,6 +70,8 @@ class WorldSettings:
             faults.append(f"relief={self.relief}: known are {', '.join(RELIEFS)}")
         if not self.reach > 0:
             faults.append(f"reach={self.reach:g}: give metres above 0, or inf")
+        if fault := name_fault(self.device):
+            faults.append(fault)
         faults += [
             f"{name}={value:g}: give 0 to 1"
             for name, value in (("wetness", self.wetness), ("snow", self.snow))

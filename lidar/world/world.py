@@ -59,8 +59,9 @@ _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
 
-def _shape(mesh: Mesh, *, backend: str) -> Caster:
-    return Caster(mesh.vertices, mesh.faces, mask=mask_bits(mesh.material), backend=backend)
+def _shape(mesh: Mesh, *, backend: str, device: str) -> Caster:
+    bits = mask_bits(mesh.material)
+    return Caster(mesh.vertices, mesh.faces, mask=bits, backend=backend, device=device)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,10 @@ class _Tile:
     transform: Float
     feature: NDArray[np.int32]
     centre: Float
+
+
+def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Caster:
+    return Caster(origin=origin, dynamic=True, backend=backend, device=settings.device)
 
 
 class World:
@@ -114,14 +119,14 @@ class World:
         self.settings = settings
         self._backend = backend
         self.region: Region | None = None
-        self._shapes = tuple(_shape(mesh, backend=backend) for mesh in shapes)
-        self._actors = tuple(_shape(mesh, backend=backend) for mesh in actors)
+        self._shapes = tuple(_shape(mesh, backend=backend, device=settings.device) for mesh in shapes)
+        self._actors = tuple(_shape(mesh, backend=backend, device=settings.device) for mesh in actors)
         self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
         self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
         self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
-        self.caster = Caster(origin=np.zeros(3), dynamic=True, backend=backend)
+        self.caster = _empty_caster(np.zeros(3), backend=backend, settings=settings)
         self._walls = WallRefiner(NO_WALLS)
         self._rough = scene.relief != "off" and settings.relief != "off"
         self._concatenate_tables()
@@ -164,7 +169,8 @@ class World:
         origin = np.array([(xmin + xmax) / 2, (ymin + ymax) / 2, 0.0])
         origin = np.round(origin / _GRID) * _GRID if self.settings.origin == "near" else np.zeros(3)
         if not np.array_equal(origin, self.caster.origin):
-            self.caster, self._tiles = Caster(origin=origin, dynamic=True, backend=self._backend), {}
+            self.caster = _empty_caster(origin, backend=self._backend, settings=self.settings)
+            self._tiles = {}
         elif ranks == list(self._tiles):
             self.region = region
             return
