@@ -53,13 +53,7 @@ def displacements(vertices: Float, faces: NDArray[np.int32], planes: Float) -> F
     lacking = ~border & (flattest <= _PLANE)
     out = _SIDEWAYS * _sideways(vertices, faces, mean) + np.where(lacking[:, None], mean, 0.0)
     out[border] = _BORDER
-    rows = np.flatnonzero(lacking[faces].any(axis=1))
-    for _ in range(_ROUNDS):
-        if not len(rows):
-            break
-        still = np.zeros(n, np.bool_)
-        _correct(out, faces, planes, rows, lacking, still)
-        rows, lacking = rows[still[faces[rows]].any(axis=1)], still
+    _correct(out, faces, planes, lacking)
     length = np.sqrt((out * out).sum(axis=1))
     far = length > _LONGEST
     out[far] *= (_LONGEST / length[far])[:, None]
@@ -158,24 +152,32 @@ def _clear(
 
 
 @njit(nogil=True, cache=True)
-def _correct(
-    out: Float,
-    faces: NDArray[np.int32],
-    planes: Float,
-    rows: NDArray[np.int64],
-    lacking: NDArray[np.bool_],
-    still: NDArray[np.bool_],
-) -> None:
-    """Move the lacking vertices along the normals of the faces in ``rows``; mark those that lacked much."""
-    for f in rows:
-        for k in range(3):
-            v = faces[f, k]
-            short = 1.0 - _along(out, v, planes, f)
-            if lacking[v] and short > 0.0:
-                if planes[f, 0] != 0.0 or planes[f, 1] != 0.0 or planes[f, 2] != 0.0:
-                    still[v] |= short > _SHORT
-                for c in range(3):
-                    out[v, c] += short * planes[f, c]
+def _correct(out: Float, faces: NDArray[np.int32], planes: Float, lacking: NDArray[np.bool_]) -> None:
+    """Move the lacking vertices along the normals of their faces, in rounds, until none lacks much.
+
+    lacking : (n,), overwritten
+    """
+    rows, count, still = np.arange(len(faces)), len(faces), lacking.copy()
+    for _ in range(_ROUNDS):
+        kept = 0
+        for f in rows[:count]:
+            if lacking[faces[f, 0]] or lacking[faces[f, 1]] or lacking[faces[f, 2]]:
+                rows[kept] = f
+                kept += 1
+        count = kept
+        if count == 0:
+            break
+        still[:] = False
+        for f in rows[:count]:
+            for k in range(3):
+                v = faces[f, k]
+                short = 1.0 - _along(out, v, planes, f)
+                if lacking[v] and short > 0.0:
+                    if planes[f, 0] != 0.0 or planes[f, 1] != 0.0 or planes[f, 2] != 0.0:
+                        still[v] |= short > _SHORT
+                    for c in range(3):
+                        out[v, c] += short * planes[f, c]
+        lacking, still = still, lacking
 
 
 @njit(nogil=True, cache=True)
