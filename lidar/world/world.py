@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,11 +60,6 @@ _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
 
-def _shape(mesh: Mesh, *, backend: str, device: str) -> Caster:
-    bits = mask_bits(mesh.material)
-    return Caster(mesh.vertices, mesh.faces, mask=bits, backend=backend, device=device)
-
-
 @dataclass(frozen=True, slots=True)
 class _Tile:
     """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
@@ -86,6 +82,45 @@ class _Tile:
 
 def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Caster:
     return Caster(origin=origin, dynamic=True, backend=backend, device=settings.device)
+
+
+class _Placed(NamedTuple):
+    """Instances, and the number (k,) of each one's shape among all shapes, and its feature (k,)."""
+
+    instances: Instances
+    shape: NDArray[np.int32]
+    feature: NDArray[np.int32]
+
+
+class _Shapes:
+    """Shapes that get a caster when they are first placed: of most, no copy is near."""
+
+    def __init__(self, meshes: Sequence[Mesh], backend: str, *, device: str) -> None:
+        self.meshes, self._backend, self._device = meshes, backend, device
+        self._casters: dict[int, Caster] = {}
+
+    def _caster(self, number: int) -> Caster:
+        if number not in self._casters:
+            mesh = self.meshes[number]
+            self._casters[number] = Caster(
+                mesh.vertices,
+                mesh.faces,
+                mask=mask_bits(mesh.material),
+                backend=self._backend,
+                device=self._device,
+            )
+        return self._casters[number]
+
+    def placed(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> _Placed:
+        """Copies (k,) of shapes by number.
+
+        Raises InputError for a number beyond the shapes.
+        """
+        if len(shape) and not 0 <= shape.min() <= shape.max() < len(self.meshes):
+            raise InputError(f"an instance has a shape number beyond the {len(self.meshes)} shapes")
+        used, own = np.unique(shape, return_inverse=True)
+        casters = tuple(self._caster(number) for number in used.tolist())
+        return _Placed(Instances(casters, own.astype(np.int32), transform), shape, feature)
 
 
 class World:
@@ -119,11 +154,13 @@ class World:
         self.settings = settings
         self._backend = backend
         self.region: Region | None = None
-        self._shapes = tuple(_shape(mesh, backend=backend, device=settings.device) for mesh in shapes)
-        self._actors = tuple(_shape(mesh, backend=backend, device=settings.device) for mesh in actors)
+        self._shapes, self._actors = (
+            _Shapes(meshes, backend, device=settings.device) for meshes in (shapes, actors)
+        )
         self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
         self._tiles: dict[int, _Tile] = {}
-        self._moving: tuple[Instances, NDArray[np.int32]] = _no_instances(self._actors)
+        none = np.empty(0, np.int32)
+        self._moving = self._actors.placed(none, np.empty((0, 3, 4)), feature=none)
         self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = _empty_caster(np.zeros(3), backend=backend, settings=settings)
@@ -182,13 +219,13 @@ class World:
             detach=[number for rank in old.keys() - kept for number in old[rank].parts],
             attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
             first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
-            instances=[self._still, self._moving[0]],
+            instances=self._instances,
         )
         self.caster.refiners = self._refiners()
         if self.settings.wetness or self.settings.snow:
-            self.caster.update(instances=[self._still])
+            self.caster.update(instances=[self._still.instances])
             self._shelter()
-            self.caster.update(instances=[self._still, self._moving[0]])
+            self.caster.update(instances=self._instances)
 
     def place_actors(
         self,
@@ -207,9 +244,9 @@ class World:
         span_ns   : times that the ray times 0 and 1 stand for
         """
         self.span_ns = span_ns
-        self._moving = Instances(self._actors, np.asarray(shape, np.int32), transform), feature
+        self._moving = self._actors.placed(np.asarray(shape, np.int32), transform, feature=feature)
         self._index_instances()
-        self.caster.update(instances=[self._still, self._moving[0]])
+        self.caster.update(instances=self._instances)
 
     def lookup(self, hits: Hits) -> Surfaces:
         """Surfaces that the rays hit."""
@@ -315,7 +352,7 @@ class World:
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
         self._still = self._static()
-        self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes)])
+        self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes.meshes)])
         self._index_instances()
 
     def _shelter(self) -> None:
@@ -344,26 +381,27 @@ class World:
 
     def _index_instances(self) -> None:
         """Set the first rows and feature numbers of all instances."""
-        moving, feature = self._moving
-        self._base = np.concatenate([self._of_shape[self._still.shape], self._of_actor[moving.shape], [0]])
-        named = [np.asarray(rows, np.int32) for rows in (*(t.feature for t in self._tiles.values()), feature)]
-        self._feature = np.concatenate(named)
+        still, moving = self._still, self._moving
+        self._base = np.concatenate([self._of_shape[still.shape], self._of_actor[moving.shape], [0]])
+        self._feature = np.concatenate([still.feature, np.asarray(moving.feature, np.int32)])
         low, high = self._bounds
         if len(self._feature):
             low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
         leaves = np.array([0.0, *self._leaves.values()])
         self._faces = Faces(self._base, self._feature, self._packed, low, high, leaves)
 
-    def _static(self) -> Instances:
+    def _static(self) -> _Placed:
         tiles = self._tiles.values()
         shape = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in tiles)])
         transform = np.concatenate([np.empty((0, 3, 4)), *(tile.transform for tile in tiles)])
-        return Instances(self._shapes, shape, transform)
+        feature = [np.asarray(tile.feature, np.int32) for tile in tiles]
+        return self._shapes.placed(
+            shape, transform, feature=np.concatenate([np.empty(0, np.int32), *feature])
+        )
 
-
-def _no_instances(shapes: tuple[Caster, ...]) -> tuple[Instances, NDArray[np.int32]]:
-    none = np.empty(0, np.int32)
-    return Instances(shapes, none, np.empty((0, 3, 4))), none
+    @property
+    def _instances(self) -> list[Instances]:
+        return [self._still.instances, self._moving.instances]
 
 
 def _tiles_intersecting(scene: Scene, region: Region, *, margin: float) -> list[int]:
