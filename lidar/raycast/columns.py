@@ -19,8 +19,8 @@ PRECISIONS = ("exact", "refined", "float32")
 EXACT, REFINED, FLOAT32 = range(len(PRECISIONS))
 """Indices of `PRECISIONS`."""
 
-CHUNK = 8192
-"""Rays per unit of work of a thread; a multiple of all packet widths, so that packets never change."""
+CHUNK = 2048
+"""Threads share rays in multiples of this number, which is one of all packet widths: packets never change."""
 
 
 class Target(NamedTuple):

@@ -6,6 +6,7 @@ import functools
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -193,8 +194,17 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
+def _parts(n: int, threads: int) -> list[tuple[int, int]]:
+    """Bounds of parts of n rays, in whole chunks: large ones first, as calls cost time, then smaller ones."""
+    bounds = [0]
+    while bounds[-1] < n:
+        left = n - bounds[-1]
+        bounds.append(min(n, bounds[-1] + CHUNK * max(1, left // (2 * threads * CHUNK))))
+    return list(pairwise(bounds))
+
+
 def share(work: Callable[[int, int], int], rays: Rays, *, threads: int) -> None:
-    """Call ``work`` for chunks of the order of rays in threads; it returns an invalid ray, or -1.
+    """Call ``work`` for parts of the order of rays in threads; it returns an invalid ray, or -1.
 
     Raises InputError for an invalid ray.
     """
@@ -202,7 +212,12 @@ def share(work: Callable[[int, int], int], rays: Rays, *, threads: int) -> None:
     if threads <= 1 or n <= CHUNK:
         bad = work(0, n)
     else:
-        chunks = range(0, n, CHUNK)
-        bad = max(_pool(threads).map(lambda lo: work(lo, min(lo + CHUNK, n)), chunks))
+        parts = iter(_parts(n, threads))  # of which each thread takes the next
+
+        def some() -> int:
+            return max((work(lo, hi) for lo, hi in parts), default=-1)
+
+        helpers = [_pool(threads - 1).submit(some) for _ in range(threads - 1)]
+        bad = max(some(), *(-1 if helper.cancel() else helper.result() for helper in helpers))
     if bad >= 0:
         raise _refusal(rays, bad)
