@@ -25,8 +25,12 @@ class Columns:
 
     def take(self, rows: ArrayLike | slice) -> Self:
         """The chosen rows, in the given order; those of a slice are views."""
-        index = rows if isinstance(rows, slice) else np.asarray(rows)
-        return replace(self, **{name: column[index] for name, column in self.columns().items()})
+        if isinstance(rows, slice):
+            return replace(self, **{name: column[rows] for name, column in self.columns().items()})
+        index = np.asarray(rows)
+        if index.dtype == np.bool_:  # a mask is searched once, not for each column
+            index = np.flatnonzero(index)
+        return replace(self, **{name: column.take(index, axis=0) for name, column in self.columns().items()})
 
     def where(self, keep: NDArray[np.bool_]) -> Self:
         """The rows at which a mask is true; the same object if that is all."""

@@ -275,12 +275,21 @@ def _mix(columns: Any, pulses: Any, separation: Any, bearer: Any, place: Any, po
 
 def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Number of each echo in its pulse, from 1, and echoes of the pulse; rows sorted by pulse and range."""
-    if not len(echoes):
-        return np.empty(0, np.uint8), np.empty(0, np.uint8)
-    starts = np.flatnonzero(np.diff(echoes.pulse, prepend=-1))
-    size = np.diff(starts, append=len(echoes))
-    number = np.arange(len(echoes)) - np.repeat(starts, size) + 1
-    return number.astype(np.uint8), np.repeat(size, size).astype(np.uint8)
+    number, count = np.empty(len(echoes), np.uint8), np.empty(len(echoes), np.uint8)
+    _number(echoes.pulse, number, count)
+    return number, count
+
+
+@njit(cache=True, nogil=True)
+def _number(pulse: Any, number: Any, count: Any) -> None:
+    """Fill ``number`` and ``count``, see `numbered`."""
+    start = 0
+    for i in range(len(pulse)):
+        if i and pulse[i] != pulse[i - 1]:
+            start = i
+        number[i] = i - start + 1
+        for k in range(start, i + 1) if i + 1 == len(pulse) or pulse[i + 1] != pulse[i] else range(0):
+            count[k] = i - start + 1
 
 
 def reported(

@@ -88,7 +88,13 @@ class Spinning:
         pulses = Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
         start, stop = frame_window_ns(frame, rate_hz, start_ns=start_ns)
         during = (time >= start) & (time < stop)
-        return pulses if during.all() else _chosen(pulses, during)
+        if during.all():
+            return pulses
+        first, last = np.flatnonzero(during)[[0, -1]].tolist() if during.any() else (0, -1)
+        if not during[first : last + 1].all():
+            return _chosen(pulses, during)
+        among = _order_among(self, len(block), first=first, stop=last + 1)
+        return replace(pulses.take(slice(first, last + 1)), order=among)
 
 
 @functools.lru_cache(maxsize=64)
@@ -106,6 +112,13 @@ def _labels(
         frozen(number[:, np.argsort(rank)].T.ravel()),
         frozen(np.tile(np.stack([0 * pattern.up, 0 * pattern.up, pattern.up], axis=1), (count, 1))),
     )
+
+
+@functools.lru_cache(maxsize=64)
+def _order_among(pattern: Spinning, count: int, *, first: int, stop: int) -> NDArray[np.int32]:
+    """Ring-major order of the pulses ``first`` to ``stop`` of ``count`` blocks, among themselves."""
+    order = _labels(pattern, count)[3]
+    return frozen(order[(order >= first) & (order < stop)] - np.int32(first))
 
 
 def _chosen(pulses: Firings, chosen: NDArray[np.bool_]) -> Firings:
