@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import ALL, Caster, Instances, caster, library
+from lidar.raycast.columns import CHUNK
 from lidar.raycast.geometry import planes
 from lidar.raycast.hull import displacements
+from lidar.raycast.rays import free_rays, share
 
 FAR_AWAY = st.sampled_from([(0.0, 0.0, 0.0), (500_000.37, 4_080_000.61, 0.0), (-3e6, 9.9e6, 2500.25)])
 BACKENDS = pytest.mark.parametrize("backend", ["embree", "float64"])
@@ -337,6 +339,22 @@ def test_hits_do_not_depend_on_the_number_of_threads():
     )
     shuffled = cast.cast([0, 0, 0], way, order=order, threads=2)
     np.testing.assert_allclose(shuffled.range, cast.cast([0, 0, 0], way).range, atol=1e-6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(CHUNK + 1, 50 * CHUNK), st.integers(2, 8))
+def test_threads_share_rays_in_whole_packets_and_each_ray_once(n, threads):
+    rays = free_rays([0, 0, 0], np.broadcast_to([0.0, 0.0, 1.0], (n, 3)))
+    parts = []
+
+    def work(lo, hi):
+        parts.append((lo, hi))
+        return -1
+
+    share(work, rays, threads=threads)
+    starts, stops = zip(*sorted(parts), strict=True)
+    assert (0, *stops) == (*starts, n)
+    assert not any(start % CHUNK for start in starts)
 
 
 def test_coherent_packets_and_single_rays_agree():

@@ -208,6 +208,26 @@ def test_rays_intersect_actors_at_their_pose_at_the_ray_time(scene):
     np.testing.assert_array_equal(world.caster.cast([150.0, 50, 1], [[-1.0, 0, 0]] * 5).range, before.range)
 
 
+def test_only_bodies_that_are_placed_are_prepared_for_rays(scene):
+    bodies = [box([4, 2, height], [0, 0, height / 2], klass=Class.CAR) for height in (1.0, 2.0, 3.0)]
+    world = World.load(scene, actors=bodies)
+    assert world.caster.instances[1].shapes == ()
+    here = np.tile(np.eye(3, 4), (2, 1, 1))
+    here[:, :, 3] = [[150, 50, 0], [170, 50, 0]]
+    world.place_actors(np.array([2, 0], np.int32), here, feature=np.array([8, 9], np.int32))
+    assert len(world.caster.instances[1].shapes) == 2
+    hits = world.caster.cast([[150.0, 50, 10], [170, 50, 10]], np.repeat(DOWN, 2, axis=0))
+    np.testing.assert_allclose(hits.range, [7, 9])
+    assert world.lookup(hits).feature.tolist() == [8, 9]
+
+
+@pytest.mark.parametrize("number", [-1, 1])
+def test_a_body_that_the_world_does_not_have_is_refused(scene, number):
+    world = World.load(scene, actors=[box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR)])
+    with pytest.raises(InputError, match="beyond the 1 shapes"):
+        world.place_actors(np.array([number], np.int32), np.eye(3, 4)[None], feature=np.array([9], np.int32))
+
+
 def test_actors_stay_when_another_region_is_loaded(scene):
     car = box([4, 2, 1.5], [0, 0, 0.75], klass=Class.CAR)
     world = World.load(scene, region=(50, 50, 50, 50), margin=10, actors=[car])
