@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.errors import need
+from geoscene.errors import SceneFormatError, need
 from geoscene.scene import Scene, open_scene
 from lidar import DriveOptions, drive
 from lidar.camera.render import RenderOptions, render
@@ -136,6 +136,15 @@ def sensors(worlds: dict[str, World], options: DriveOptions, scene: Scene) -> No
         print(f"\n{title}: " + ", ".join(f"{name} {1 / taken[name]:.2f}/s" for name in worlds))
 
 
+def has_colors(scene: Scene) -> bool:
+    """Whether cameras can record a scene."""
+    try:
+        scene.require("colors")
+    except SceneFormatError:
+        return False
+    return True
+
+
 def main() -> None:
     """Measure the devices of this machine."""
     parser = argparse.ArgumentParser(
@@ -145,8 +154,8 @@ def main() -> None:
     parser.add_argument("--drive", type=float, default=2.0, help="seconds of the whole drives")
     parser.add_argument("--devices", nargs="*", help="of Warp; by default warp-cpu and all CUDA devices")
     given = parser.parse_args()
+    device(WARP_CPU)  # which prepares Warp
     wp = need("warp", "gpu")
-    wp.init()
     names = given.devices or [WARP_CPU, *(f"cuda:{k}" for k in range(wp.get_cuda_device_count()))]
     print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, Warp {wp.config.version}")
     for name in names:
@@ -165,9 +174,11 @@ def main() -> None:
         print(f"  {name}: {time.perf_counter() - began:.1f} s to load the world and the kernels")
     casting(worlds, World.load(scene, region=region, margin=MARGIN, backend="float64"), eye)
     sensors(worlds, options, scene)
-    for rig, formats in (("vlp16", ("pcd",)), ("kitti", ("pcd",))):
+    for rig in ("vlp16", "kitti") if has_colors(scene) else ("vlp16",):
         for name in worlds:
-            chosen = DriveOptions(route="random", duration=given.drive, rig=rig, formats=formats, device=name)
+            chosen = DriveOptions(
+                route="random", duration=given.drive, rig=rig, formats=("pcd",), device=name
+            )
             with tempfile.TemporaryDirectory() as out:
                 began = time.perf_counter()
                 drive(scene, Path(out) / "drive", options=chosen)
