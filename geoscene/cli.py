@@ -135,7 +135,6 @@ def build(
         Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers build the tiles instead;
         they need the output folder under the same path.
     """
-    from geoscene.clouds.survey import with_clouds  # noqa: PLC0415
     from geoscene.cluster import connected  # noqa: PLC0415
     from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
@@ -160,9 +159,12 @@ def build(
         data = _read_map(source)
         options = _with_elevation(source, data, options=options, progress=progress)
         many = workers or os.cpu_count() or 1
-        data, options = with_clouds(
-            data, options, cloud=clouds, cache_dir=_cache_of(source), workers=many, progress=progress
-        )
+        if clouds.cloud:
+            from geoscene.clouds.survey import with_clouds  # noqa: PLC0415
+
+            data, options = with_clouds(
+                data, options, cloud=clouds, cache_dir=_cache_of(source), workers=many, progress=progress
+            )
         scene = build_scene(
             data,
             folder,

@@ -7,12 +7,15 @@ footprints and solids stay as mapped, and a ray that hits a wall decides there w
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.columns import Columns
 from geoscene.typing import Float
+
+T = TypeVar("T", bound=np.generic)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +109,25 @@ class WallRelief:
     cells: NDArray[np.int32]
     openings: Openings
     wall: NDArray[np.int32]
+
+    @classmethod
+    def empty(cls) -> WallRelief:
+        """The relief of a mesh without faces."""
+
+        def none(kind: type[T], *width: int) -> NDArray[T]:
+            return np.empty((0, *width), kind)
+
+        real, count, code = np.float64, np.int32, np.uint8
+        facades = Facades(
+            none(count), none(real, 3), none(real, 2), none(real, 2), none(real, 2), none(real, 2),
+            none(real), none(count, 2), none(count),
+        )  # fmt: skip
+        openings = Openings(
+            none(real, 4), none(real, 4), none(real, 4), none(real), none(real), none(real), none(real),
+            none(count, 2), none(real), none(real), none(code), none(code), none(code), none(code, 3),
+            none(code, 3), none(code, 3), none(code, 3), none(np.bool_),
+        )  # fmt: skip
+        return cls(facades, none(count), openings, none(count))
 
     def placed(self, offset: Float, *, faces: int) -> WallRelief:
         """The relief moved by ``offset`` (3,), of a mesh of ``faces`` faces that begins with its own."""

@@ -58,6 +58,8 @@ def wall_relief(
     height : z of the ground at x, y; None if it is 0 everywhere
     guess  : also parts that stand out of walls and are not mapped
     """
+    if not len(mesh):
+        return Layout(WallRelief.empty(), Attached(mesh, np.empty(0, np.bool_), {}), {})
     walls, of_face = find_walls(mesh)
     simple = np.array([o is not None for o in outlines(mesh, of_face, count=len(walls))], np.bool_)
     at = Elevations.of(walls, setting, mesh=mesh, of_face=of_face, usable=simple, base=base, height=height)

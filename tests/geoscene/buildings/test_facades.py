@@ -1,6 +1,6 @@
 """Openings of walls follow tags and types, lie within their walls, and face free space."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -446,3 +446,21 @@ def test_of_what_stands_out_of_facades_mapped_balconies_alone_are_not_guessed():
     assert not mapped.guessed.any()
     left = parts.mesh.take(~parts.guessed)
     np.testing.assert_array_equal(left.vertices[left.faces], mapped.mesh.vertices[mapped.mesh.faces])
+
+
+def test_a_mesh_without_faces_has_the_columns_of_a_building_without_openings():
+    shed = house(1, shapely.box(0, 0, 2, 2), building="garage", height="1")
+    table, mesh, layout = facades_of(shed)
+    assert not len(layout.relief.facades)
+    osm = OsmData((8.6, 49.3, 8.8, 49.5), [], [shed], [], [])
+    setting = read_setting(osm, FRAME, buildings=table, streets=np.array([], object))
+    empty = wall_relief(mesh.take(np.arange(0)), setting, base=np.zeros(table.count), height=None)
+    for group in ("facades", "openings"):
+        ours, theirs = getattr(empty.relief, group), getattr(layout.relief, group)
+        for field in fields(ours):
+            one, other = getattr(ours, field.name), getattr(theirs, field.name)
+            assert (one.dtype, one.shape) == (other.dtype, other.shape), field.name
+    assert empty.relief.cells.dtype == layout.relief.cells.dtype
+    assert empty.relief.wall.dtype == layout.relief.wall.dtype
+    assert not len(empty.parts.mesh)
+    assert not any(empty.counts.values())
