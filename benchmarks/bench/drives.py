@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import TypedDict
 
 import numpy as np
@@ -51,6 +52,14 @@ def driving(setup: Setup) -> Iterator[Case]:
             note="in memory, one thread; rays alone: the same world, without beams, columns, light and noise",
             **shared,
         )
+        if camera:
+            yield Case(
+                "driving",
+                f"{rig} in memory, depth and labels, {setup.town}, {seconds:g} s",
+                sides=_image_sides(plan, images=("depth", "semantic", "instance")),
+                note="in memory, one thread, without colour; rays alone: the same world, without labels",
+                **shared,
+            )
         yield Case(
             "driving",
             f"{rig} to files, {setup.town}, {seconds:g} s",
@@ -108,13 +117,15 @@ def _posed(plan: DrivePlan, scanner: Scanner, fired: Firings) -> tuple[Poses, In
     return plan.trajectory.at(times).mounted(mount.translation, mount.rotation), index, fired
 
 
-def _image_sides(plan: DrivePlan) -> dict[str, Work]:
+def _image_sides(plan: DrivePlan, *, images: tuple[str, ...] = ()) -> dict[str, Work]:
+    """Images of the kinds that the rig asks for, or of others, and their rays alone."""
     world, (camera,) = world_of(plan), plan.sensors
     spec, contents = camera.spec, plan.options.contents()
+    spec = replace(spec, images=images or spec.images)
     x, y = plan.trajectory.position[0, :2].tolist()
     sun = sun_direction(plan.scene.frame, plan.start, at=(x, y))
 
-    def images() -> None:
+    def rendered() -> None:
         for frame in range(plan.frames[camera.name]):
             times = exposure_times(spec, camera.frame_start_ns(frame), samples=contents.camera.moments(spec))
             render(
@@ -138,4 +149,4 @@ def _image_sides(plan: DrivePlan) -> dict[str, Work]:
             pose = pose.mounted(spec.mount.translation, spec.mount.rotation)
             world.caster.cast_posed(pose, index, directions=way, far=camera.max_range)
 
-    return {"lidar": images, "rays alone": casts}
+    return {"lidar": rendered, "rays alone": casts}

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,14 +66,14 @@ def colors(
     material: NDArray[np.uint8],
     feature: NDArray[np.int32],
     color: NDArray[np.uint8],
-    place: Float,
+    place: Callable[[NDArray[np.intp]], Float],
     width: Float,
 ) -> NDArray[np.uint8]:
     """SRGB (n, 3) of hits on instances, by what is drawn on them.
 
     instance, face : (n,) of the hits
     klass, material, feature, color : of their surfaces, see `lidar.world.surfaces.Surfaces`
-    place : (n, 3) of the hits in the instances' own frames
+    place : returns the places (k, 3) of some of these hits, by row, in the instances' own frames
     width : (n,) metres that a pixel is wide at the hit
     """
     out = color.copy()
@@ -82,12 +82,13 @@ def colors(
     plated = (material == _SHEET) & np.isin(klass, _PLATED) & (color == WHITE).all(axis=1)
     rows = np.flatnonzero(plated)
     if len(rows):
-        centre, across = _plate_axes(world, instance[rows], face=face[rows], place=place[rows])
+        spot = place(rows)
+        centre, across = _plate_axes(world, instance[rows], face=face[rows], place=spot)
         for number in np.unique(feature[rows]).tolist():
             own = np.flatnonzero(feature[rows] == number)
             out[rows[own]] = sampled(
                 plate_levels(number),
-                np.column_stack([across[own], place[rows[own], 2] - centre[own]]),
+                np.column_stack([across[own], spot[own, 2] - centre[own]]),
                 width=width[rows[own]],
                 side=PLATE[0],
             )
@@ -100,7 +101,7 @@ def _draw_signs(
     *,
     material: NDArray[np.uint8],
     feature: NDArray[np.int32],
-    place: Float,
+    place: Callable[[NDArray[np.intp]], Float],
     width: Float,
     out: NDArray[np.uint8],
 ) -> None:
@@ -110,11 +111,11 @@ def _draw_signs(
         faces = _faces(world)
         for number in np.unique(feature[signs]).tolist():
             own = signs[feature[signs] == number]
-            where = place[own, 1:] - [0.0, SIGN_HEIGHT]
+            where = place(own)[:, 1:] - [0.0, SIGN_HEIGHT]
             out[own] = sampled(face_levels(faces.get(number, "plain")), where, width=width[own], side=SIDE)
     signals = np.flatnonzero((klass == _SIGNAL) & (material == _GLASS))
     if len(signals):
-        where = place[signals, 1:] - [0.0, LENSES]
+        where = place(signals)[:, 1:] - [0.0, LENSES]
         out[signals] = sampled(face_levels("signal"), where, width=width[signals], side=SIDE)
 
 

@@ -98,7 +98,7 @@ class Street:
             material=self.mesh.material[row],
             feature=np.full(count, feature, np.int32),
             color=self.mesh.color[row],
-            place=place,
+            place=lambda rows: place[rows],
             width=np.full(count, 0.001),
         ), row
 
