@@ -1,9 +1,14 @@
-"""Build sdist and wheel, and run both programs from a new environment of the wheel and what it declares.
+"""Build sdist and wheels, and run both programs from a new environment of a wheel and what it declares.
 
-python tests/wheel.py    needs the packages of requirements.lock; writes sdist and wheel to dist/
+python tests/wheel.py [LEVEL...]
+
+Needs the packages of requirements.lock. Writes to dist/ the sdist, the wheel for any platform and, on x86-64,
+a wheel with machine code for the levels, by default that of this processor.
 """
 
+import importlib
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -11,7 +16,7 @@ import sys
 import tarfile
 import tempfile
 import venv
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import requires
 from pathlib import Path
 from zipfile import ZipFile
@@ -20,30 +25,96 @@ from packaging.metadata import Metadata
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from geoscene import compiled
+
 ROOT = Path(__file__).resolve().parents[1]
-BACKEND = "import setuptools.build_meta as b; print(b.build_{kind}({folder!r}))"
+BACKEND = "import setuptools.build_meta as b; print(b.build_{kind}({folder!r}, {settings!r}))"
+PLATFORM = "manylinux_2_28_x86_64"
+"""As of the wheels of llvmlite, which links the machine code."""
+
+DRIVE = ("lidar", "drive", "scene", "--duration=0.1", "--quiet")
+ROAD = (*DRIVE, "--route=random")
+BOX = "--bbox=24.940,60.168,24.944,60.171"
+USES = (
+    ("geoscene", "build", "--demo", BOX, "--relief=full", "-o=scene", "--quiet"),
+    ("geoscene", "export", "scene", "-o=surface.tif"),
+    (*ROAD, "--traffic=on", "--format=csv,laz,pcd-compressed", "--deskew=middle", "-o=town"),
+    (*ROAD, "--weather=rain=10mm/h", "--road=by-weather", "-o=rain"),
+    (*ROAD, "--rig=vlp16", "--fidelity=survey", "--weather=fog=80m", "-o=fog"),
+    (*DRIVE, "--rig=drone", "--survey=all", "--altitude=80", "--turns", "--weather=snow=2mm/h", "-o=snow"),
+    ("lidar", "map", "town", "-o=map.laz", "--quiet"),
+    ("lidar", "map", "town", "-o=map.copc.laz", "--quiet"),
+)
+"""Commands that between them call the compiled functions as users do."""
 
 
-def run(*words: str | Path, cwd: Path) -> None:
+def run(*words: str | Path, cwd: Path, settings: Mapping[str, str] | None = None) -> None:
     """Run a command that must succeed, without the repository on the module path."""
     print("$", *words, flush=True)  # noqa: T201
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    subprocess.run([str(word) for word in words], cwd=cwd, env=clean, check=True)
+    subprocess.run([str(word) for word in words], cwd=cwd, env=clean | dict(settings or {}), check=True)
 
 
-def build_packages(folder: Path) -> Path:
-    """Write the sdist and the wheel built from it to dist/; returns the path of the wheel."""
+def compile_functions(level: str) -> None:
+    """Compile for a level of x86-64 what users call; the code is kept beside the sources."""
+    settings = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "PYTHONPATH": str(ROOT)}
+    with tempfile.TemporaryDirectory() as folder:
+        for program, *words in USES:
+            run(sys.executable, "-m", program, *words, cwd=Path(folder), settings=settings)
+
+
+def fitting_code() -> Iterator[Path]:
+    """Files of machine code beside the sources of this repository that fit the sources as they are."""
+    for index in sorted(
+        file for package in ("geoscene", "lidar") for file in (ROOT / package).rglob("*.nbi")
+    ):
+        source = index.parent.with_name(f"{index.name.split('.')[0]}.py")
+        if not source.exists():
+            continue
+        with index.open("rb") as file:
+            pickle.load(file)  # noqa: S301  (the version of numba; this process's own files)
+            stamp, overloads = pickle.loads(file.read())  # noqa: S301
+        module = importlib.import_module(".".join(source.relative_to(ROOT).with_suffix("").parts))
+        if stamp == compiled.digest(module):
+            yield index
+            yield from (index.with_name(name) for name in sorted(set(overloads.values())))
+
+
+def build_compiled(source: Path, dist: Path) -> Path:
+    """Write a wheel with the machine code that lies beside the sources of this repository."""
+    project = source / "pyproject.toml"
+    text = project.read_text("utf-8")
+    project.write_text(text.replace('"py.typed"', '"py.typed", "**/__pycache__/*.nb[ic]"'), "utf-8")
+    for file in fitting_code():
+        there = source / file.relative_to(ROOT)
+        there.parent.mkdir(exist_ok=True)
+        shutil.copyfile(file, there)
+    tag = f"cp{sys.version_info.major}{sys.version_info.minor}"
+    return build("wheel", dist, cwd=source, options=[f"--plat-name={PLATFORM}", f"--python-tag={tag}"])
+
+
+def build(kind: str, dist: Path, *, cwd: Path, options: Sequence[str] = ()) -> Path:
+    """Write an sdist or a wheel; returns its path."""
+    settings = {"--build-option": list(options)} if options else {}
+    before = set(dist.iterdir())
+    run(sys.executable, "-c", BACKEND.format(kind=kind, folder=str(dist), settings=settings), cwd=cwd)
+    (made,) = set(dist.iterdir()) - before
+    return made
+
+
+def build_packages(folder: Path, levels: Sequence[str]) -> Path:
+    """Write the sdist and the wheels built from it to dist/; returns the path of the last."""
     dist = ROOT / "dist"
     shutil.rmtree(dist, ignore_errors=True)
     dist.mkdir()
-    run(sys.executable, "-c", BACKEND.format(kind="sdist", folder=str(dist)), cwd=ROOT)
-    (sdist,) = dist.glob("*.tar.gz")
+    sdist = build("sdist", dist, cwd=ROOT)
     with tarfile.open(sdist) as archive:
         archive.extractall(folder, filter="data")
     (unpacked,) = folder.iterdir()
-    run(sys.executable, "-c", BACKEND.format(kind="wheel", folder=str(dist)), cwd=unpacked)
-    (wheel,) = dist.glob("*.whl")
-    return wheel
+    wheel = build("wheel", dist, cwd=unpacked)
+    for level in levels:
+        compile_functions(level)
+    return build_compiled(unpacked, dist) if levels else wheel
 
 
 def declared(wheel: Path) -> Iterable[Requirement]:
@@ -78,19 +149,23 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         source, away = Path(temporary) / "source", Path(temporary) / "away"
         source.mkdir()
-        wheel = build_packages(source)
+        levels = sys.argv[1:] or list(filter(None, [compiled.level()]))
+        wheel = build_packages(source, levels)
         venv.create(away / "venv", with_pip=True)
         binaries = away / "venv" / "bin"
         pip = (binaries / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
         write_lock(away / "needed.lock", names=needed(declared(wheel)))
         run(*pip, "--require-hashes", "-r", "needed.lock", cwd=away)
         run(*pip, "--no-index", wheel, cwd=away)
+        brought = set(away.rglob("*.nbc"))
         run(binaries / "geoscene", "build", "--demo", "-o", "scene", "-q", cwd=away)
         run(binaries / "geoscene", "validate", "scene", cwd=away)
         words = ("scene", "--route=random", "--duration=1", "-o", "drive", "-q")
         run(binaries / "lidar", "drive", *words, cwd=away)
         run(binaries / "python", "-m", "geoscene", "info", "scene", cwd=away)
         run(binaries / "python", "-m", "lidar", "map", "drive", "-o", "map.laz", "-q", cwd=away)
+        if levels and (missing := sorted(path.stem for path in set(away.rglob("*.nbc")) - brought)):
+            sys.exit(f"the wheel lacks machine code of {', '.join(missing)}; add commands to USES")
 
 
 if __name__ == "__main__":
