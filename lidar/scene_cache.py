@@ -18,7 +18,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from geoscene.reach import RoadMap
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
-from geoscene.storage import cache_folder, url_of
+from geoscene.storage import cache_folder
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
 from lidar.options import DriveOptions, PlaceOptions
@@ -52,46 +52,25 @@ _PAUSE_S = 0.2
 """Seconds between attempts to take a turn at a scene."""
 
 
-@dataclass(frozen=True, slots=True)
-class OpenedScene:
-    """A scene for a drive.
-
-    built : tiles that were built for this drive; None for the directory of a scene
-    """
-
-    scene: Scene
-    built: int | None = None
-
-
-def open_scene_or_map(
+def built_scene(
     path: Path | None,
     drive: DriveOptions,
     *,
-    place: PlaceOptions = PlaceOptions(),
-    clouds: CloudOptions = CloudOptions(),
+    place: PlaceOptions,
+    clouds: CloudOptions,
     servers: Servers | None = None,
     progress: Progress = silent,
-) -> OpenedScene:
-    """The scene that a drive needs: of a scene directory, or of a map, from the cache or built now.
+) -> tuple[Scene, int]:
+    """The scene of a map that a drive needs, from the cache or built now, and how many tiles were built.
 
-    path    : a scene directory or a map file; None for the name of a place
-    place   : that name, and how the scene of a map is built
+    path    : a map file; None for the name of a place
+    place   : that name, and how the scene is built
     clouds  : point clouds in which heights, roofs and trees of the map are measured
     servers : of maps, for a place
 
-    Raises InputError (also as RouteError) for what is neither and for a drive that cannot be planned, and
-    NetworkError if a place cannot be downloaded.
+    Raises InputError (also as RouteError) for a drive that cannot be planned, and NetworkError if a place
+    cannot be downloaded.
     """
-    if (path is None) == (not place.place):
-        raise InputError("give one of SCENE, the directory of a scene or a map file, and `place` NAME")
-    if path is not None and not path.is_file():
-        if not (path.exists() or url_of(path)):
-            raise InputError(f"{path}: no such scene or map; give a map file, or the directory of a scene")
-        given: tuple[PlaceOptions | CloudOptions, ...] = (place, clouds)
-        changed = [f.name for of in given for f in fields(of) if getattr(of, f.name) != f.default]
-        if changed:
-            raise InputError(f"`{changed[0]}`: is for maps, and {path} is a directory; leave it out")
-        return OpenedScene(open_scene(path))
     chosen = place.build_options("", relief=drive.contents().world.relief)
     source = _Map(path, place, clouds=clouds, options=chosen, servers=servers or Servers(), progress=progress)
     folder = _folder(source)
@@ -196,13 +175,13 @@ class _CachedScene:
         """Directory of the scene."""
         return self.folder / "scene"
 
-    def opened(self) -> OpenedScene:
-        """The scene with all that the drive needs; what is missing or damaged is built."""
+    def opened(self) -> tuple[Scene, int]:
+        """The scene with all that the drive needs, and how many tiles of it were missing or damaged."""
         scene, built = _intact(self.path), 0
         for _ in range(_ROUNDS):
             area = None if scene is None else self._drive_area(scene)
             if scene is not None and shapely.covers(scene.area, area):
-                return OpenedScene(scene, built)
+                return scene, built
             scene, more = self._grown(scene, area)
             built += more
         raise LidarError(

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 import shapely
 
-from geoscene.buildings.facades.solids import relief_mesh
 from geoscene.errors import BUILD_AGAIN, GeosceneError, InputError, SceneFormatError, reading
 from geoscene.files import digest, digest_of, write_atomically
 from geoscene.frames import Frame
@@ -258,6 +257,8 @@ class Scene:
         """
         tile = read_tile(self.files.tile(i, j))
         if self.modelled and tile.relief is not None:
+            from geoscene.buildings.facades.solids import relief_mesh  # noqa: PLC0415  (0.1 s)
+
             tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None, extras=None)
         if self.forests is None or not forests:
             return tile

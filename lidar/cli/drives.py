@@ -27,7 +27,7 @@ from lidar.errors import InputError, LidarError
 from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
 
 if TYPE_CHECKING:
-    from lidar.scene_cache import OpenedScene
+    from lidar.scene_source import OpenedScene
 
 
 def drive(
@@ -80,7 +80,7 @@ def drive(
     from geoscene.scene.layout import using  # noqa: PLC0415
     from geoscene.storage import published, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
+    from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
     from lidar.view.live import live_target, opened_live  # noqa: PLC0415
 
@@ -300,7 +300,7 @@ def tradeoff(
         Folder to write tradeoff.json, tradeoff.html and a plot of each sensor to.
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
-    from lidar.scene_cache import open_scene_or_map  # noqa: PLC0415
+    from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
     from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
     from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415

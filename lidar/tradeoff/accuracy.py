@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
@@ -17,9 +17,11 @@ from lidar.plan import DrivePlan, plan_drive, sensors_of
 from lidar.rig.devices import Camera, Scanner
 from lidar.rig.specs import load_rig
 from lidar.tradeoff.choice import Choice, Kind, Wanted, choice, speed, workers_text
-from lidar.tradeoff.profile import Profile, profile_of
 from lidar.tradeoff.sensor_errors import SensorErrors, kinds_of, stated
-from lidar.tradeoff.spot import SpotCheck, spot_check
+
+if TYPE_CHECKING:
+    from lidar.tradeoff.profile import Profile
+    from lidar.tradeoff.spot import SpotCheck
 
 _PERCENT = 99.9
 """Percent of the returns whose error is stated where no accuracy says another."""
@@ -194,6 +196,8 @@ def picked(
     free = _free(options, wanted)
     if before := _picked_before(out, wanted) if out else None:
         return before
+    from lidar.tradeoff.profile import profile_of  # noqa: PLC0415  (0.1 s)
+
     profile = profile_of(scene, options, folder=wanted.profile_cache, progress=progress)
     asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
     contents = options.contents()
@@ -297,6 +301,8 @@ def driven(
     kinds = kinds_of(read_accuracy(wanted.accuracy) if wanted.accuracy else None)
 
     def check(plan: DrivePlan) -> dict[str, Any]:
+        from lidar.tradeoff.spot import spot_check  # noqa: PLC0415  (0.1 s)
+
         found.append(spot_check(plan, percent=percent, kinds=kinds, progress=progress))
         return {"accuracy": notes | found[0].to_json()}
 

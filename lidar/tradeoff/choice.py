@@ -6,15 +6,17 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from geoscene.charts import metres
 from lidar.errors import InputError
 from lidar.options import Accuracy
 from lidar.tradeoff.errors import Estimate
-from lidar.tradeoff.profile import Candidate, Profile
 from lidar.tradeoff.sensor_errors import error_text
 from lidar.tradeoff.words import levels
+
+if TYPE_CHECKING:
+    from lidar.tradeoff.profile import Candidate, Profile
 
 Kind = Literal["scanners", "cameras"]
 

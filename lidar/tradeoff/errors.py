@@ -8,8 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.special import stdtrit
 
 from geoscene.columns import Columns
 from geoscene.typing import Float
@@ -98,6 +96,8 @@ def cloud_distances(found: Float, exact: Float) -> tuple[Float, Float]:
     """Distances of the points of either cloud to the nearest of the other; empty if one has no points."""
     if not len(found) or not len(exact):
         return np.empty(0), np.empty(0)
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (0.2 s)
+
     return cKDTree(exact).query(found)[0], cKDTree(found).query(exact)[0]
 
 
@@ -242,6 +242,8 @@ def next_drive(values: Sequence[float], *, least: float) -> Estimate:
     Intervals for Samples from a Normal Distribution, J. Am. Stat. Assoc. 65, 1970). Errors below ``least``
     count as that.
     """
+    from scipy.special import stdtrit  # noqa: PLC0415  (0.2 s)
+
     logs = np.log(np.maximum(values, least))
     n, middle = len(logs), float(np.mean(logs))
     reach = float(stdtrit(n - 1, 0.975)) * float(np.std(logs, ddof=1)) * (1 + 1 / n) ** 0.5

@@ -26,7 +26,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError, RouteError
 from lidar.options import DriveOptions, PlaceOptions
 from lidar.pipeline import drive
-from lidar.scene_cache import open_scene_or_map
+from lidar.scene_source import open_scene_or_map
 from lidar.traffic.populate import TrafficOptions
 
 RIG = """
