@@ -39,6 +39,7 @@ from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_eleva
 from geoscene.storage import cache_folder
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
+from lidar.gpu.device import check_device
 from lidar.options import DriveOptions, PlaceOptions
 from lidar.planning.road_drive import road_map
 
@@ -68,10 +69,12 @@ def built_scene(
     clouds  : point clouds in which heights, roofs and trees of the map are measured
     servers : of maps, for a place
 
-    Raises InputError (also as RouteError) for a drive that cannot be planned, and NetworkError if a place
-    cannot be downloaded.
+    Raises InputError (also as RouteError) for a drive that cannot be planned, MissingExtraError without what
+    its device needs, and NetworkError if a place cannot be downloaded.
     """
-    chosen = place.build_options("", relief=drive.contents().world.relief)
+    world = drive.contents().world
+    check_device(world.device)
+    chosen = place.build_options("", relief=world.relief)
     source = _Map(path, place, clouds=clouds, options=chosen, servers=servers or Servers(), progress=progress)
     folder = _folder(source)
     with _turn(folder, progress):

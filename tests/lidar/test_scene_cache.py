@@ -14,7 +14,7 @@ from helpers.scenes import same_files
 
 from geoscene import tiles
 from geoscene.errors import InputError as SceneInputError
-from geoscene.errors import NetworkError
+from geoscene.errors import MissingExtraError, NetworkError
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline import build
 from geoscene.scene import open_scene
@@ -353,6 +353,8 @@ def test_errors_are_one_line_and_leave_nothing(town, south, tmp_path):
         opened(town, south, cache, scene_crs="EPSG:4326")
     with pytest.raises(SceneInputError, match="`lod` 7"):
         opened(town, south, cache, lod=7)
+    with pytest.raises((InputError, MissingExtraError), match=r"cuda:99|geoscene\[gpu\]"):
+        opened(town, replace(south, device="cuda:99"), cache)
     with pytest.raises(InputError, match="`lod`: is for maps"):
         open_scene_or_map(town / "whole", south, place=PlaceOptions(lod=1))
     with pytest.raises(InputError, match="`place` NAME"):
