@@ -248,7 +248,7 @@ def _towards(ahead: Callable[[Float], Float], field: NDArray[np.float32]) -> Flo
 
 def _highest_ahead(h: Float) -> Float:
     """Height (n / 8, n / 8) of the highest place in a block and in those next to it at +x and +y."""
-    return _grown(_blocks(_of_corners(h, np.maximum), np.max, REACH), 1)
+    return _grown(_blocks(_of_corners(h, np.maximum), np.maximum, REACH), 1)
 
 
 def _steepness_ahead(h: Float) -> Float:
@@ -260,9 +260,9 @@ def _steepness_ahead(h: Float) -> Float:
     right, up, both = (np.roll(h, shift, (0, 1)) for shift in ((-1, 0), (0, -1), (-1, -1)))
     along_x = np.maximum(np.maximum(right - h, both - up), 0.0)
     along_y = np.maximum(np.maximum(up - h, both - right), 0.0)
-    rise = _blocks(along_x + along_y, np.max, BLOCK)
-    top = _blocks(_of_corners(h, np.maximum), np.max, BLOCK)
-    low = _blocks(_of_corners(h, np.minimum), np.min, BLOCK)
+    rise = _blocks(along_x + along_y, np.maximum, BLOCK)
+    top = _blocks(_of_corners(h, np.maximum), np.maximum, BLOCK)
+    low = _blocks(_of_corners(h, np.minimum), np.minimum, BLOCK)
     bound, before = rise.copy(), 0
     for ring in _RINGS:
         rise, top = (_grown(values, ring - before) for values in (rise, top))
@@ -279,11 +279,12 @@ def _of_corners(h: Float, choose: Callable[[Float, Float], Float]) -> Float:
     return choose(along_x, np.roll(along_x, -1, 1))
 
 
-def _blocks(values: Float, reduce: Callable[..., Float], side: int) -> Float:
-    """The greatest or least of blocks of cells."""
-    n = len(values) // side
-    found: Float = reduce(values.reshape(n, side, n, side), axis=(1, 3))
-    return found
+def _blocks(values: Float, choose: Callable[[Float, Float], Float], side: int) -> Float:
+    """The greatest or least of blocks of cells, ``side`` along each axis, a power of two."""
+    while side > 1:
+        values = choose(values[::2], values[1::2])
+        values, side = choose(values[:, ::2], values[:, 1::2]), side // 2
+    return values
 
 
 def _grown(values: Float, by: int) -> Float:
