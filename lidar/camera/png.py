@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from isal import isal_zlib
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -22,6 +22,7 @@ def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     """The PNG file of an image (h, w, 3) in colour or (h, w) in grey, uint8 or uint16.
 
     Every row uses the "up" filter and light compression (PNG, W3C 2003), twice as fast as trying all filters.
+    ISA-L, which compresses, gives the same bytes on all x86-64 processors with SSE 4.2.
     Raises FormatError for another array.
     """
     kinds = {("uint8", 3): (8, 2), ("uint8", 2): (8, 0), ("uint16", 2): (16, 0), ("uint16", 3): (16, 2)}
@@ -37,15 +38,15 @@ def encode_png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     filtered[:, 0] = 2
     filtered[0, 1:] = rows[0]
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])
-    packer = zlib.compressobj(1)
-    packed = packer.compress(filtered.data) + packer.flush()
+    packed = isal_zlib.compress(filtered.data, 1)
     header = struct.pack(">IIBBBBB", width, height, *kind, 0, 0, 0)
     chunks = [_chunk(b"IHDR", header), _chunk(b"IDAT", packed), _chunk(b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+    checksum = isal_zlib.crc32(data, isal_zlib.crc32(name))
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", checksum)
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
