@@ -7,9 +7,11 @@ import tomllib
 from dataclasses import dataclass
 from enum import IntEnum
 from importlib import resources
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class Class(IntEnum):
@@ -133,6 +135,8 @@ def class_rows() -> list[dict[str, str | int]]:
 @functools.cache
 def class_codes() -> ClassCodes:
     """The tables that turn `Class` codes into those of other datasets."""
+    import numpy as np  # noqa: PLC0415  (0.1 s, and options of commands name classes)
+
     tables = [np.zeros(256, np.uint16) for _ in range(4)]
     tables[3][:] = 1
     color = np.full((256, 3), 60, np.uint8)
