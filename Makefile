@@ -52,7 +52,7 @@ docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 wheel-test: $(STAMP)
-	$(BIN)/python tests/wheel.py
+	$(BIN)/python -P tests/wheel.py
 
 clean:
 	rm -rf $(VENV) demo bench build dist *.egg-info

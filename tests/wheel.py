@@ -1,6 +1,6 @@
 """Build sdist and wheels, and run both programs from a new environment of a wheel and what it declares.
 
-python tests/wheel.py [LEVEL...]
+python -P tests/wheel.py [LEVEL...]   (-P: tests/geoscene must not hide the package)
 
 Needs the packages of requirements.lock. Writes to dist/ the sdist, the wheel for any platform and, on x86-64,
 a wheel with machine code for the levels, by default that of this processor.
