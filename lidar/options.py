@@ -367,8 +367,8 @@ class DriveOptions:
     (openings as triangles). By default what the scene holds; the scene of a map is built plain."""
 
     device: str = ""
-    """What casts the rays, short for --set device: cpu, or, with the extra gpu, cuda or cuda:N (a CUDA
-    device) or warp-cpu (the kernels of CUDA on the CPU, to test them). The CPU by default."""
+    """What casts rays and shades images, short for --set device: cpu, or, with the extra gpu, cuda or cuda:N
+    (a CUDA device) or warp-cpu (the kernels of CUDA on the CPU, to test them). The CPU by default."""
 
     stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or

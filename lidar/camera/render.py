@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,7 @@ from lidar.camera.light import Light, daylight
 from lidar.camera.signal_lamps import Lamps, emitted
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
+from lidar.gpu.device import CPU
 from lidar.physics.fresnel import mirrored
 from lidar.raycast import Hits
 from lidar.raycast.hits import own_faces
@@ -25,6 +27,9 @@ from lidar.rig.camera_model import pixel_rays, project, unproject
 from lidar.rig.specs import CameraSpec
 from lidar.world.surfaces import Surfaces
 from lidar.world.world import World
+
+if TYPE_CHECKING:
+    from lidar.camera.warp_shade import WarpShader
 
 _BAND = 1 << 16
 """Rays per batch: small enough for their columns to stay in the processor's cache."""
@@ -462,7 +467,8 @@ def _shaded(
             lit[which] = True
     out = np.empty((n, 3), np.float32)
     gloss, facet = np.zeros(n if wet else 0, np.float32), np.empty((n if wet else 0, 3), np.float32)
-    shade.shade(
+    fill = shade.shade if world.settings.device == CPU else _shader(world.settings.device).shade
+    fill(
         view.origin,
         view.row,
         view.direction,
@@ -498,6 +504,13 @@ def _shaded(
     if not view.seen.all():
         out[~view.seen] = 0.0
     return out, gloss, facet
+
+
+def _shader(device: str) -> WarpShader:
+    """What shades on a device."""
+    from lidar.camera.warp_shade import shader  # noqa: PLC0415  (Warp, which is optional)
+
+    return shader(device)
 
 
 def _on_shapes(world: World, view: View, *, rows: NDArray[np.intp]) -> Float:

@@ -66,6 +66,9 @@ def linear_table() -> Float:
 _LEVEL = 0.7
 """Least vertical part of the normal of ground that is textured as such; steeper ground has other detail."""
 
+TOWN = 0.6
+"""Radiance of what mirrors show below the sky, the lit surroundings, as a share of that of the horizon."""
+
 _SNOW = np.array([0.80, 0.83, 0.87])
 """Albedo of snow, red, green and blue; 0.75 to 0.9 when fresh, typical value."""
 
@@ -277,7 +280,7 @@ def _irradiance(
 
 
 @inlined
-def _pixel(
+def pixel(
     i: int,
     view: Any,
     found: Any,
@@ -417,10 +420,10 @@ def _pixel(
             irradiance[c] += upwards * sides[c] * aslant[c]
     clear = math.exp(-extinction * distance)
     for c in range(3):
-        r = (1.0 - shine) * (1.0 - film) * irradiance[c] / math.pi
+        leaving = (1.0 - shine) * (1.0 - film) * irradiance[c] / math.pi
         if shine > 0.0:
-            r += shine * glow[c]
-        out[i, c] = r * clear + horizon[c] * (1.0 - clear)
+            leaving += shine * glow[c]
+        out[i, c] = leaving * clear + horizon[c] * (1.0 - clear)
     if len(gloss):
         # The texture of the surface shows through a thin film, puddles are smooth but for ripples.
         rough = (0.12 * (1.0 - pool) + 0.006) / (1.0 + 8.0 * footprint) if film > 0.0 else 0.0
@@ -464,8 +467,8 @@ def shade(
                haze (1/m), whether detail is drawn
     covers   : `covers` of the world
     """
-    scratch = np.empty((6, 3)), np.zeros(SEEN), 0.6 * light[4]
+    scratch = np.empty((6, 3)), np.zeros(SEEN), TOWN * light[4]
     view = origin, row, direction, range_, normal
     found = klass, material, color, feature, wall
     for i in range(len(range_)):
-        _pixel(i, view, found, walls, lit, light, tables, settings, covers, scratch, out, gloss, facet)
+        pixel(i, view, found, walls, lit, light, tables, settings, covers, scratch, out, gloss, facet)

@@ -47,7 +47,8 @@ class WorldSettings:
                 only of a scene that has them; ``mesh``: openings of walls as triangles
     wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
     snow      : share of surfaces open to the sky that is under snow, 0 to 1
-    device    : that casts the rays: ``cpu``, or ``cuda``, ``cuda:N`` or ``warp-cpu`` with the extra ``gpu``
+    device    : that casts rays and shades images: ``cpu``, or, with the extra ``gpu``, ``cuda``,
+                ``cuda:N`` or ``warp-cpu``
     """
 
     origin: str = "near"
