@@ -187,6 +187,7 @@ def image_boxes(
     ahead |= count_points(actors, rows, feature=instance) > 0
     found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
     body = poses_of(actors, rows, at=at)
+    pixels_of = _pixels_of(actors, instance)
     for k in np.flatnonzero(ahead).tolist():
         row = int(rows[k])
         mesh = actors.shapes[body[k]].mesh
@@ -195,10 +196,11 @@ def image_boxes(
         pixels, _ = project(camera, ((points - pose.position) / pose.scale) @ pose.rotation[0])
         box, whole = outline(pixels[mesh.faces], camera.width, height=camera.height)
         inside = bool(np.isfinite(box[0]))
-        u0, v0 = (max(int(side) - 1, 0) if inside else 0 for side in box[:2])
-        part = instance[v0 : int(box[3]) + 3, u0 : int(box[2]) + 3] if inside else instance
-        v, u = np.nonzero(part == actors.feature[row])
-        v, u = v + v0, u + u0
+        v, u = np.divmod(pixels_of.get(row, np.zeros(0, np.int64)), camera.width)
+        if inside:
+            left, top, right, bottom = map(int, box)
+            near = (u >= left - 1) & (v >= top - 1) & (u < right + 3) & (v < bottom + 3)
+            v, u = v[near], u[near]
         seen = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5) if len(u) else (np.nan,) * 4
         if inside or len(u):
             found.append((row, box if inside else seen, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
@@ -209,6 +211,16 @@ def image_boxes(
         np.array([f[3] for f in found], np.int64),
         np.array([f[4] for f in found], float),
     )
+
+
+def _pixels_of(actors: Actors, instance: NDArray[np.integer]) -> dict[int, Ints]:
+    """Numbers of the pixels, row by row from the top, that show each actor of an image, by its row."""
+    low = int(actors.feature[0]) if len(actors) else 0
+    number = instance.ravel()
+    pixels = np.flatnonzero((number >= low) & (number < low + len(actors)))
+    pixels = pixels[np.argsort(number[pixels], kind="stable")]
+    rows, first = np.unique(number[pixels] - low, return_index=True)
+    return dict(zip(rows.tolist(), np.split(pixels, first[1:]), strict=True)) if len(rows) else {}
 
 
 def merge_box_files(out: Path) -> None:
