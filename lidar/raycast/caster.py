@@ -237,17 +237,20 @@ class Caster:
         mask: int = ALL,
         time: ArrayLike | None = None,
         on: NDArray[np.int32] | None = None,
+        retrace: bool = True,
         threads: int = 1,
     ) -> NDArray[np.bool_]:
         """Whether each ray (n,) hits anything between ``near`` and ``far`` (a number or (n,)).
 
-        ``on`` and the other parameters are those of `cast`.
+        ``on`` and the other parameters are those of `cast`. Without ``retrace`` a ray aimed at a vertex, or
+        within 3e-7 rad beside a face, may pass.
 
         Offset the origins of shadow rays by a millimetre along the normal, or they hit their own surface.
         Within a tenth of a millimetre (at 400 m from the caster's origin) of an edge
         a ray counts as occluded.
         """
-        rays = limited(free_rays(origins, directions), near=near, far=far, mask=mask, time=time)
+        rays = free_rays(origins, directions)
+        rays = limited(rays, near=near, far=far, mask=mask, time=time, retrace=retrace)
         return self._any_hit(rays, on, threads=threads)
 
     def _first_hits(self, rays: Rays, on: NDArray[np.int32] | None, *, normals: bool, threads: int) -> Hits:

@@ -428,7 +428,7 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
             out[ids[k]] = hit
             valid[k] = 0 if hit else -1
             doubtful |= not hit
-        if not doubtful:
+        if not (doubtful and rays.retrace):
             continue
         for k in range(W):
             if valid[k]:
