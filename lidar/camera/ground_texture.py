@@ -48,6 +48,8 @@ _OCTAVES = np.array(
     ]
 )
 
+_FINE = 1.0 / _OCTAVES[:, :, 1]
+
 # Spots, of two sizes for each kind: side in metres of the squares of which a share has one, that share, least
 # and greatest radius in metres, factors of the albedo of dark and of light ones, and the share of dark ones:
 # oil, tar and chewing gum; paint, pebbles and worn places; tufts and bare earth.
@@ -62,6 +64,12 @@ _SPOTS = np.array(
         [[0.35, 0.70, 0.020, 0.07, 0.50, 1.60, 0.6], [1.40, 0.60, 0.09, 0.35, 0.60, 1.40, 0.6]],
     ]
 )
+
+_CELL, _CHANCE, _LEAST, _MOST, _DARK, _LIGHT, _DARK_SHARE = np.moveaxis(_SPOTS, -1, 0)
+# The mean share of ground under spots, of radii evenly distributed from the least to the greatest.
+_COVERED = _CHANCE * np.pi * (_LEAST**2 + _LEAST * _MOST + _MOST**2) / (3.0 * _CELL**2)
+_SPOT_LEVEL = 1.0 / (1.0 + _COVERED * (_DARK_SHARE * _DARK + (1.0 - _DARK_SHARE) * _LIGHT - 1.0))
+"""One over the mean factor of ground with spots."""
 
 _PATCH = 7.3
 """Side in metres of the squares of which `_PATCHED` have a patch of other asphalt with a sealed edge."""
@@ -85,20 +93,27 @@ _JOINT_DARK, _SETT_DARK = 0.45, 0.55
 
 @compiled
 def _octave(
-    x: float, y: float, hx: float, hy: float, size: float, across: float, along: float, k: int
+    x: float, y: float, hx: float, hy: float, fine: float, across: float, along: float, k: int
 ) -> float:
-    """Noise of one size, averaged over the footprint of a pixel by up to five samples along it."""
-    fade = 2.0 - 2.0 * across / size
+    """Noise of one size, averaged over the footprint of a pixel by up to five samples along it.
+
+    fine : one over the size
+    """
+    fade = 2.0 - 2.0 * across * fine
     if fade <= 0.0:
         return 0.0
-    n = min(int(1.6 * along / size) + 1, 5)
-    fade = min(fade, 1.0, 2.0 - along / (n * size))
+    x, y, along = x * fine, y * fine, along * fine
+    n = min(int(1.6 * along) + 1, 5)
+    fade = min(fade, 1.0, 2.0 - 0.2 * along)
     if fade <= 0.0:
         return 0.0
+    if n == 1:
+        return fade * noise(x, y, k)
+    step = along / n
+    start = 0.5 * (step - along)
     total = 0.0
     for i in range(n):
-        step = ((i + 0.5) / n - 0.5) * along
-        total += noise((x + step * hx) / size, (y + step * hy) / size, k)
+        total += noise(x + (start + i * step) * hx, y + (start + i * step) * hy, k)
     return fade * total / n
 
 
@@ -114,24 +129,16 @@ def _spots(
     x: float, y: float, hx: float, hy: float, across: float, along: float, kind: int, which: int
 ) -> float:
     """Factor of the spots of one size; its mean is 1."""
-    cell, chance, least, most = (
-        _SPOTS[kind, which, 0],
-        _SPOTS[kind, which, 1],
-        _SPOTS[kind, which, 2],
-        _SPOTS[kind, which, 3],
-    )
-    dark, light, share = _SPOTS[kind, which, 4], _SPOTS[kind, which, 5], _SPOTS[kind, which, 6]
-    # The mean share of ground under spots, of radii evenly distributed from the least to the greatest.
-    covered = chance * math.pi * (least * least + least * most + most * most) / (3.0 * cell * cell)
-    mean = 1.0 + covered * (share * dark + (1.0 - share) * light - 1.0)
-    fade = min(2.0 - 2.0 * across / most, 2.0 - 2.0 * along / cell, 1.0)
+    cell, least, most = _SPOTS[kind, which, 0], _SPOTS[kind, which, 2], _SPOTS[kind, which, 3]
+    fine = 1.0 / cell
+    fade = min(2.0 - 2.0 * across / most, 2.0 - 2.0 * along * fine, 1.0)
     if fade <= 0.0:
         return 1.0
-    i, j = math.floor(x / cell), math.floor(y / cell)
+    i, j = math.floor(x * fine), math.floor(y * fine)
     tone = 1.0
-    if hashed(i, j, 60 + which) < chance:
+    if hashed(i, j, 60 + which) < _SPOTS[kind, which, 1]:
         r = least + (most - least) * hashed(i, j, 62 + which)
-        free = 0.5 - 1.3 * r / cell
+        free = 0.5 - 1.3 * r * fine
         dx = x - (i + 0.5 + free * (2.0 * hashed(i, j, 64 + which) - 1.0)) * cell
         dy = y - (j + 0.5 + free * (2.0 * hashed(i, j, 66 + which) - 1.0)) * cell
         d = math.sqrt(dx * dx + dy * dy)
@@ -144,9 +151,9 @@ def _spots(
             width = max(forward * along + aside * across, 1e-3)
             other = max(aside * along + forward * across, 1e-3)
             cover = _within(d, r, width) * min(2.0 * r / other, 1.0)
-            own = dark if hashed(i, j, 69 + which) < share else light
+            own = _SPOTS[kind, which, 4 if hashed(i, j, 69 + which) < _SPOTS[kind, which, 6] else 5]
             tone = 1.0 + cover * (own - 1.0)
-    factor = 1.0 + fade * (tone / mean - 1.0)
+    factor = 1.0 + fade * (tone * _SPOT_LEVEL[kind, which] - 1.0)
     return float(factor)
 
 
@@ -199,7 +206,10 @@ def cracked(x: float, y: float, hx: float, hy: float, across: float, along: floa
     """Share of a footprint in cracks: the zeros of a noise, where another one says that ground is worn."""
     if across > 2.0 * _CRACK:
         return 0.0
-    worn = noise(x / 9.0, y / 9.0, 80) + 0.4 * noise(x / 2.7, y / 2.7, 81) - _CRACK_FROM[kind]
+    worn = noise(x / 9.0, y / 9.0, 80) - _CRACK_FROM[kind]
+    if worn <= -0.4:
+        return 0.0
+    worn += 0.4 * noise(x / 2.7, y / 2.7, 81)
     if worn <= 0.0:
         return 0.0
     f, fx, fy = _slope(x / 2.3, y / 2.3, 82)
@@ -259,8 +269,7 @@ def ground(
         return 1.0
     tone = 1.0
     for k in range(4):
-        amplitude, size = _OCTAVES[kind, k, 0], _OCTAVES[kind, k, 1]
-        tone += amplitude * _octave(x, y, hx, hy, size, across, along, 50 + 8 * k + kind)
+        tone += _OCTAVES[kind, k, 0] * _octave(x, y, hx, hy, _FINE[kind, k], across, along, 50 + 8 * k + kind)
     tone *= _spots(x, y, hx, hy, across, along, kind, 0)
     tone *= _spots(x, y, hx, hy, across, along, kind, 1)
     footprint = math.sqrt(across * along)

@@ -374,7 +374,7 @@ def pixel(
                 albedo[c] = front * albedo[c] + seen[LIGHT + c] + seen[BEHIND + c]
 
     film = pool = 0.0
-    if is_open:
+    if is_open and max(wetness, snow) > 0.0:
         edge = 0.1 + 0.5 * min(footprint, 1.0)
         bumps, hollows = 0.0, 0.0
         if 0.0 < snow < 1.0:
@@ -386,7 +386,7 @@ def pixel(
         damp = max(wetness, pool) * (1.0 - white)
         bright = 1.0
         if detailed and white > 0.0:
-            bright += 0.05 * grain(x, y, 1.3, footprint, 38) + 0.04 * grain(x, y, 0.16, footprint, 39)
+            bright += 0.05 * grain(x, y, 1 / 1.3, footprint, 38) + 0.04 * grain(x, y, 1 / 0.16, footprint, 39)
         for c in range(3):
             albedo[c] *= 1.0 - damp * (1.0 - soaked[m])
             albedo[c] += white * (_SNOW[c] * bright - albedo[c])

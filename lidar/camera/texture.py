@@ -61,12 +61,12 @@ def noise(x: float, y: float, k: int) -> float:
 
 
 @compiled
-def grain(x: float, y: float, size: float, footprint: float, k: int) -> float:
-    """Noise of grains of ``size`` metres, faded to 0 where a pixel covers a grain."""
-    fade = 2.0 - 2.0 * footprint / size
+def grain(x: float, y: float, fine: float, footprint: float, k: int) -> float:
+    """Noise of grains, ``fine`` to a metre, faded to 0 where a pixel covers a grain."""
+    fade = 2.0 - 2.0 * footprint * fine
     if fade <= 0.0:
         return 0.0
-    return min(fade, 1.0) * noise(x / size, y / size, k)
+    return min(fade, 1.0) * noise(x * fine, y * fine, k)
 
 
 @compiled
@@ -131,6 +131,8 @@ _GRAINS = np.array(
     ]
 )
 
+_FINE = 1.0 / _GRAINS[:, :, 1]
+
 
 @compiled
 def detail(kind: int, upright: int, x: float, y: float, z: float, u: float, footprint: float) -> float:
@@ -141,9 +143,9 @@ def detail(kind: int, upright: int, x: float, y: float, z: float, u: float, foot
         a, b = x + 0.31 * z, y + 0.47 * z
     tone = 1.0
     for k in range(3):
-        amplitude, size, stretch = _GRAINS[kind, k]
+        amplitude, fine, stretch = _GRAINS[kind, k, 0], _FINE[kind, k], _GRAINS[kind, k, 2]
         if amplitude > 0.0:
-            tone += amplitude * grain(a, b * stretch, size, footprint, 8 * k + kind)
+            tone += amplitude * grain(a, b * stretch, fine, footprint, 8 * k + kind)
     if kind == SLABS:
         if footprint < 0.6:
             slab = hashed(math.floor(a / 0.6), math.floor(b / 0.6), 5) - 0.5
