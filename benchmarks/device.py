@@ -1,6 +1,6 @@
 """Rates of the devices that cast rays: rays, scans, images and whole drives, and how many hits differ.
 
-    python benchmarks/device.py SCENE [--drive SECONDS]
+    python benchmarks/device.py SCENE [--drive SECONDS] [--rays N]
 
 Measures the CPU with Embree and every device of Warp on this machine, by turns, near the start of a random
 drive: medians of wall time, as a GPU has no CPU time. ``copies`` is the rate at which the rays and hits of a
@@ -38,7 +38,6 @@ from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 
 ROUNDS = 5
-RAYS = 1_000_000
 COPIED = 24 + 24, 8 + 4 + 4 + 4
 """Bytes of a ray to the device, with its origin, and of a hit back."""
 SUN = np.array([0.5, -0.6, 0.7]) / np.linalg.norm([0.5, -0.6, 0.7])
@@ -57,24 +56,24 @@ def seconds(tasks: dict[str, Callable[[], object]]) -> dict[str, float]:
     return {name: statistics.median(all_times) for name, all_times in times.items()}
 
 
-def rays_of(shape: str, rng: np.random.Generator) -> np.ndarray:
-    """Unit directions: of a scanner's rings, the pixels of an image, or at random."""
+def rays_of(shape: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """About that many unit directions: of a scanner's rings, the pixels of an image, or at random."""
     if shape == "rings":
         up = np.radians(np.linspace(-25, 10, 64))[:, None]
-        turn = np.linspace(0, 2 * np.pi, RAYS // 64)[None]
+        turn = np.linspace(0, 2 * np.pi, count // 64)[None]
         way = [np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up) + 0 * turn]
     elif shape == "pixels":
-        v, u = np.mgrid[-0.5:0.5:800j, -0.8 : 0.8 : (RAYS // 800) * 1j]
+        v, u = np.mgrid[-0.5:0.5:400j, -0.8 : 0.8 : (count // 400) * 1j]
         way = [np.ones_like(u), u, v]
     else:
-        way = list(rng.normal(size=(3, RAYS)))
+        way = list(rng.normal(size=(3, count)))
     rows = np.stack([axis.ravel() for axis in way], axis=1)
     return np.ascontiguousarray(rows / np.linalg.norm(rows, axis=1)[:, None])
 
 
-def copies(name: str) -> float:
-    """Seconds in which the rays and hits of `RAYS` rays travel to a device and back."""
-    there, back = (np.zeros(RAYS * size, np.uint8) for size in COPIED)
+def copies(name: str, count: int) -> float:
+    """Seconds in which rays travel to a device and their hits back."""
+    there, back = (np.zeros(count * size, np.uint8) for size in COPIED)
     on, byte = device(name), need("warp", "gpu").uint8
 
     def task() -> None:
@@ -93,11 +92,11 @@ def differences(found: Hits, expected: Hits) -> str:
     return f"{int(rows.sum())} of {len(rows):,}"
 
 
-def casting(worlds: dict[str, World], exact: World, eye: np.ndarray) -> None:
+def casting(worlds: dict[str, World], exact: World, *, eye: np.ndarray, count: int) -> None:
     """Print the rates of first hits and shadow rays."""
-    limits = {name: RAYS / copies(name) / 1e6 for name in worlds if name != "cpu"}
+    limits = {name: count / copies(name, count) / 1e6 for name in worlds if name != "cpu"}
     for shape in ("rings", "pixels", "random"):
-        way = rays_of(shape, np.random.default_rng(1))
+        way = rays_of(shape, count, np.random.default_rng(1))
         threads = os.cpu_count() or 1
         cast = {n: partial(w.caster.cast, eye, way, far=MARGIN, threads=threads) for n, w in worlds.items()}
         shadow = {
@@ -152,6 +151,7 @@ def main() -> None:
     )
     parser.add_argument("scene", type=Path)
     parser.add_argument("--drive", type=float, default=2.0, help="seconds of the whole drives")
+    parser.add_argument("--rays", type=int, default=1_000_000, help="in a cast")
     parser.add_argument("--devices", nargs="*", help="of Warp; by default warp-cpu and all CUDA devices")
     given = parser.parse_args()
     device(WARP_CPU)  # which prepares Warp
@@ -172,7 +172,8 @@ def main() -> None:
         worlds[name] = World.load(scene, region=region, margin=MARGIN, settings=WorldSettings(device=name))
         worlds[name].caster.cast(eye, np.eye(3))
         print(f"  {name}: {time.perf_counter() - began:.1f} s to load the world and the kernels")
-    casting(worlds, World.load(scene, region=region, margin=MARGIN, backend="float64"), eye)
+    exact = World.load(scene, region=region, margin=MARGIN, backend="float64")
+    casting(worlds, exact, eye=eye, count=given.rays)
     sensors(worlds, options, scene)
     for rig in ("vlp16", "kitti") if has_colors(scene) else ("vlp16",):
         for name in worlds:
