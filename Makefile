@@ -1,6 +1,7 @@
 # make demo        build the bundled real scene, drive it, write pictures and point clouds
 # make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
 # make test-fast   the tests outside the modules that build scenes, record drives or compile kernels
+# make test-gpu    the kernels of CUDA on the CPU; installs the extra gpu
 # make fuzz        property tests with fresh random seeds and ten times the examples; 20,000 damaged files
 # make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
 # make bench-quick the same on a part of the demo, about a minute
@@ -14,7 +15,7 @@ STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
 
-.PHONY: demo test test-fast fuzz bench bench-quick lint docs wheel-test clean
+.PHONY: demo test test-fast test-gpu fuzz bench bench-quick lint docs wheel-test clean
 
 $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one: make PYTHON=python3.12")'
@@ -31,6 +32,10 @@ test: $(STAMP)
 
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow"
+
+test-gpu: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check warp-lang==1.19.0
+	$(PYTEST) tests/lidar/gpu tests/lidar/raycast/test_warp.py tests/lidar/camera/test_warp_shade.py
 
 fuzz: $(STAMP)
 	$(PYTEST) --hypothesis-profile=fuzz -m hypothesis

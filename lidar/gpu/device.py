@@ -7,12 +7,14 @@ import functools
 import re
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from geoscene.errors import need
-from lidar.errors import InputError
+from lidar.errors import BackendError, InputError
 
 CPU = "cpu"
 WARP_CPU = "warp-cpu"
@@ -81,15 +83,28 @@ class Device:
     def upload(self, column: Any, kind: Any = Any) -> Any:
         """A copy of a NumPy array in the memory of the device, or the array itself on the CPU.
 
+        Raises BackendError if there is no memory left, as `empty` does.
+
         kind : type of Warp of an item, such as a vector; by default that of the array
         """
         import warp as wp  # noqa: PLC0415
 
         flat = np.ascontiguousarray(column)
-        return wp.array(flat, dtype=kind, device=self.warp_device, copy=not self.warp_device.is_cpu)
+        with self._full():
+            return wp.array(flat, dtype=kind, device=self.warp_device, copy=not self.warp_device.is_cpu)
 
-    def empty(self, count: int, kind: Any) -> Any:
+    def empty(self, count: int | tuple[int, ...], kind: Any) -> Any:
         """An array of the device for results, with undefined items."""
         import warp as wp  # noqa: PLC0415
 
-        return wp.empty(count, dtype=kind, device=self.warp_device)
+        with self._full():
+            return wp.empty(count, dtype=kind, device=self.warp_device)
+
+    @contextmanager
+    def _full(self) -> Iterator[None]:
+        """Raise BackendError where Warp cannot allocate memory."""
+        try:
+            yield
+        except RuntimeError as error:
+            advice = "take fewer `workers`, or leave `device` out to use the CPU"
+            raise BackendError(f"device {self}: {error}; {advice}") from error

@@ -8,7 +8,7 @@ import pytest
 from geoscene.errors import MissingExtraError
 from lidar import drive
 from lidar.dataset.formats import read_cloud
-from lidar.errors import InputError
+from lidar.errors import BackendError, InputError
 from lidar.gpu import device
 from lidar.options import DriveOptions
 from lidar.traffic.populate import TrafficOptions
@@ -64,6 +64,12 @@ def test_a_drive_with_warp_has_the_clouds_of_the_cpu(scene, tmp_path):
         if len(one) == len(two):
             apart = np.linalg.norm(one.xyz - two.xyz, axis=1)
             assert (apart > 1e-4).sum() <= 5
+
+
+@pytest.mark.skipif(not HAS_WARP, reason="the extra gpu is not installed")
+def test_a_full_device_is_named_with_what_to_do():
+    with pytest.raises(BackendError, match=r"cpu.*Failed to allocate.*fewer `workers`"):
+        device.device("warp-cpu").empty((2**30, 2**15), device.need("warp", "gpu").float64)
 
 
 def test_the_device_is_given_once():
