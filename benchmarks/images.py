@@ -25,7 +25,7 @@ from lidar.plan import plan_drive
 from lidar.rig.specs import CameraSpec
 from lidar.world.world import World
 
-ROUNDS = 5
+ROUNDS = 3
 CAMERA = CameraSpec("c", Mount(), 1600, 900, 1266.0, 1266.0, 799.5, 449.5)
 
 

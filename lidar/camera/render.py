@@ -23,7 +23,7 @@ from lidar.gpu.device import CPU
 from lidar.physics.fresnel import mirrored
 from lidar.raycast import Hits
 from lidar.raycast.hits import own_faces
-from lidar.rig.camera_model import pixel_rays, project, unproject
+from lidar.rig.camera_model import project, unproject
 from lidar.rig.specs import CameraSpec
 from lidar.world.surfaces import Surfaces
 from lidar.world.world import World
@@ -40,8 +40,9 @@ _EDGES = 1 << 14
 _Pixels = slice | NDArray[np.int64]
 """Numbers of pixels; a slice has a start and a stop."""
 
-_SHARED = 1 << 23
-"""Rays of a camera, supersampling included, up to which frames share them; they take 24 bytes each."""
+_SHARED = 1 << 21
+"""Rays of a lens with distortion, supersampling included, up to which frames share them; they take 24 bytes
+each. Of larger images, rays are computed for each frame."""
 
 _ROLLS = 5
 """Fixed-point iterations for the row in which a rolling shutter sees a point; each gains some digits."""
@@ -97,14 +98,14 @@ class Frame:
     """One frame of a camera, row by row from the top.
 
     rgb     : (h, w, 3) uint8, sRGB, or None if not asked for
-    depth   : (h, w) float32, metres: along the optical axis (z) for a pinhole, along the ray for a fisheye;
-              inf for sky and beyond the camera's ``far``
+    depth   : (h, w) metres, float64 as rendered, float32 as read from a file: along the optical axis (z) for
+              a pinhole, along the ray for a fisheye; inf for sky and beyond the camera's ``far``
     klass   : (h, w) uint8, `geoscene.classes.Class`; SKY where nothing is hit, UNLABELED without a ray
     feature : (h, w) int32, feature number in the scene, -1 for none
     """
 
     rgb: NDArray[np.uint8] | None
-    depth: NDArray[np.float32]
+    depth: NDArray[np.floating]
     klass: NDArray[np.uint8]
     feature: NDArray[np.int32]
 
@@ -227,7 +228,7 @@ def render(
             electrons = noise.standard_normal((h, w, 3), np.float32).reshape(-1, 3)
             total = _noisy(total, exposure, normal=electrons, options=options)
         rgb = shade.developed(total, exposure).reshape(h, w, 3)
-    depth = np.where(middle.range <= camera.far, middle.range, np.float32(np.inf))
+    depth = np.where(middle.range <= camera.far, middle.range, np.inf)
     return Frame(
         rgb if coloured else None,
         depth.reshape(h, w),
@@ -258,10 +259,11 @@ class _Image:
 
     def label(self, here: slice, view: View) -> None:
         """Set depth, class and feature of some pixels."""
-        distance = view.hits.range
-        sky = np.where(view.seen, np.uint8(Class.SKY), np.uint8(Class.UNLABELED))
-        self.range[here] = distance
-        self.klass[here] = np.where(np.isfinite(distance), view.surfaces.klass, sky)
+        self.range[here] = view.hits.range
+        klass = self.klass[here]
+        klass[:] = view.surfaces.klass
+        klass[view.hits.face < 0] = Class.SKY
+        klass[~view.seen] = Class.UNLABELED
         self.feature[here] = view.surfaces.feature
 
 
@@ -348,27 +350,29 @@ def _view(
     return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
 
 
-@functools.lru_cache(maxsize=4)
-def _distorted_rays(camera: CameraSpec) -> Float:
-    rays = pixel_rays(camera)
-    return rays / rays[:, 2:]
-
-
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
     """Directions of pixels whose ray parameter is the depth as defined in `Frame`."""
-    w, fisheye = camera.width, camera.model == "fisheye"
-    shared = w * camera.height <= _SHARED
-    if shared and fisheye:
-        return pixel_rays(camera)[pixels]
-    if shared and any(camera.distortion):
-        return _distorted_rays(camera)[pixels]
+    bent = camera.model == "fisheye" or any(camera.distortion)
+    if bent and camera.width * camera.height <= _SHARED:
+        return _shared_rays(camera)[pixels]
     number = np.arange(pixels.start, pixels.stop) if isinstance(pixels, slice) else pixels
-    if not (fisheye or any(camera.distortion)):
-        rays = np.empty((len(number), 3))
-        shade.straight_rays(number, w, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
-        return rays
-    rays = unproject(camera, np.stack([number % w, number // w], axis=-1))
-    return rays if fisheye else rays / rays[:, 2:]
+    if bent:
+        return _bent_rays(camera, number)
+    rays = np.empty((len(number), 3))
+    shade.straight_rays(number, camera.width, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
+    return rays
+
+
+@functools.lru_cache(maxsize=16)
+def _shared_rays(camera: CameraSpec) -> Float:
+    """Rays of all pixels, kept for the cameras of a rig, each with its finer one."""
+    return _bent_rays(camera, np.arange(camera.width * camera.height))
+
+
+def _bent_rays(camera: CameraSpec, number: NDArray[np.int64]) -> Float:
+    """Rays of pixels of a lens with distortion."""
+    rays = unproject(camera, np.stack([number % camera.width, number // camera.width], axis=-1))
+    return rays if camera.model == "fisheye" else rays / rays[:, 2:]
 
 
 def _with_misses(hits: Hits, missed: NDArray[np.bool_]) -> Hits:

@@ -37,7 +37,7 @@ def pixel_rays(camera: CameraSpec) -> Float:
     )
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=16)  # the cameras of a rig
 def _pixel_rays(
     model: str,
     width: int,

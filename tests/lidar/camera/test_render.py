@@ -12,7 +12,7 @@ from geoscene.classes import Class, materials
 from geoscene.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.camera.edges import edge_pixels
 from lidar.camera.png import encode_png
-from lidar.camera.render import RenderOptions, exposure_times, optical_flow, render
+from lidar.camera.render import RenderOptions, _shared_rays, exposure_times, optical_flow, render
 from lidar.camera.shade import straight_rays
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL, Mount
@@ -550,10 +550,19 @@ def test_depth_and_labels_are_those_of_the_dry_world():
         assert np.array_equal(getattr(dry, name), getattr(wet, name))
 
 
-def test_rays_of_an_undistorted_pinhole_are_those_of_the_camera_model_to_the_last_bit():
+def test_rays_of_six_lenses_with_distortion_are_computed_once():
+    lenses = [replace(CAMERA, fx=100.0 + k, distortion=(-0.2, 0.1, 0.0, 0.0, 0.0)) for k in range(6)]
+    scene = world(ground())
+    _shared_rays.cache_clear()
+    for lens in 2 * lenses:
+        render(lens, looking(), world=scene, sun=NOON)
+    assert _shared_rays.cache_info().misses == 12  # of each lens and of its finer one, for edges
+
+
+def test_rays_of_an_undistorted_pinhole_are_those_of_the_camera_model():
     camera = replace(CAMERA, width=41, height=23, fx=37.3, fy=36.1, cx=19.7, cy=11.2)
     number = np.arange(camera.width * camera.height)
     rays = np.empty((len(number), 3))
     straight_rays(number, camera.width, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
     expected = pixel_rays(camera)
-    np.testing.assert_array_equal(rays, expected / expected[:, 2:])
+    np.testing.assert_allclose(rays, expected / expected[:, 2:], rtol=1e-15, atol=1e-16)
