@@ -195,6 +195,8 @@ def _enter_below(tables: Any, rough: Any, rays: Any, f: int, i: int, lanes: Any,
 
     Returns 1 if it does so, else 0, and the parameter at which a ray without a lane has crossed the plane.
     A ray that starts on the mean over a footprint may start below the surface: it starts just above it.
+    One that starts closer above the plane than rays go on from it, on a peak or off a shallow dip, goes on
+    from there, too: it would meet the plane in float32.
     """
     k = tables.kind[f] if f >= 0 else -1
     if k < 0:
@@ -203,11 +205,12 @@ def _enter_below(tables: Any, rough: Any, rays: Any, f: int, i: int, lanes: Any,
     (x, y, z), way = _on_plane(tables.plane, f, origin_of(rays, i), direction)
     near, depth, length = rays.near, rough.kinds[k, DEPTH], _length(direction)
     below = z + near * way[2]
-    if below >= 0.0 or below < -2.0 * depth:
+    if below >= OVER or below < -2.0 * depth or (below >= 0.0 and way[2] <= 0.0):
         return 0, 0.0
     px, py, slope = x + near * way[0], y + near * way[1], rough.kinds[k, FIELD_SLOPE]
-    if way[2] > slope * np.sqrt(way[0] ** 2 + way[1] ** 2) and (
-        rough.kinds[k, 1] <= 0.0 or joints(rough, k, px, py) >= 0.0
+    if below >= 0.0 or (
+        way[2] > slope * np.sqrt(way[0] ** 2 + way[1] ** 2)
+        and (rough.kinds[k, 1] <= 0.0 or joints(rough, k, px, py) >= 0.0)
     ):
         return 0, near - below / way[2] + beyond_plane(way[2], length)
     surface = height(rough, k, px, py)

@@ -23,17 +23,17 @@ KIND_OF |= {
 SLOPE = np.array([0.08, -0.05])
 
 
-def ground(kind, slope=SLOPE):
+def ground(kind, slope=SLOPE, *, side=SIDE, **chosen):
     """A sloping square of a kind of ground about the origin, and its plane's height function."""
     material, klass = KIND_OF[kind]
-    xy = SIDE / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
+    xy = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1.0]])
     mesh = Mesh.of(
         np.column_stack([xy, xy @ slope]),
         [[0, 1, 2], [0, 2, 3]],
         klass=klass,
         material=materials()[material].code,
     )
-    caster = Caster(mesh.vertices, mesh.faces, origin=np.zeros(3))
+    caster = Caster(mesh.vertices, mesh.faces, origin=np.zeros(3), **chosen)
     caster.refiners = [GroundRefiner(ground_tables(mesh, origin=np.zeros(3)))]
     return caster
 
@@ -258,6 +258,20 @@ def test_light_leaves_a_point_on_rough_ground_upwards_and_hits_the_surface_sidew
     down = caster.cast(place, -up, on=hits.face)
     assert (down.face >= 0).all()
     assert np.abs(above(kind, place - down.range[:, None] * up)).max() < 1e-6
+
+
+@pytest.mark.parametrize("kind", ["asphalt", "paving", "sett"])
+def test_the_plane_throws_no_shadow_on_peaks_that_nearly_reach_it_far_from_the_origin(kind):
+    start, way = looks(np.random.default_rng(9), 50_000, lowest_deg=30, highest_deg=80)
+    start += [3000.0, -1800.0, 3000.0 * SLOPE[0] - 1800.0 * SLOPE[1]]
+    exact, fast = (ground(kind, side=8000.0, backend=name) for name in ("float64", "embree"))
+    hits = exact.cast(start, way, normals=True)
+    place = start + hits.range[:, None] * way + 1e-3 * hits.normal
+    height = place[:, 2] - place[:, :2] @ SLOPE
+    assert (height > 0).sum() > 100
+    sun = np.tile([0.5, -0.6, 0.7], (len(place), 1))
+    shadow = exact.occluded(place, sun, on=hits.face)
+    np.testing.assert_array_equal(fast.occluded(place, sun, on=hits.face), shadow)
 
 
 @pytest.mark.parametrize("kind", KIND_OF)
