@@ -5,7 +5,7 @@
 Measures the CPU with Embree and every device of Warp on this machine, by turns, near the start of a random
 drive: medians of wall time, as a GPU has no CPU time. ``copies`` is the rate at which the rays and hits of a
 cast alone can be copied to the device and back: no cast can be faster. Hits are compared with those of the
-float64 backend, byte for byte, and those of Embree, by face.
+float64 backend, byte for byte, and those of Embree, by face; images with that backend's, by levels of sRGB.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -116,14 +117,14 @@ def casting(worlds: dict[str, World], exact: World, *, eye: np.ndarray, count: i
             print(line)
 
 
-def sensors(worlds: dict[str, World], options: DriveOptions, scene: Scene) -> None:
-    """Print the rates of whole scans and images."""
+def sensors(worlds: dict[str, World], exact: World, *, options: DriveOptions, scene: Scene) -> None:
+    """Print the rates of whole scans and images, and how many pixels differ from the float64 backend's."""
     trajectory = plan_drive(scene, options).trajectory
     x, y, z = trajectory.position[0]
     camera = CameraSpec("c", Mount(), 960, 600, 700.0, 700.0, 479.5, 299.5)
     poses = Poses(np.array([[x, y, z + 2.0]]), OPTICAL[None], np.ones((1, 3)))
     mount = Mount((0.0, 0.0, 1.8))
-    tasks: dict[str, Callable[[World], object]] = {
+    tasks: dict[str, Callable[[World], Any]] = {
         "VLP-16 scans": lambda w: scan(load_sensor("vlp16"), mount, trajectory=trajectory, world=w, frame=0),
         "HDL-64E scans": lambda w: scan(
             load_sensor("hdl64e_s3"), mount, trajectory=trajectory, world=w, frame=0
@@ -133,6 +134,12 @@ def sensors(worlds: dict[str, World], options: DriveOptions, scene: Scene) -> No
     for title, task in tasks.items():
         taken = seconds({name: partial(task, world) for name, world in worlds.items()})
         print(f"\n{title}: " + ", ".join(f"{name} {1 / taken[name]:.2f}/s" for name in worlds))
+    image = tasks["images 960 x 600"]
+    truth = np.asarray(image(exact).rgb, int)
+    for name, world in worlds.items():
+        apart = np.abs(image(world).rgb - truth).max(axis=2)
+        share, most = np.mean(apart > 1), apart.max()
+        print(f"  {name}: {share:.4%} of the pixels differ by more than a level, by {most} at most")
 
 
 def has_colors(scene: Scene) -> bool:
@@ -174,7 +181,7 @@ def main() -> None:
         print(f"  {name}: {time.perf_counter() - began:.1f} s to load the world and the kernels")
     exact = World.load(scene, region=region, margin=MARGIN, backend="float64")
     casting(worlds, exact, eye=eye, count=given.rays)
-    sensors(worlds, options, scene)
+    sensors(worlds, exact, options=options, scene=scene)
     for rig in ("vlp16", "kitti") if has_colors(scene) else ("vlp16",):
         for name in worlds:
             chosen = DriveOptions(
