@@ -142,8 +142,8 @@ def in_scene(rays: Rays) -> tuple[Float, Float]:
 def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
     """Selected rays, without an order."""
     return rays._replace(
-        directions=_rows(rays.directions[row], "directions"),
-        offsets=_rows(rays.offsets[row], "origins") if len(rays.offsets) > 1 else rays.offsets,
+        directions=_rows(rays.directions.take(row, axis=0), "directions"),
+        offsets=_rows(rays.offsets.take(row, axis=0), "origins") if len(rays.offsets) > 1 else rays.offsets,
         pose=rays.pose[row] if len(rays.pose) else rays.pose,
         order=np.empty(0, np.int64),
         time=rays.time[row] if len(rays.time) else rays.time,
