@@ -24,7 +24,7 @@ from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Rays, Target
 from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.hull import LONG, REACH, ROUNDING
-from lidar.raycast.lanes import GRAZING, START, cross, move_float64, move_int32, narrow, same
+from lidar.raycast.lanes import GRAZING, START, cross, look_up, move_float64, move_int32, narrow, same
 from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
 from lidar.raycast.planes import INVALID, PLANE, intersection, numbered, outside, placed, plane_of, ray_of
@@ -86,13 +86,9 @@ def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: 
         # The common case, all lanes on one mesh: look up the mesh once.
         part = target.parts.ctypes.data + 8 * PART * np.int64(target.rows[u[HIT_GEOMETRY * W]])
         planes, numbers, first = int64_at(part, 0), int64_at(part, NUMBERS), int64_at(part, START_NUMBER)
+        look_up(target.lanes, planes, PLANE, u.ctypes.data + 4 * HIT_FACE * W, work.ctypes.data)
         for k in range(W):
-            prim = np.int64(u[HIT_FACE * W + k])
-            plane = planes + PLANE * prim
-            work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
-            work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
-            work[MARGIN * W + k] = float64_at(plane, 4)
-            faces[k] = first + prim
+            faces[k] = first + np.int64(u[HIT_FACE * W + k])
         if numbers:
             for k in range(W):
                 faces[k] = first + np.int64(int32_at(numbers, np.int64(u[HIT_FACE * W + k])))

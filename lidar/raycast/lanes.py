@@ -32,7 +32,11 @@ from lidar.raycast.rows import (
     OZ,
     RANGE,
     RAY_DX,
+    RAY_FAR,
+    RAY_NEAR,
+    RAY_TIME,
     SCALE,
+    TIME,
 )
 
 GRAZING = 1e-3
@@ -43,6 +47,8 @@ UNIT = 1e-12
 """Tolerance of the squared length of a unit vector."""
 START = 1e-9
 """Metres between the start of a ray and the plane of a face up to which the ray starts on the face."""
+UP = 1.0 + 2.0**-23
+"""Factor that compensates rounding down to float32."""
 
 _DOUBLE, _FLOAT, _INT = ir.DoubleType(), ir.FloatType(), ir.IntType(32)
 
@@ -157,29 +163,75 @@ same: Any = _same
 
 
 @intrinsic
-def _settle(context: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any) -> Any:  # noqa: ARG001
+def _settle(
+    context: Any,  # noqa: ARG001
+    lanes: Any,
+    work: Any,  # noqa: ARG001
+    packet: Any,  # noqa: ARG001
+    x: Any,  # noqa: ARG001
+    y: Any,  # noqa: ARG001
+    z: Any,  # noqa: ARG001
+    near: Any,  # noqa: ARG001
+) -> Any:
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows, rounded = (
             _Rows(builder, lanes, address=values[1]),
             _Rows(builder, lanes, address=values[2], kind=_FLOAT),
         )
-        place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:])]
+        place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:6])]
         way = [rows[DX + r] for r in range(3)]
         for r in range(3):
             rows[r] = rounded[r] = place[r]
             rounded[RAY_DX + r] = way[r]
+        rows[INVERSE] = rows.same(1.0)
+        rounded[RAY_NEAR], rounded[RAY_TIME] = rows.same(values[6]), rows[TIME]
+        rounded[RAY_FAR] = rows[FAR] * rows.same(UP)
         squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
         near = (abs(place[0]) + abs(place[1]) + abs(place[2])).all("<", rows.same(HUGE))
         unit = abs(squared - rows.same(1.0)).all("<", rows.same(UNIT))
         return builder.and_(near, unit)
 
-    return types.boolean(lanes, types.int64, types.int64, *[types.float64] * 3), build
+    return types.boolean(lanes, types.int64, types.int64, *[types.float64] * 4), build
 
 
 settle: Any = _settle
-"""Make origins relative to a point; write them and the directions to Embree's packet in float32.
+"""Make origins relative to a point; write the rays to Embree's packet in float32, with far rounded up.
 
 Returns whether all directions have length 1 and all origins are below `HUGE`."""
+
+
+@intrinsic
+def _look_up(context: Any, lanes: Any, planes: Any, size: Any, faces: Any, work: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:
+        start, size, faces, work = values[1:]
+        rows, long = _Rows(builder, lanes, address=work), ir.IntType(64)
+        places = _Rows(builder, lanes, address=faces, kind=_INT)[0].value
+        four, margin, packed = ir.VectorType(_DOUBLE, 4), ir.Constant(rows.kind, ir.Undefined), []
+        for k in range(lanes.count):
+            lane = ir.Constant(_INT, k)
+            face = builder.zext(builder.extract_element(places, lane), long)
+            place = builder.add(start, builder.mul(face, size))
+            packed.append(builder.load(builder.inttoptr(place, four.as_pointer()), align=8))
+            last = builder.inttoptr(builder.add(place, long(32)), _DOUBLE.as_pointer())
+            margin = builder.insert_element(margin, builder.load(last), lane)
+        while len(packed) > 1:
+            count = 2 * packed[0].type.count
+            every = ir.Constant(ir.VectorType(_INT, count), list(range(count)))
+            pairs = zip(packed[::2], packed[1::2], strict=True)
+            packed = [builder.shuffle_vector(one, other, every) for one, other in pairs]
+        for r, row in enumerate((NX, NY, NZ, OFFSET)):
+            column = ir.Constant(ir.VectorType(_INT, lanes.count), list(range(r, 4 * lanes.count, 4)))
+            rows[row] = _Row(builder, builder.shuffle_vector(packed[0], packed[0], column))
+        rows[MARGIN] = _Row(builder, margin)
+        return made.get_constant(signature.return_type, 0)
+
+    return types.int64(lanes, *[types.int64] * 4), build
+
+
+look_up: Any = _look_up
+"""Write the planes of a row of faces, from a table at an address with a size in bytes of its rows.
+
+Rows written lane by lane could not be read as vectors at once: the processor would wait for the writes."""
 
 
 @intrinsic

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar.raycast.columns import Rays, Target
-from lidar.raycast.lanes import HUGE, settle
+from lidar.raycast.lanes import HUGE, UP, settle
 from lidar.raycast.memory import (
     float32_at,
     float64_at,
@@ -41,14 +41,12 @@ from lidar.raycast.rows import (
     RAY_DZ,
     RAY_FAR,
     RAY_NEAR,
-    RAY_TIME,
     TIME,
 )
 
 _NUDGE = 3e-7  # radians; the smallest that closed all leaks of a million rays aimed at vertices
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
 _SPREAD = 4.0  # metres; likewise packets whose origins lie farther apart
-_UP = 1.0 + 2.0**-23  # factor that compensates rounding down to float32
 
 
 @inlined
@@ -71,7 +69,7 @@ def _shorten(W: int, k: int, work: Any, f: Any) -> None:
     work[INVERSE * W + k] = inverse
     f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x * inverse, y * inverse, z * inverse
     f[RAY_NEAR * W + k] = f[RAY_NEAR * W + k] * length
-    f[RAY_FAR * W + k] = work[FAR * W + k] * length * _UP
+    f[RAY_FAR * W + k] = work[FAR * W + k] * length * UP
 
 
 @inlined
@@ -121,7 +119,6 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
         for k in range(W):
             work[DX * W + k], work[DY * W + k], work[DZ * W + k] = vector(directions, ids[k])
             work[OX * W + k], work[OY * W + k], work[OZ * W + k] = vector(offsets, step * ids[k])
-    plain = settle(lanes, work.ctypes.data, f.ctypes.data, cx, cy, cz)
     if reach:
         for k in range(W):
             work[FAR * W + k] = float64_at(far, ids[k])
@@ -132,12 +129,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
     if timed:
         for k in range(W):
             work[TIME * W + k] = float32_at(time, ids[k])
-    for k in range(W):
-        work[INVERSE * W + k] = 1.0
-        f[RAY_NEAR * W + k] = rays.near
-        f[RAY_TIME * W + k] = work[TIME * W + k]
-        f[RAY_FAR * W + k] = work[FAR * W + k] * _UP
-    if plain:
+    if settle(lanes, work.ctypes.data, f.ctypes.data, cx, cy, cz, rays.near):
         return True
     if first_bad(W, ids, work) >= 0:
         return False
@@ -158,7 +150,7 @@ def nudge(W: int, k: int, work: Any, f: Any, far: float) -> None:
     else:
         z += _NUDGE
     f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x, y, z
-    f[RAY_FAR * W + k] = far / inverse * _UP
+    f[RAY_FAR * W + k] = far / inverse * UP
 
 
 @inlined
