@@ -1,10 +1,12 @@
-"""Subject casting: lidar's caster, a native Embree loop, embreex as trimesh calls it, and Open3D.
+"""Subject casting: lidar's caster, native Embree loops, embreex as trimesh calls it, and Open3D.
 
-The native loop is C, compiled by gcc -O3 -march=native if gcc is installed. For each packet of 16 it rotates
-float64 directions by the rays' float64 poses, rounds them to float32, calls rtcIntersect16 of the same
-library on the same scene with the same flags, and writes 8 bytes per ray: Embree's float32 range and the face
-number. It has no exact range, cosine, instances, range limits or input checks, and does not retry rays that
-miss or hit a back face. It is the upper limit.
+The native loops are C, compiled by gcc -O3 -march=native if gcc is installed. For each packet of 16, "native"
+rotates float64 directions by the rays' float64 poses, rounds them to float32, calls rtcIntersect16 of the
+same library on the same scene with the same flags, and writes 8 bytes per ray: Embree's float32 range and
+the face number. It has no exact range, cosine, instances, range limits or input checks, and does not retry
+rays that miss or hit a back face. It is the upper limit. "native, exact" is the same loop with the columns of
+lidar's hits: the range and the cosine in float64 from the plane of the face, face and instance, 20 bytes per
+ray. It has no range limits and checks, does not test hits near edges and does not retry.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ _NATIVE = Path(__file__).with_name("native.c")
 
 _NOTE = (
     "one thread, same rays. native: 8 bytes per ray, no exact ranges, cosines, checks and retries (upper"
-    " limit); embreex and open3d: rays prepared outside the measured time, float32 ranges; open3d also"
+    " limit); native, exact: float64 ranges and cosines, 20 bytes, no checks and retries;"
+    " embreex and open3d: rays prepared outside the measured time, float32 ranges; open3d also"
     " returns normals and barycentric coordinates"
 )
 
@@ -75,7 +78,10 @@ def casters(
         "lidar": lambda: [caster.cast_posed(p, index, directions=directions) for p in poses][-1].range
     }
     if loop is not None and library().width == 16:
-        sides["native"] = lambda: [_native_ranges(loop, caster, p, index, directions) for p in poses][-1]
+        for name, exact in (("native", False), ("native, exact", True)):
+            sides[name] = lambda exact=exact: [
+                native_ranges(loop, caster, p, index, directions, exact=exact) for p in poses
+            ][-1]
     here = vertices - caster.origin
     rays = [(p.position[index] - caster.origin, p.take(index).directions(directions)) for p in poses]
     engine = EmbreeScene()
@@ -109,22 +115,25 @@ def native(folder: Path) -> c.CDLL | None:
     return c.CDLL(str(built))
 
 
-def _native_ranges(
-    loop: c.CDLL, caster: Caster, poses: Poses, index: Ints, directions: Float
-) -> NDArray[np.float32]:
-    lib, target = library(), caster.scene.target
-    ranges, prim = np.empty(len(directions), np.float32), np.empty(len(directions), np.uint32)
+def native_ranges(
+    loop: c.CDLL, caster: Caster, poses: Poses, index: Ints, directions: Float, *, exact: bool
+) -> NDArray[np.floating]:
+    """Ranges of one of the native loops; exact ones need a caster of one mesh without instances."""
+    lib, target, n = library(), caster.scene.target, len(directions)
     columns = (poses.position, poses.rotation, index, directions, target.origin)
+    out: list[NDArray[Any]] = [np.empty(n, np.float64 if exact else np.float32), np.empty(n, np.int32)]
+    if exact:
+        out += np.empty(n, np.int32), np.empty(n, np.float32), caster.scene.parts[0].planes
+    trace = c.cast(lib.embree.rtcIntersect16, c.c_void_p)
     addresses = (target.scene, target.packet, *(a.ctypes.data for a in columns))
-    loop.cast(
-        c.cast(lib.embree.rtcIntersect16, c.c_void_p),
+    (loop.cast_planes if exact else loop.cast)(
+        trace,
         *(c.c_void_p(address) for address in addresses),
         c.c_long(0),
-        c.c_long(len(directions)),
-        c.c_void_p(ranges.ctypes.data),
-        c.c_void_p(prim.ctypes.data),
+        c.c_long(n),
+        *(c.c_void_p(column.ctypes.data) for column in out),
     )
-    return ranges
+    return out[0]
 
 
 def _scanner(low: float, high: float, *, rings: int) -> tuple[Float, Ints]:
