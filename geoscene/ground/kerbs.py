@@ -160,7 +160,8 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3).astype(np.int64)
     edge = on_border(plan, cells, triangles=triangles)
-    inner = ~edge[vertex]
+    points, inside = shapely.points(triangles.points), ~edge
+    inner = inside[vertex]
     around = triangles.points[edge][:, None] + _AROUND * np.stack(
         [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
     )
@@ -170,14 +171,21 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
     def touched(chosen: Bools) -> Bools:
         return np.bincount(vertex[chosen], minlength=len(triangles.points)) > 0
 
+    def beside(found: Bools) -> Bools:
+        # Where a lowered kerb begins, its corner and that of the kerb may be a step of the grid apart.
+        near, _ = shapely.STRtree(points[found]).query(points, predicate="dwithin", distance=_AROUND)
+        found = found.copy()
+        found[near] |= inside[near]
+        return found
+
     priority = values_at(plan.layers.priority, row, base=-1.0)
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
     raised = touched(((priority >= SIDEWALKS) & (priority <= SIDEWALK_ENDS)) | _is_kerb(priority))
     height = np.where(raised, KERB, 0.0)
-    height[touched(priority == LOWERED)] = KERB_LOWERED
-    height[touched((priority == FLUSH) | np.isin(klass, _LEVEL))] = 0.0
-    vertex, end = kerbs.ends.query(shapely.points(triangles.points), predicate="dwithin", distance=_END)
-    away = shapely.distance(shapely.points(triangles.points[vertex]), kerbs.ends.geometries[end])
+    height[raised & beside(touched(priority == LOWERED))] = KERB_LOWERED
+    height[beside(touched(priority == FLUSH)) | touched(np.isin(klass, _LEVEL))] = 0.0
+    vertex, end = kerbs.ends.query(points, predicate="dwithin", distance=_END)
+    away = shapely.distance(points[vertex], kerbs.ends.geometries[end])
     np.minimum.at(height, vertex, KERB * away / _END)
     return height
 

@@ -2,7 +2,7 @@
 
 Every polygon's outline is put on a grid of `PRECISION`; in a tile, the outlines that come within a
 centimetre of it, the tile's own sides and the terrain's lines are noded together by snap rounding (Hobby
-1999; Guibas and Marimont 1998, as implemented in GEOS). Snap rounding is local: whether a segment bends
+1999; Guibas and Marimont 1998). Snap rounding is local: whether a segment bends
 at a point depends only on the segments that pass that very point. As both tiles beside a border node the
 same whole segments there, they find the same vertices on it, whichever other tiles are built.
 """
@@ -23,6 +23,7 @@ from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.faces import Faces, faces
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
+from geoscene.ground.snapping import snap_rounded
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9
@@ -191,12 +192,7 @@ def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     if place is None:
         raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
     box = tile_box(plan, i, j=j)
-    mine = np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]])
-    lines = [
-        *_strings(plan.start[mine], plan.end[mine], string=plan.string[mine]),
-        *_ruling(plan, i, j=j, box=box),
-    ]
-    cells = _noded_faces(lines, box)
+    cells = _noded_faces(plan, np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]]), tile=(i, j))
     row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(cells.polygon)))
     row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
@@ -338,20 +334,6 @@ def _by_tile(start: Float, end: Float, *, low: Ints, count: Ints, tile_size: flo
     return segment[order], offset
 
 
-def _strings(start: Float, end: Float, *, string: Ints) -> NDArray[np.object_]:
-    """Line strings of segments, joined where one outline runs on."""
-    if len(start) == 0:
-        return np.empty(0, object)
-    fresh = np.ones(len(start), bool)
-    fresh[1:] = (string[1:] != string[:-1]) | (start[1:] != end[:-1]).any(axis=1)
-    run = np.cumsum(fresh) - 1
-    coords = np.concatenate([start[fresh], end])
-    line = np.concatenate([np.arange(run[-1] + 1), run])
-    order = np.argsort(line, kind="stable")  # a run's first start comes before its ends
-    lines: NDArray[np.object_] = shapely.linestrings(coords[order], indices=line[order])
-    return lines
-
-
 def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
     """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
     if follows_relief(plan, i, j=j):
@@ -365,8 +347,8 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
     return np.unique(np.concatenate([np.empty(0), *steps]))
 
 
-def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[object]:
-    """The tile's sides, and the terrain's lines across it.
+def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[Float]:
+    """The tile's sides, and the terrain's lines across it, as vertices (n, 2).
 
     A side has a vertex at every line and every vertex of the relief of both tiles that share it, and at every
     corner of a square, so that tiles of any span agree.
@@ -391,11 +373,11 @@ def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float,
         (xmax, ymin), *((xmax, y) for y in right),
         (xmax, ymax), *((x, ymax) for x in top[::-1]),
         (xmin, ymax), *((xmin, y) for y in left[::-1]),
+        (xmin, ymin),
     ]  # fmt: skip
-    ruling: list[object] = [shapely.LinearRing(ring)]
-    ruling += [shapely.LineString([(x, ymin), (x, ymax)]) for x in _multiples(xmin, xmax, own)]
-    ruling += [shapely.LineString([(xmin, y), (xmax, y)]) for y in _multiples(ymin, ymax, own)]
-    return ruling
+    across = [[(x, ymin), (x, ymax)] for x in _multiples(xmin, xmax, own)]
+    across += [[(xmin, y), (xmax, y)] for y in _multiples(ymin, ymax, own)]
+    return [np.array(line) for line in (ring, *across)]
 
 
 def _kept_on_sides(plan: GroundPlan, i: int, *, j: int) -> list[Float]:
@@ -440,21 +422,18 @@ def _stops(
     return np.concatenate(stops)[1:]
 
 
-def _noded_faces(lines: Sequence[object], box: tuple[float, float, float, float]) -> Faces:
-    """The cells within the box between lines, which are noded together first."""
-    noded = shapely.get_parts(shapely.union_all(lines, grid_size=PRECISION))
-    coords, line = shapely.get_coordinates(noded, return_index=True)
-    points, number = distinct(coords)
-    count = shapely.get_num_points(noded) - 1
-    begin = np.repeat(np.cumsum(count) - count, count)
-    nth, count = np.arange(len(begin)) - begin, np.repeat(count, count)
-    follows = line[:-1] == line[1:]
-    return faces(
-        points,
-        np.stack([number[:-1][follows], number[1:][follows]]),
-        rank=2 * begin + np.stack([nth, 2 * count - 1 - nth]),
-        box=box,
-    )
+def _noded_faces(plan: GroundPlan, outlines: Ints, *, tile: tuple[int, int]) -> Faces:
+    """The cells of a tile between segments of the outlines, its sides and the terrain's lines."""
+    box = tile_box(plan, tile[0], j=tile[1])
+    ruling = _ruling(plan, tile[0], j=tile[1], box=box)
+    start = np.concatenate([plan.start[outlines], *(line[:-1] for line in ruling)])
+    end = np.concatenate([plan.end[outlines], *(line[1:] for line in ruling)])
+    string = np.repeat(np.arange(-len(ruling), 0), [len(line) - 1 for line in ruling])
+    string = np.concatenate([plan.string[outlines], string])
+    start, end = (np.round(ends / PRECISION).astype(np.int64) for ends in (start, end))
+    fresh = np.append(True, (string[1:] != string[:-1]) | (start[1:] != end[:-1]).any(axis=1))
+    points, ends, rank = snap_rounded(start, end, fresh=fresh)
+    return faces(np.asarray(points * PRECISION, float), ends, rank=rank, box=box)
 
 
 def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
