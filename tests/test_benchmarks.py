@@ -96,7 +96,7 @@ def test_a_quick_run_measures_every_subject_against_its_references(quick):
         assert all(side["wall_s"][0] > 0 for side in case["sides"].values())
     assert {"geoscene", "pyosmium, areas", "pyosmium, objects"} <= sides["reading a map"]
     assert {"geoscene", "numpy", "lidar", "numpy, embreex"} <= sides["reading a scene"]
-    assert {"lidar", "embreex"} <= sides["casting"]
+    assert {"lidar", "embreex", "1 thread", "2 threads"} <= sides["casting"]
     assert {"lidar", "rays alone", "1 worker", "2 workers"} <= sides["driving"]
     assert {"lidar", "laspy", "numpy"} <= sides["writing"]
     assert {"1 worker", "2 workers"} <= sides["building"]

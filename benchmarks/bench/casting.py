@@ -55,6 +55,16 @@ def casting(setup: Setup) -> Iterator[Case]:
             sides = casters(vertices, faces, loop=loop, poses=poses, index=index, directions=directions)
             rays = len(directions) * frames / 1e6
             yield Case("casting", f"{sensor}, {len(faces):,} triangles", rays, "M rays", sides, _NOTE)
+            if sensor == "VLP-16":
+                yield Case(
+                    "casting",
+                    f"{sensor}, {len(faces):,} triangles, threads",
+                    rays,
+                    "M rays",
+                    sides=shared(vertices, faces, poses=poses, index=index, directions=directions),
+                    note="threads share each frame of 28,800 rays",
+                    clock="wall",
+                )
 
 
 def missing() -> list[str]:
@@ -91,6 +101,19 @@ def casters(
     if find_spec("open3d") is not None:
         sides["open3d"] = _open3d(here, faces, single)
     return sides
+
+
+def shared(
+    vertices: Float, faces: Ints, *, poses: list[Poses], index: Ints, directions: Float
+) -> dict[str, Work]:
+    """Functions by name that cast all rays of all poses, a pose at a time, by two threads and by one."""
+    caster = Caster(vertices, faces)
+    return {
+        f"{n} thread{'s'[: n > 1]}": lambda n=n: (
+            [caster.cast_posed(p, index, directions=directions, threads=n) for p in poses][-1].range
+        )
+        for n in (2, 1)
+    }
 
 
 def _open3d(vertices: Float, faces: Ints, rays: list[tuple[NDArray[np.float32], ...]]) -> Work:
