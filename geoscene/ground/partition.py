@@ -23,7 +23,7 @@ from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.faces import Faces, faces
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
-from geoscene.ground.snapping import snap_rounded
+from geoscene.ground.snapping import distinct_places, snap_rounded
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9
@@ -290,12 +290,8 @@ def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], *, base: obje
 
 def distinct(points: Float) -> tuple[Float, Ints]:
     """Points (k, 2) on the grid, sorted by x, then y, each once, and the number (n,) of each given one."""
-    grid = np.round(points / PRECISION).astype(np.int64)
-    low = grid.min(axis=0, initial=np.iinfo(np.int64).max)
-    grid -= low
-    height = int(grid[:, 1].max(initial=0)) + 1  # two sides of a tile in grid steps: far below 2**63
-    key, number = np.unique(grid[:, 0] * height + grid[:, 1], return_inverse=True)
-    return (np.stack(np.divmod(key, height), axis=1) + low) * PRECISION, number
+    places, number = distinct_places(np.round(points / PRECISION).astype(np.int64))
+    return np.asarray(places * PRECISION, float), number
 
 
 def _snap(values: Float) -> Float:

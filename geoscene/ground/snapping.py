@@ -46,6 +46,18 @@ def snap_rounded(start: Ints, end: Ints, *, fresh: Bools) -> tuple[Ints, Ints, I
     return points, np.stack([a[once], b[once]]), _ranks(begins)[:, once]
 
 
+def distinct_places(places: Ints) -> tuple[Ints, Ints]:
+    """Places (k, 2), sorted by x, then y, each once, and the number (n,) of each given one (n, 2).
+
+    They lie within a few sides of a tile: the product of their extents is below 2**63.
+    """
+    low = places.min(axis=0, initial=np.iinfo(np.int64).max)
+    x, y = (places - low).T
+    height = int(y.max(initial=0)) + 1
+    key, number = np.unique(x * height + y, return_inverse=True)
+    return np.stack(np.divmod(key, height), axis=1) + low, number
+
+
 def _crossings(start: Ints, end: Ints, *, pairs: Ints) -> Ints:
     """The grid points (m, 2) nearest to where pairs of segments cross between their ends."""
     one, other = pairs[:, pairs[0] < pairs[1]]
@@ -69,14 +81,12 @@ def _rounded(start: Ints, direction: Ints, *, part: Ints, whole: Ints) -> Ints:
 
 def _hot_pixels(start: Ints, end: Ints, *, fresh: Bools, crossings: Ints) -> tuple[Ints, Ints, Bools]:
     """Hot pixels (k, 2), numbers (2, n) of segments' ends, and where several ends or a crossing lie."""
-    n, every = len(start), np.concatenate([start, end, crossings])
-    low = every.min(axis=0)
-    height = int(every[:, 1].max() - low[1]) + 1
-    key, number = np.unique((every[:, 0] - low[0]) * height + every[:, 1] - low[1], return_inverse=True)
+    n = len(start)
+    points, number = distinct_places(np.concatenate([start, end, crossings]))
     ends = np.append(number[:n][fresh], number[n:])
-    met = np.bincount(ends, minlength=len(key)) > 1
+    met = np.bincount(ends, minlength=len(points)) > 1
     met[number[2 * n :]] = True
-    return np.stack(np.divmod(key, height), axis=1) + low, number[: 2 * n].reshape(2, n), met
+    return points, number[: 2 * n].reshape(2, n), met
 
 
 def _passed(
