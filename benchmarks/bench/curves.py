@@ -78,7 +78,7 @@ def growth(setup: Setup) -> Iterator[Curve]:
         "tree of triangles",
         {n: (_tree, n) for n in sizes(setup, "triangles")},
         size="triangles",
-        note="Embree's tree and the tables of a caster over a synthetic city; Embree builds on all cores",
+        note="Embree's tree and the tables of a caster over a synthetic city, on one core",
     )
     yield _rays_into_triangles(setup)
     _ = setup.scene  # built here, not in the processes that are measured

@@ -16,7 +16,7 @@ import shapely
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from bench.measure import Case, Spent, command
+from bench.measure import Case, Spent, alone, command
 from bench.scenes import QUICK_BOX, Setup
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.frames import Frame
@@ -155,9 +155,13 @@ def reading_scenes(setup: Setup) -> Iterator[Case]:
             f"{name}: ready for rays",
             size,
             "MB",
-            {"lidar": lambda s=scene: _world(s), "numpy, embreex": lambda s=scene: _plain_world(s)},
-            "lidar: tables of surfaces, and instances of trees and furniture, too; embreex: tiles' own"
-            " triangles as one mesh. Embree builds on all cores",
+            {
+                side: partial(_apart, load, scene.path)
+                for side, load in {"lidar": _world, "numpy, embreex": _plain_world}.items()
+            },
+            "each in a process of its own, without imports. lidar: tables of surfaces, and instances of trees"
+            " and furniture, too, on one core; embreex: tiles' own triangles as one mesh, on all cores",
+            processes=True,
         )
 
 
@@ -174,8 +178,20 @@ def _arrays(scene: Scene) -> list[dict[str, Any]]:
     return found
 
 
-def _world(scene: Scene) -> float:
-    return _first_hit(World.load(open_scene(scene.path)).caster.cast)
+def _apart(load: Callable[[Path], float], path: Path) -> Spent:
+    """Cost of loading a scene in a process that has loaded it once before, and so has grown before."""
+    cost = alone(_warm, load, path)
+    return Spent(cost.wall_s, cost.cpu_s)
+
+
+def _warm(load: Callable[[Path], float], path: Path) -> Callable[[], float]:
+    """Loading of a scene, done once before."""
+    load(path)
+    return lambda: load(path)
+
+
+def _world(path: Path) -> float:
+    return _first_hit(World.load(open_scene(path)).caster.cast)
 
 
 def _first_hit(cast: Callable[..., Any]) -> float:
@@ -183,9 +199,9 @@ def _first_hit(cast: Callable[..., Any]) -> float:
     return float(cast(np.array([[0.0, 0.0, 100.0]]), np.array([[0.0, 0.0, -1.0]])).range[0])
 
 
-def _plain_world(scene: Scene) -> float:
+def _plain_world(path: Path) -> float:
     """Embree's tree over the triangles of all tiles, by numpy and embreex; the first range."""
-    tiles = _arrays(scene)
+    tiles = _arrays(open_scene(path))
     first = np.cumsum([0, *(len(tile["vertices"]) for tile in tiles)])
     vertices = np.concatenate([tile["vertices"] + tile["origin"] for tile in tiles])
     faces = np.concatenate([tile["faces"] + k for tile, k in zip(tiles, first, strict=False)])

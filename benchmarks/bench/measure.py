@@ -12,10 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, TypeVar
 
 from geoscene.errors import GeosceneError
 from geoscene.memory import peak_memory
+
+T = TypeVar("T")
 
 SAMPLE_S = 0.2
 """Seconds between two samples of a command's memory."""
@@ -142,10 +144,15 @@ def alone(function: Callable[..., Callable[[], object]], *arguments: object) -> 
 
     function : prepares the work and warms up, and returns the work; of a module, so that it can be imported
     """
+    return apart(_in_child, function, arguments)
+
+
+def apart(function: Callable[..., T], *arguments: object) -> T:
+    """What a function of a module returns in a new process, where no thread of earlier work runs."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([function.__module__])  # imports once: children are forks of the server
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_in_child, function, arguments).result()
+        return pool.submit(function, *arguments).result()
 
 
 def _in_child(function: Callable[..., Callable[[], object]], arguments: tuple[object, ...]) -> Spent:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from bench import casting, drives, files, helios, maps
-from bench.measure import Case
+from bench.measure import Case, Result, measured
 from bench.scenes import Setup
 
 CASES: dict[str, Callable[[Setup], Iterator[Case]]] = {
@@ -22,3 +22,8 @@ CASES: dict[str, Callable[[Setup], Iterator[Case]]] = {
 
 SUBJECTS = (*CASES, "growth")
 """All subjects, in the order of a run."""
+
+
+def results(subject: str, setup: Setup) -> list[Result]:
+    """All cases of a subject, measured."""
+    return [measured(case, repetitions=setup.repetitions) for case in CASES[subject](setup)]
