@@ -195,11 +195,14 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
 
 
 def _parts(n: int, threads: int) -> list[tuple[int, int]]:
-    """Bounds of parts of n rays, in whole chunks: large ones first, as calls cost time, then smaller ones."""
+    """Bounds of parts of n rays, in whole chunks: two thirds of an equal share of what is left, so few calls.
+
+    The last part is the smallest, but at least a chunk, so that threads end at about the same time.
+    """
     bounds = [0]
-    while bounds[-1] < n:
-        left = n - bounds[-1]
-        bounds.append(min(n, bounds[-1] + CHUNK * max(1, left // (2 * threads * CHUNK))))
+    while (left := n - bounds[-1]) > 0:
+        end = bounds[-1] + CHUNK * -(-2 * left // (3 * threads * CHUNK))
+        bounds.append(end if n - end >= CHUNK else n)
     return list(pairwise(bounds))
 
 
