@@ -39,19 +39,22 @@ def intersecting_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) 
     return pairs[crossing]
 
 
-def close_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) -> tuple[Ints, Bools]:
+def close_faces(
+    cells: Ints, faces: Ints, *, owner: NDArray[np.integer], body: Ints | None = None
+) -> tuple[Ints, Bools]:
     """Pairs (k, 2) of faces of one owner that are closer than `CLEARANCE`, and whether they cross or touch.
 
-    The vertices and edges that two faces share do not count.
+    The vertices and edges that two faces share do not count, nor do, with ``body``, pairs of one body.
 
     cells : (n, 3) whole grid numbers of the vertices, each place once per owner; all within 2**27 of another
     faces : (m, 3) vertices of each face, none degenerate
     owner : (m,) number of the solid that each face belongs to
+    body  : (m,) number of the body within the solid, ascending
     """
     if not len(faces):
         return np.empty((0, 2), np.int64), np.empty(0, np.bool_)
     corners = cells[faces]
-    i, j = _near_pairs(corners, owner)
+    i, j = _near_pairs(corners, owner, body=body)
     planes = _Planes.of(corners, faces)
     found, crossing = [np.empty((0, 2), np.int64)], [np.empty(0, np.bool_)]
     for first in range(0, len(i), _AT_ONCE):
@@ -64,19 +67,20 @@ def close_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) -> tupl
     return np.concatenate(found), np.concatenate(crossing)
 
 
-def _near_pairs(corners: Ints, owner: NDArray[np.integer]) -> tuple[Ints, Ints]:
-    """Pairs i < j of triangles (m, 3, 3) of one owner whose boxes overlap."""
+def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None) -> tuple[Ints, Ints]:
+    """Pairs i < j of triangles (m, 3, 3) of one owner, and of two bodies if given, whose boxes overlap."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     # owners stand apart, so that triangles find only those of their own
     apart = owner * float(high[:, 0].max() - low[:, 0].min() + 1)
     boxes = shapely.box(low[:, 0] + apart, low[:, 1], high[:, 0] + apart, high[:, 1])
     tree = shapely.STRtree(boxes)
     bottom, top = low[:, 2].copy(), high[:, 2].copy()
-    found = []
-    for first in range(0, len(boxes), 20_000):
-        i, j = tree.query(boxes[first : first + 20_000])
-        i += first
-        above = i < j
+    start = 0 if body is None else int(np.searchsorted(body, body[0], side="right"))  # the first body asks none
+    found = [np.empty((2, 0), np.int64)]
+    for first in range(start, len(boxes), 20_000):
+        j, i = tree.query(boxes[first : first + 20_000])
+        j += first
+        above = i < j if body is None else body[i] < body[j]
         i, j = i[above], j[above]
         near = (bottom[i] <= top[j]) & (bottom[j] <= top[i])
         found.append(np.stack([i[near], j[near]]))

@@ -67,9 +67,8 @@ def _clear(tube: Mesh, bodies: list[Mesh]) -> Bools:
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     ids, first = weld(corners, np.zeros(len(corners), np.int64))
     pairs, _ = close_faces(
-        grid_cells(corners[first]), ids.reshape(-1, 3), owner=np.zeros(len(mesh), np.int64)
+        grid_cells(corners[first]), ids.reshape(-1, 3), owner=np.zeros(len(mesh), np.int64), body=body
     )
-    met = np.unique(np.sort(body[pairs], axis=1), axis=0)
-    for one, other in met[met[:, 0] != met[:, 1]].tolist():
+    for one, other in np.unique(body[pairs], axis=0).tolist():
         clear[other] &= one >= 0 and not clear[one]
     return clear

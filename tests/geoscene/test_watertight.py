@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from geoscene.intersections import distances, intersecting_faces
+from geoscene.intersections import close_faces, distances, intersecting_faces
 from geoscene.mesh import Mesh, concatenate
 from geoscene.watertight import validate_mesh
 
@@ -233,6 +233,19 @@ def test_faces_intersect_as_linear_programs_say():
         far = points + rng.integers(-(10**7), 10**7, 3)
         hit = len(intersecting_faces(far, faces, owner=np.zeros(2, np.int64))) == 1
         assert hit == common_points(*points[faces].astype(float), shared=shared)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_of_several_bodies_only_faces_of_different_ones_count(seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, 400, (120, 3))
+    faces, none = np.arange(120).reshape(40, 3), np.zeros(40, np.int64)
+    body = np.sort(rng.integers(0, 4, 40))
+    pairs, _ = close_faces(cells, faces, owner=none)
+    between = pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
+    found, _ = close_faces(cells, faces, owner=none, body=body)
+    assert 0 < len(between) < len(pairs)
+    assert sorted(found.tolist()) == sorted(between.tolist())
 
 
 def test_a_triangle_without_area_is_as_far_away_as_its_edges():
