@@ -25,7 +25,7 @@ from geoscene.ground.layers import (
     SIDEWALKS,
     Layers,
 )
-from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
+from geoscene.ground.partition import GroundPlan, Partition, rows_at, rows_near, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
 from geoscene.typing import Bools, Float, Ints
 
@@ -157,6 +157,10 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
     What touches a carriageway, water or a tunnel's mouth is not raised. The height of a vertex on a tile's
     border depends on all layers there, so that neighbouring tiles agree.
     """
+    low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
+    near = rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])
+    if not _is_raised(plan.layers.priority[near]).any():
+        return np.zeros(len(triangles.points))
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3).astype(np.int64)
     edge = on_border(plan, cells, triangles=triangles)
@@ -180,7 +184,7 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
 
     priority = values_at(plan.layers.priority, row, base=-1.0)
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
-    raised = touched(((priority >= SIDEWALKS) & (priority <= SIDEWALK_ENDS)) | _is_kerb(priority))
+    raised = touched(_is_raised(priority))
     height = np.where(raised, KERB, 0.0)
     height[raised & beside(touched(priority == LOWERED))] = KERB_LOWERED
     height[beside(touched(priority == FLUSH)) | touched(np.isin(klass, _LEVEL))] = 0.0
@@ -190,8 +194,10 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
     return height
 
 
-def _is_kerb(priority: Float) -> Bools:
-    return (priority >= KERBS) & (priority <= RAISED)
+def _is_raised(priority: Float) -> Bools:
+    """Whether rows are sidewalks or kerbs."""
+    sidewalk = (priority >= SIDEWALKS) & (priority <= SIDEWALK_ENDS)
+    return sidewalk | ((priority >= KERBS) & (priority <= RAISED))
 
 
 def on_border(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Bools:

@@ -191,13 +191,13 @@ def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     place = tile_place(plan, i, j=j)
     if place is None:
         raise InputError(f"tile ({i}, {j}) is not one of the {len(plan.tiles)} tiles of the ground")
-    box = tile_box(plan, i, j=j)
-    cells = _noded_faces(plan, np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]]), tile=(i, j))
-    row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(cells.polygon)))
-    row, slivers = _without_slivers(cells, row=row)
-    level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
-    joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
-    polygon = shapely.coverage_simplify(joined, BEND, simplify_boundary=False)
+    outlines = np.sort(plan.order[plan.offset[place] : plan.offset[place + 1]])
+    sides, *across = ruling = _ruling(plan, i, j=j, box=tile_box(plan, i, j=j))
+    if len(outlines) or across:
+        polygon, row, slivers = _cells(plan, outlines, ruling=ruling, tile=(i, j))
+    else:  # one cell: faces run clockwise
+        polygon, slivers = shapely.polygons(_snap(sides)[None, ::-1]), 0
+        row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(polygon)))
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
     material = values_at(plan.layers.material, row, base=plan.base[1])
     feature = values_at(plan.layers.feature, row, base=-1)
@@ -418,10 +418,24 @@ def _stops(
     return np.concatenate(stops)[1:]
 
 
-def _noded_faces(plan: GroundPlan, outlines: Ints, *, tile: tuple[int, int]) -> Faces:
+def _cells(
+    plan: GroundPlan, outlines: Ints, *, ruling: list[Float], tile: tuple[int, int]
+) -> tuple[NDArray[np.object_], Ints, int]:
+    """The cells of a tile: polygons, the row that each is of, and how many slivers joined a neighbour."""
+    i, j = tile
+    box = tile_box(plan, i, j=j)
+    cells = _noded_faces(plan, outlines, ruling=ruling, box=box)
+    row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(cells.polygon)))
+    row, slivers = _without_slivers(cells, row=row)
+    level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
+    joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
+    return shapely.coverage_simplify(joined, BEND, simplify_boundary=False), row, slivers
+
+
+def _noded_faces(
+    plan: GroundPlan, outlines: Ints, *, ruling: list[Float], box: tuple[float, float, float, float]
+) -> Faces:
     """The cells of a tile between segments of the outlines, its sides and the terrain's lines."""
-    box = tile_box(plan, tile[0], j=tile[1])
-    ruling = _ruling(plan, tile[0], j=tile[1], box=box)
     start = np.concatenate([plan.start[outlines], *(line[:-1] for line in ruling)])
     end = np.concatenate([plan.end[outlines], *(line[1:] for line in ruling)])
     string = np.repeat(np.arange(-len(ruling), 0), [len(line) - 1 for line in ruling])

@@ -85,8 +85,8 @@ def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tup
 
 def forest_tree_count(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> int:
     """The number of `forest_trees`, which are not made."""
-    floor = ground.take(ground.klass == Class.FOREST_FLOOR)
-    return len(_places(floor, forests, box=box)[0])
+    is_floor = ground.klass == Class.FOREST_FLOOR
+    return len(_places(ground.take(is_floor), forests, box=box)[0]) if is_floor.any() else 0
 
 
 def forest_instances(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> Instances:

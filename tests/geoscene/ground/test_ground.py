@@ -91,6 +91,26 @@ def test_the_ground_is_one_surface_across_joined_tiles_and_the_others_do_not_cha
             assert np.isin(alone.vertices[:, :2], meshes[i, j].vertices[:, :2]).all()
 
 
+def test_a_tile_that_nothing_crosses_has_the_vertices_that_noding_gives_it():
+    field, hidden = (
+        shapely.box(-20, -20, 20, 20),
+        shapely.box(4, 0, 8, 4),
+    )  # the tile's sides, below the field
+
+    def cells(polygons):
+        layers = Layers.of(
+            polygons, klass=Class.TERRAIN, material=GRASS, priority=np.arange(len(polygons))[::-1]
+        )
+        plan = plan_ground((-12, -12, 12, 12), layers, tile_size=4.0, lines=1.0, ruled=[(0, 0)])
+        return partition_tile(plan, 1, j=0)
+
+    bare, noded = cells([field]), cells([field, hidden])
+    assert bare.row.tolist() == noded.row.tolist() == [0]
+    corners = shapely.get_coordinates(bare.polygon)
+    assert shapely.equals_exact(*shapely.normalize([bare.polygon[0], noded.polygon[0]]))
+    assert {(4.0, y) for y in range(5)} <= set(map(tuple, corners.tolist()))  # the lines of the tile beside
+
+
 def test_outlines_along_the_border_of_the_extent_do_not_keep_squares_apart():
     sea = shapely.box(0, 0, 1500, 1600) - shapely.box(500, 500, 520, 520)
     layers = Layers.of([sea], klass=Class.WATER, material=GRASS, priority=0)
