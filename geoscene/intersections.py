@@ -75,7 +75,8 @@ def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None)
     boxes = shapely.box(low[:, 0] + apart, low[:, 1], high[:, 0] + apart, high[:, 1])
     tree = shapely.STRtree(boxes)
     bottom, top = low[:, 2].copy(), high[:, 2].copy()
-    start = 0 if body is None else int(np.searchsorted(body, body[0], side="right"))  # the first body asks none
+    # the first body, of which there is most, is only asked
+    start = 0 if body is None else int(np.searchsorted(body, body[0], side="right"))
     found = [np.empty((2, 0), np.int64)]
     for first in range(start, len(boxes), 20_000):
         j, i = tree.query(boxes[first : first + 20_000])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,19 +54,19 @@ def writing(setup: Setup) -> Iterator[Case]:
     folder = setup.folder
     for name in ("las", "laz"):
         sides = {
-            "lidar": partial(_written, name, folder / f"ours.{name}", world, info=info),
-            "laspy": partial(laspy_written, folder / f"theirs.{name}", world, info=info),
+            "lidar": _anew(_written, folder / f"ours.{name}", name, world, info=info),
+            "laspy": _anew(laspy_written, folder / f"theirs.{name}", world, info=info),
         }
         note = (
             "same points, columns and CRS. lidar: class codes from labels, 15 echoes at most, millimetres"
             " checked, a complete file or none; laspy: finished columns, through its scaled x, y, z"
         )
         yield Case("writing", name.upper(), rows(world) / 1e6, "M points", sides, note)
-    note = "same bytes after the header; numpy: fields copied into records, then tofile, in place"
+    note = "same bytes after the header; numpy: fields copied into records, then tofile"
     for name, plain in (("pcd", numpy_pcd), ("kitti", numpy_kitti)):
         sides = {
-            "lidar": partial(_written, name, folder / f"ours.{name}", local),
-            "numpy": partial(plain, folder / f"theirs.{name}", local),
+            "lidar": _anew(_written, folder / f"ours.{name}", name, local),
+            "numpy": _anew(plain, folder / f"theirs.{name}", local),
         }
         yield Case("writing", name.upper(), rows(local) / 1e6, "M points", sides, note)
     yield from _others(folder, world=world, local=local, info=info)
@@ -87,19 +87,19 @@ def _others(folder: Path, *, world: Table, local: Table, info: LasInfo) -> Itera
     }
     for name, (side, plain, note) in theirs.items():
         sides = {
-            "lidar": partial(_written, name, folder / f"ours{FORMATS[name].suffix}", local),
-            side: partial(plain, folder / f"theirs{FORMATS[name].suffix}", local),
+            "lidar": _anew(_written, folder / f"ours{FORMATS[name].suffix}", name, local),
+            side: _anew(plain, folder / f"theirs{FORMATS[name].suffix}", local),
         }
         yield Case("writing", name.upper(), rows(local) / 1e6, "M points", sides, note)
     sides = {
-        "lidar": partial(_written, "e57", folder / "ours.e57", world, info=info),
-        "pye57": partial(pye57_written, folder / "theirs.e57", world, info=info),
+        "lidar": _anew(_written, folder / "ours.e57", "e57", world, info=info),
+        "pye57": _anew(pye57_written, folder / "theirs.e57", world, info=info),
     }
     note = "lidar: all columns, an identifier from the content; pye57: x, y, z, intensity and row only"
     yield Case("writing", "E57", rows(world) / 1e6, "M points", sides, note)
     sides = {
-        "lidar": partial(map_written, folder / "ours.copc.laz", colored, info=info, columns=names),
-        "laspy": partial(laspy_written, folder / "theirs.laz", world, info=info),
+        "lidar": _anew(map_written, folder / "ours.copc.laz", colored, info=info, columns=names),
+        "laspy": _anew(laspy_written, folder / "theirs.laz", world, info=info),
     }
     note = "lidar: an octree of samples; laspy: plain LAZ in the order of firing, without colours"
     yield Case("writing", "COPC", rows(world) / 1e6, "M points", sides, note)
@@ -145,8 +145,18 @@ def pye57_written(path: Path, table: Table, *, info: LasInfo) -> None:
         file.write_scan_raw(data, translation=np.array(info.offset))
 
 
-def _written(name: str, path: Path, table: Table, **info: Any) -> None:
+def _written(path: Path, name: str, table: Table, **info: Any) -> None:
     FORMATS[name].write(path, table, **info)
+
+
+def _anew(write: Callable[..., None], path: Path, *arguments: object, **named: object) -> Callable[[], None]:
+    """Writing of a file that is not there, as in a drive: replacing one waits for the disk."""
+
+    def written() -> None:
+        path.unlink(missing_ok=True)
+        write(path, *arguments, **named)
+
+    return written
 
 
 def _las_header(info: LasInfo, *, point_format: int, extra: tuple[str, ...]) -> Any:
