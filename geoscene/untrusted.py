@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import tomllib
 import zipfile
 import zlib
+from io import BytesIO
 from pathlib import Path
 from typing import IO, Any
 
@@ -20,6 +22,10 @@ DAMAGED_ARCHIVE = (
 
 _PARSING = threading.Lock()
 """NumPy parses headers as Python, which fails now and then in CPython 3.11 if two threads do so."""
+
+
+_LONGEST = 10_000
+"""Bytes of a header at most, as NumPy has it."""
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
@@ -38,9 +44,15 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
 def array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Shape, whether it is stored by columns, and type of the array in a member of an .npz file."""
     version = np.lib.format.read_magic(member)
-    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    size = member.read(2 if version == (1, 0) else 4)
+    return _parsed(version, size + member.read(min(int.from_bytes(size, "little"), _LONGEST)))
+
+
+@functools.lru_cache(maxsize=4096)  # columns of one table have one header
+def _parsed(version: tuple[int, int], header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     with _PARSING:
-        shape, by_columns, kind = header(member)
+        shape, by_columns, kind = read(BytesIO(header))
     return shape, by_columns, kind
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -67,9 +68,17 @@ def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         for name, array in arrays.items():
             entry = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
-            buffer = BytesIO()
-            np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(entry, buffer.getvalue(), compresslevel=1)
+            plain = np.ascontiguousarray(array)
+            archive.writestr(entry, _header(plain.dtype, plain.shape) + plain.tobytes(), compresslevel=1)
+    return out.getvalue()
+
+
+@functools.lru_cache(maxsize=4096)  # columns of one table have one header
+def _header(kind: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    """The header of an .npy file."""
+    out = BytesIO()
+    descr = np.lib.format.dtype_to_descr(kind)
+    np.lib.format.write_array_header_1_0(out, {"descr": descr, "fortran_order": False, "shape": shape})
     return out.getvalue()
 
 

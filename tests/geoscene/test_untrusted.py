@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from geoscene.scene.tile_files import pack
 from geoscene.untrusted import DAMAGED_ARCHIVE, read_arrays, read_toml
 
 KINDS = st.sampled_from(["f4", "f8", "i4", "u1", "i8", "?", "U3"])
@@ -65,3 +66,13 @@ def test_bytes_that_are_no_archive_are_refused(data):
 def test_toml_without_an_end_is_an_error_of_toml(value):
     with pytest.raises(tomllib.TOMLDecodeError):
         read_toml(f"a = {value}")
+
+
+@given(arrays.arrays(KINDS, arrays.array_shapes(min_dims=1, max_dims=3, min_side=0)), st.booleans())
+def test_columns_of_tiles_are_files_as_numpy_writes_them(array, by_columns):
+    plain = io.BytesIO()
+    np.save(plain, np.ascontiguousarray(array))
+    with zipfile.ZipFile(
+        io.BytesIO(pack({"a": np.asfortranarray(array) if by_columns else array}))
+    ) as archive:
+        assert archive.read("a.npy") == plain.getvalue()
