@@ -1,9 +1,9 @@
 """Subject casting: lidar's caster, native Embree loops, embreex as trimesh calls it, and Open3D.
 
-The native loops are C, compiled by gcc -O3 -march=native if gcc is installed. For each packet of 16, "native"
-rotates float64 directions by the rays' float64 poses, rounds them to float32, calls rtcIntersect16 of the
-same library on the same scene with the same flags, and writes 8 bytes per ray: Embree's float32 range and
-the face number. It has no exact range, cosine, instances, range limits or input checks, and does not retry
+The native loops are C, compiled by gcc -O3 -march=native if gcc is installed. For each packet, of as many rays
+as lidar's, "native" rotates float64 directions by the rays' float64 poses, rounds them to float32, calls
+rtcIntersect16, 8 or 4 of the same library on the same scene with the same flags, and writes 8 bytes per ray:
+Embree's float32 range and the face number. It has no exact range, cosine, instances, range limits or input checks, and does not retry
 rays that miss or hit a back face. It is the upper limit. "native, exact" is the same loop with the columns of
 lidar's hits: the range and the cosine in float64 from the plane of the face, face and instance, 20 bytes per
 ray. It has no range limits and checks, does not test hits near edges and does not retry.
@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Thread
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -88,7 +88,7 @@ def casters(
     sides: dict[str, Work] = {
         "lidar": lambda: [caster.cast_posed(p, index, directions=directions) for p in poses][-1].range
     }
-    if _traces(loop):
+    if loop is not None:
         for name, exact in (("native", False), ("native, exact", True)):
             sides[name] = lambda exact=exact: [
                 native_ranges(loop, caster, p, index, directions, exact=exact) for p in poses
@@ -134,14 +134,9 @@ def shared(
         other.join()
 
     sides: dict[str, Work] = {"2 threads": lambda: cast(2), "1 thread": lambda: cast(1)}
-    if _traces(loop):
+    if loop is not None:
         sides |= {"native, 2 threads": by_two, "native, 1 thread": lambda: cast_native(poses)}
     return sides
-
-
-def _traces(loop: c.CDLL | None) -> TypeGuard[c.CDLL]:
-    """Whether the native loop is there and this machine has its packets of 16 rays."""
-    return loop is not None and library().width == 16
 
 
 def _open3d(vertices: Float, faces: Ints, rays: list[tuple[NDArray[np.float32], ...]]) -> Work:
@@ -156,12 +151,13 @@ def _open3d(vertices: Float, faces: Ints, rays: list[tuple[NDArray[np.float32], 
 
 
 def native(folder: Path) -> c.CDLL | None:
-    """The compiled native loop; None without gcc."""
-    if shutil.which("gcc") is None:
+    """The native loops, compiled for this machine's packets; None without gcc or packets."""
+    if shutil.which("gcc") is None or library().width == 1:
         return None
     built = folder / "native.so"
     subprocess.run(
-        ["gcc", "-O3", "-march=native", "-shared", "-fPIC", "-o", str(built), str(_NATIVE)], check=True
+        ["gcc", "-O3", "-march=native", f"-DW={library().width}", "-shared", "-fPIC", "-o", built, _NATIVE],
+        check=True,
     )
     return c.CDLL(str(built))
 
@@ -175,7 +171,7 @@ def native_ranges(
     out: list[NDArray[Any]] = [np.empty(n, np.float64 if exact else np.float32), np.empty(n, np.int32)]
     if exact:
         out += np.empty(n, np.int32), np.empty(n, np.float32), caster.scene.parts[0].planes
-    trace = c.cast(lib.embree.rtcIntersect16, c.c_void_p)
+    trace = c.cast(getattr(lib.embree, f"rtcIntersect{lib.width}"), c.c_void_p)
     addresses = (target.scene, target.packet, *(a.ctypes.data for a in columns))
     (loop.cast_planes if exact else loop.cast)(
         trace,

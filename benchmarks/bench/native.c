@@ -1,8 +1,7 @@
-/* The native loops: see casting.py. */
+/* The native loops, for packets of W rays: see casting.py. */
 #include <math.h>
 #include <stdint.h>
 typedef void (*trace_t)(const int *, void *, void *, void *);
-#define W 16
 #define NONE 0xFFFFFFFFu
 struct packet {
   float ox[W], oy[W], oz[W], near[W], dx[W], dy[W], dz[W], time[W], far[W];
