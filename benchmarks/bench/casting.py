@@ -1,12 +1,13 @@
 """Subject casting: lidar's caster, native Embree loops, embreex as trimesh calls it, and Open3D.
 
-The native loops are C, compiled by gcc -O3 -march=native if gcc is installed. For each packet, of as many rays
-as lidar's, "native" rotates float64 directions by the rays' float64 poses, rounds them to float32, calls
+The native loops are C, compiled by gcc -O3 -march=native if gcc is installed. For each packet, of as many
+rays as lidar's, "native" rotates float64 directions by the rays' float64 poses, rounds them to float32, calls
 rtcIntersect16, 8 or 4 of the same library on the same scene with the same flags, and writes 8 bytes per ray:
-Embree's float32 range and the face number. It has no exact range, cosine, instances, range limits or input checks, and does not retry
-rays that miss or hit a back face. It is the upper limit. "native, exact" is the same loop with the columns of
-lidar's hits: the range and the cosine in float64 from the plane of the face, face and instance, 20 bytes per
-ray. It has no range limits and checks, does not test hits near edges and does not retry.
+Embree's float32 range and the face number. It has no exact range, cosine, instances, range limits or input
+checks, and does not retry rays that miss or hit a back face. It is the upper limit. "native, exact" is the
+same loop with the columns of lidar's hits: the range and the cosine in float64 from the plane of the face,
+face and instance, 20 bytes per ray. It has no range limits and checks, does not test hits near edges and
+does not retry.
 """
 
 from __future__ import annotations

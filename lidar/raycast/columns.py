@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
+from lidar.raycast.memory import float64_column, int32_column, int64_column, uint32_column
 
 COPIES = 256
 """Geometry numbers below this are for instances, numbers from it on for the mesh. Embree's commit visits all
@@ -60,6 +62,50 @@ class Target(NamedTuple):
     steps: NDArray[np.int64]
     transforms: Float
     groups: NDArray[np.int64]
+
+
+class Packed(NamedTuple):
+    """A target as kernels are given it: numba takes a microsecond for each array.
+
+    lanes : as of `Target`
+    words : int64, its other numbers, and addresses and lengths of its columns
+    """
+
+    lanes: tuple[int, ...]
+    words: NDArray[np.int64]
+
+
+def packed(target: Target) -> Packed:
+    """A target for kernels, of which the caller keeps the columns."""
+    columns = target[4:]
+    words = [target.scene, target.packet, target.single]
+    for column in columns:
+        words += [column.ctypes.data, len(column)]
+    return Packed(target.lanes, np.array(words, np.int64))
+
+
+@njit(nogil=True)
+def unpacked(given: Packed) -> Any:
+    """The target of `packed`."""
+    w = given.words
+    return Target(
+        w[0],
+        w[1],
+        w[2],
+        given.lanes,
+        float64_column(w[3], (w[4],)),
+        int64_column(w[5], (w[6], 9)),
+        int32_column(w[7], (w[8],)),
+        int64_column(w[9], (w[10],)),
+        int32_column(w[11], (w[12],)),
+        int32_column(w[13], (w[14],)),
+        int32_column(w[15], (w[16],)),
+        uint32_column(w[17], (w[18],)),
+        int64_column(w[19], (w[20],)),
+        int64_column(w[21], (w[22],)),
+        float64_column(w[23], (w[24], 12)),
+        int64_column(w[25], (w[26], 4)),
+    )
 
 
 class Rays(NamedTuple):

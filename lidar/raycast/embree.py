@@ -14,7 +14,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
 from lidar.raycast import library as rtc
-from lidar.raycast.columns import COPIES, Rays
+from lidar.raycast.columns import COPIES, Rays, packed
 from lidar.raycast.geometry import Geometry, Instances
 from lidar.raycast.rays import share
 from lidar.raycast.scene import Float64Scene
@@ -136,9 +136,10 @@ class EmbreeScene(Float64Scene):
             starts=np.cumsum([0, *(len(copied) for copied in self._copies)], dtype=np.int64),
             numbers=np.concatenate([np.empty(0, np.int32), *self._copies]).astype(np.int32),
         )
+        self.packed = packed(self.target)
 
     def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
         """Whether each ray hits anything."""
-        out, target = np.empty(len(rays.directions), np.bool_), self.target
+        out, target = np.empty(len(rays.directions), np.bool_), self.packed
         share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)
         return out

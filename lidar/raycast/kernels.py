@@ -21,12 +21,23 @@ from numpy.typing import NDArray
 
 from geoscene.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Rays, Target
+from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, Rays, Target, unpacked
 from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.hull import LONG, REACH, ROUNDING
-from lidar.raycast.lanes import GRAZING, START, cross, look_up, move_float64, move_int32, narrow, same
+from lidar.raycast.lanes import (
+    GRAZING,
+    START,
+    cross,
+    hits,
+    look_up,
+    move_float64,
+    move_int32,
+    narrow,
+    nudge,
+    sole,
+)
 from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
-from lidar.raycast.packets import alike, first_bad, gather, nudge, trace
+from lidar.raycast.packets import NUDGE, alike, first_bad, gather, trace
 from lidar.raycast.planes import INVALID, PLANE, intersection, numbered, outside, placed, plane_of, ray_of
 from lidar.raycast.rows import (
     COSINE,
@@ -77,21 +88,23 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
 
 @inlined
 def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
-    """Write planes, faces and instances of the lanes' hits; a miss gets a plane with a zero normal."""
+    """Write planes, faces and instances of the lanes' hits; what it writes for a miss means nothing."""
     for k in range(W):
         work[SCALE * W + k] = work[INVERSE * W + k]
-    geometry, copies = u.ctypes.data + 4 * HIT_GEOMETRY * W, u.ctypes.data + 4 * HIT_INSTANCE * W
-    own = u[HIT_GEOMETRY * W] != INVALID and u[HIT_INSTANCE * W] == INVALID
-    if own and same(target.lanes, geometry) and same(target.lanes, copies):
-        # The common case, all lanes on one mesh: look up the mesh once.
-        part = target.parts.ctypes.data + 8 * PART * np.int64(target.rows[u[HIT_GEOMETRY * W]])
+    geometry, number = u.ctypes.data + 4 * HIT_GEOMETRY * W, np.int64(-1)
+    if hits(target.lanes, u.ctypes.data + 4 * HIT_INSTANCE * W) == 0:
+        number = sole(target.lanes, geometry)
+    if number >= 0:
+        # The common case, all hits on one part of the mesh: look it up once.
+        part = target.parts.ctypes.data + 8 * PART * np.int64(target.rows[number])
         planes, numbers, first = int64_at(part, 0), int64_at(part, NUMBERS), int64_at(part, START_NUMBER)
-        look_up(target.lanes, planes, PLANE, u.ctypes.data + 4 * HIT_FACE * W, work.ctypes.data)
+        look_up(target.lanes, planes, PLANE, u.ctypes.data + 4 * HIT_FACE * W, geometry, work.ctypes.data)
         for k in range(W):
             faces[k] = first + np.int64(u[HIT_FACE * W + k])
         if numbers:
             for k in range(W):
-                faces[k] = first + np.int64(int32_at(numbers, np.int64(u[HIT_FACE * W + k])))
+                if u[HIT_GEOMETRY * W + k] != INVALID:
+                    faces[k] = first + np.int64(int32_at(numbers, np.int64(u[HIT_FACE * W + k])))
         for k in range(W):
             instances[k] = -1
         return
@@ -148,6 +161,15 @@ def _starts(t: float, near: float, cosine: float, inverse: float) -> bool:
     return not (t - near) * abs(cosine) > START * inverse
 
 
+@inlined
+def _miss(i: int, columns: Any) -> None:
+    """Write a miss of ray i."""
+    ranges, faces, instances, cosines, normals = columns
+    ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+    if normals.size:
+        normals[i, 0], normals[i, 1], normals[i, 2] = 0.0, 0.0, 0.0
+
+
 @called
 def _keep(
     target: Target,
@@ -158,17 +180,12 @@ def _keep(
     inverse: float,
     time: float,
     i: int,
-    ranges: Any,
-    faces: Any,
-    instances: Any,
-    cosines: Any,
-    normals: Any,
+    columns: Any,
 ) -> None:
     """Write a face, or a miss if its row is -1, as the hit of ray i."""
+    ranges, faces, instances, cosines, normals = columns
     if row < 0:
-        ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
-        if normals.size:
-            _normal(normals, i, 0.0, 0.0, 0.0)
+        _miss(i, columns)
         return
     t, cosine, x, y, z = intersection(target, row, prim, instance, ray, inverse, time)
     ranges[i], cosines[i], faces[i], instances[i] = t, cosine, numbered(target, row, prim), instance
@@ -177,67 +194,70 @@ def _keep(
 
 
 @inlined
-def _retry(
+def _decide(
+    target: Target, rays: Rays, k: int, W: int, work: Any, ids: Any, f: Any, u: Any, stack: Any, columns: Any
+) -> bool:
+    """Decide in float64 what lane k hits, where in doubt; write a miss. Whether it is a hit."""
+    t, cosine, far = work[RANGE * W + k], work[COSINE * W + k], work[FAR * W + k]
+    if u[HIT_GEOMETRY * W + k] != INVALID:
+        share = min(f[HIT_U * W + k], f[HIT_V * W + k], 1.0 - f[HIT_U * W + k] - f[HIT_V * W + k])
+        starts = _starts(t, rays.near, cosine, work[INVERSE * W + k])
+        if rays.precision == EXACT:
+            clear = share * cosine >= work[MARGIN * W + k] and cosine >= GRAZING
+        else:
+            clear = abs(cosine) >= GRAZING
+        if starts or not clear:
+            ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
+            row, copy = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
+            prim = np.int64(u[HIT_FACE * W + k])
+            trusted = cosine >= GRAZING and not starts
+            if not work[MARGIN * W + k] < np.inf:
+                before = (t / inverse - f[RAY_FAR * W + k]) * cosine
+                trusted &= copy < 0 and before <= LONG * _margin(ray, t)
+            if not trusted or outside(target, row, prim, copy, ray, time) > 0.0:
+                row, prim, copy = first_hit(target, rays.near, far, rays.mask, ray, time, stack)
+                _keep(target, row, prim, copy, ray, inverse, time, ids[k], columns)
+                return True
+        if t <= far:
+            return True
+    _miss(ids[k], columns)
+    return False
+
+
+@inlined
+def _again(
     target: Target,
-    near: float,
-    mask: int,
+    rays: Rays,
     m: int,
     work: Any,
     ids: Any,
     f: Any,
     valid: Any,
     one: Any,
-    ranges: Any,
-    faces: Any,
-    instances: Any,
-    cosines: Any,
-    normals: Any,
     stack: Any,
+    columns: Any,
 ) -> None:
-    """Retry m rays that hit nothing, with perturbed directions."""
+    """Trace the first m rays of a packet, which hit nothing, with perturbed directions.
+
+    Embree finds whether there is a hit; float64 decides what is hit.
+    """
     W = len(target.lanes)
-    u = f.view(np.uint32)
-    for k in range(W):
-        f[RAY_OX * W + k] = work[OX * W + k]
-        f[RAY_OY * W + k] = work[OY * W + k]
-        f[RAY_OZ * W + k] = work[OZ * W + k]
-        f[RAY_NEAR * W + k], f[RAY_TIME * W + k] = near / work[INVERSE * W + k], work[TIME * W + k]
-        nudge(W, k, work, f, work[FAR * W + k])
-        valid[k] = -1 if k < m else 0
-        u[HIT_GEOMETRY * W + k] = INVALID
-        u[HIT_INSTANCE * W + k] = INVALID
-    trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
-    for k in range(m):
-        if u[HIT_GEOMETRY * W + k] != INVALID:
-            ray, inverse, time, far = (
-                ray_of(W, k, work),
-                work[INVERSE * W + k],
-                work[TIME * W + k],
-                work[FAR * W + k],
-            )
-            row, prim, copy = first_hit(target, near, far, mask, ray, time, stack)
-            _keep(
-                target,
-                row,
-                prim,
-                copy,
-                ray,
-                inverse,
-                time,
-                ids[k],
-                ranges,
-                faces,
-                instances,
-                cosines,
-                normals,
-            )
-    for k in range(W):
+    nudge(target.lanes, work.ctypes.data, f.ctypes.data, NUDGE)
+    for k in range(m, W):
+        valid[k] = 0
+    trace(target, W, PACKET_RAY_ROWS, f, valid, alike(W, work), one)
+    for k in range(m, W):
         valid[k] = -1
+    for k in range(m):
+        if f[RAY_FAR * W + k] < 0:
+            ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
+            row, prim, copy = first_hit(target, rays.near, work[FAR * W + k], rays.mask, ray, time, stack)
+            _keep(target, row, prim, copy, ray, inverse, time, ids[k], columns)
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def cast(
-    target: Target,
+    given: Packed,
     rays: Rays,
     lo: int,
     hi: int,
@@ -251,6 +271,7 @@ def cast(
 
     No normals are written if ``normals`` is empty. Packets are consecutive from lo.
     """
+    target = unpacked(given)
     W = len(target.lanes)
     packet = aligned(4 * PACKET_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
@@ -259,7 +280,8 @@ def cast(
     face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
     stack = np.zeros(STACK, np.int64)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
-    precise = rays.precision == EXACT
+    columns = ranges, faces, instances, cosines, normals
+    whole, geometry = (1 << W) - 1, u.ctypes.data + 4 * HIT_GEOMETRY * W
     for k in range(W):
         u[RAY_MASK * W + k] = rays.mask
         u[RAY_ID * W + k] = k
@@ -274,74 +296,38 @@ def cast(
         for k in range(m, W):
             valid[k] = 0
         trace(target, W, PACKET_ROWS, f, valid, alike(W, work), one)
-        _identify(target, W, u, work, face, instance)
-        settled = cross(target.lanes, work.ctypes.data, f.ctypes.data, rays.near)
-        if not precise:
-            settled = _approximate(W, rays.near, rays.precision, work, f)
-        if m == W and not rays.order.size:
-            exact = work.ctypes.data + 8 * RANGE * W
-            move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
-            narrow(target.lanes, exact + 8 * W, cosines.ctypes.data + 4 * at)
-            move_int32(target.lanes, face.ctypes.data, faces.ctypes.data + 4 * at)
-            move_int32(target.lanes, instance.ctypes.data, instances.ctypes.data + 4 * at)
+        struck = hits(target.lanes, geometry)
+        if struck == 0:
+            for k in range(m):
+                _miss(ids[k], columns)
+            if rays.retrace:
+                _again(target, rays, m, work, ids, f, valid, one, stack, columns)
         else:
-            for k in range(m):
-                i = ids[k]
-                ranges[i], cosines[i] = work[RANGE * W + k], work[COSINE * W + k]
-                faces[i], instances[i] = face[k], instance[k]
-        if normals.size:
-            for k in range(m):
-                _normal(normals, ids[k], work[NX * W + k], work[NY * W + k], work[NZ * W + k])
-        for k in range(0 if settled else m):
-            i = ids[k]
-            hit = u[HIT_GEOMETRY * W + k] != INVALID
-            t, cosine, far = work[RANGE * W + k], work[COSINE * W + k], work[FAR * W + k]
-            if hit:
-                share = min(f[HIT_U * W + k], f[HIT_V * W + k], 1.0 - f[HIT_U * W + k] - f[HIT_V * W + k])
-                starts = _starts(t, rays.near, cosine, work[INVERSE * W + k])
-                if precise:
-                    clear = share * cosine >= work[MARGIN * W + k] and cosine >= GRAZING
-                else:
-                    clear = abs(cosine) >= GRAZING
-                if starts or not clear:
-                    ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
-                    row, copy = placed(
-                        target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
-                    )
-                    prim = np.int64(u[HIT_FACE * W + k])
-                    trusted = cosine >= GRAZING and not starts
-                    if not work[MARGIN * W + k] < np.inf:
-                        before = (t / inverse - f[RAY_FAR * W + k]) * cosine
-                        trusted &= copy < 0 and before <= LONG * _margin(ray, t)
-                    if not trusted or outside(target, row, prim, copy, ray, time) > 0.0:
-                        row, prim, copy = first_hit(target, rays.near, far, rays.mask, ray, time, stack)
-                        _keep(
-                            target,
-                            row,
-                            prim,
-                            copy,
-                            ray,
-                            inverse,
-                            time,
-                            i,
-                            ranges,
-                            faces,
-                            instances,
-                            cosines,
-                            normals,
-                        )
-                        continue
-                if t <= far:
-                    continue
-            ranges[i], cosines[i], faces[i], instances[i] = np.inf, 0.0, -1, -1
+            _identify(target, W, u, work, face, instance)
+            settled = cross(target.lanes, work.ctypes.data, f.ctypes.data, rays.near)
+            if rays.precision != EXACT:
+                settled = _approximate(W, rays.near, rays.precision, work, f)
+            if m == W and not rays.order.size:
+                exact = work.ctypes.data + 8 * RANGE * W
+                move_float64(target.lanes, exact, ranges.ctypes.data + 8 * at)
+                narrow(target.lanes, exact + 8 * W, cosines.ctypes.data + 4 * at)
+                move_int32(target.lanes, face.ctypes.data, faces.ctypes.data + 4 * at)
+                move_int32(target.lanes, instance.ctypes.data, instances.ctypes.data + 4 * at)
+            else:
+                for k in range(m):
+                    i = ids[k]
+                    ranges[i], cosines[i] = work[RANGE * W + k], work[COSINE * W + k]
+                    faces[i], instances[i] = face[k], instance[k]
             if normals.size:
-                _normal(normals, i, 0.0, 0.0, 0.0)
-            if not rays.retrace:
-                continue
-            for r in range(RAY_ROWS):
-                late[r * 2 * W + waiting] = work[r * W + k]
-            doubtful[waiting] = i
-            waiting += 1
+                for k in range(m):
+                    _normal(normals, ids[k], work[NX * W + k], work[NY * W + k], work[NZ * W + k])
+            for k in range(0 if settled and struck == whole else m):
+                if _decide(target, rays, k, W, work, ids, f, u, stack, columns) or not rays.retrace:
+                    continue
+                for r in range(RAY_ROWS):
+                    late[r * 2 * W + waiting] = work[r * W + k]
+                doubtful[waiting] = ids[k]
+                waiting += 1
         # The buffer is emptied at the end of each chunk, so that the number of threads changes no packet.
         last = hi - at <= W or (at - lo + W) % CHUNK == 0
         while waiting >= W or (last and waiting > 0):
@@ -350,23 +336,13 @@ def cast(
                 for r in range(RAY_ROWS):
                     work[r * W + k] = late[r * 2 * W + min(k, n - 1)]
                 ids[k] = doubtful[min(k, n - 1)]
-            _retry(
-                target,
-                rays.near,
-                rays.mask,
-                n,
-                work,
-                ids,
-                f,
-                valid,
-                one,
-                ranges,
-                faces,
-                instances,
-                cosines,
-                normals,
-                stack,
-            )
+            for k in range(W):
+                f[RAY_OX * W + k] = work[OX * W + k]
+                f[RAY_OY * W + k] = work[OY * W + k]
+                f[RAY_OZ * W + k] = work[OZ * W + k]
+                f[RAY_NEAR * W + k] = rays.near / work[INVERSE * W + k]
+                f[RAY_TIME * W + k] = work[TIME * W + k]
+            _again(target, rays, n, work, ids, f, valid, one, stack, columns)
             for k in range(W):
                 doubtful[k] = doubtful[W + k]
                 for r in range(RAY_ROWS):
@@ -377,7 +353,7 @@ def cast(
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def cast_float64(
-    target: Target,
+    given: Packed,
     rays: Rays,
     lo: int,
     hi: int,
@@ -388,6 +364,7 @@ def cast_float64(
     normals: Float,
 ) -> Any:
     """The same as `cast`, entirely in float64, without Embree."""
+    target = unpacked(given)
     work, ids, stack = np.zeros(WORK_ROWS), np.zeros(1, np.int64), np.zeros(STACK, np.int64)
     f = np.zeros(PACKET_ROWS, np.float32)
     for at in range(lo, hi):
@@ -395,13 +372,15 @@ def cast_float64(
             return first_bad(1, ids, work)
         ray, inverse, time = ray_of(1, 0, work), work[INVERSE], work[TIME]
         row, prim, copy = first_hit(target, rays.near, work[FAR], rays.mask, ray, time, stack)
-        _keep(target, row, prim, copy, ray, inverse, time, ids[0], ranges, faces, instances, cosines, normals)
+        columns = ranges, faces, instances, cosines, normals
+        _keep(target, row, prim, copy, ray, inverse, time, ids[0], columns)
     return -1
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
+def occluded(given: Packed, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
     """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
+    target = unpacked(given)
     W = len(target.lanes)
     packet = aligned(4 * PACKET_RAY_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
@@ -426,9 +405,7 @@ def occluded(target: Target, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_
             doubtful |= not hit
         if not (doubtful and rays.retrace):
             continue
-        for k in range(W):
-            if valid[k]:
-                nudge(W, k, work, f, work[FAR * W + k])
+        nudge(target.lanes, work.ctypes.data, f.ctypes.data, NUDGE)
         trace(target, W, PACKET_RAY_ROWS, f, valid, together, one)
         for k in range(W):
             if valid[k]:

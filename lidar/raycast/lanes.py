@@ -7,6 +7,7 @@ its length is a compile-time constant.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 from llvmlite import ir
@@ -81,6 +82,19 @@ class _Row:
         )
         return _Row(self.builder, self.builder.call(function, [self.value]))
 
+    def root(self) -> _Row:
+        """Square roots."""
+        row = self.value.type
+        function = self.builder.module.declare_intrinsic(
+            f"llvm.sqrt.v{row.count}f64", (), ir.FunctionType(row, [row])
+        )
+        return _Row(self.builder, self.builder.call(function, [self.value]))
+
+    def least(self, *others: _Row) -> Any:
+        """Lanes in which no other row has a smaller number."""
+        flags = [self.builder.fcmp_ordered("<=", self.value, other.value) for other in others]
+        return functools.reduce(self.builder.and_, flags)
+
     def double(self) -> _Row:
         """The numbers as float64."""
         return _Row(
@@ -144,22 +158,58 @@ narrow = _row(_DOUBLE, _FLOAT)
 """Copy a row from one address to another; `narrow` rounds to float32."""
 
 
+def _hit(builder: Any, lanes: Any, geometry: Any) -> Any:
+    """Lanes that hit a geometry, from a row at an address."""
+    row = _Rows(builder, lanes, address=geometry, kind=_INT)[0].value
+    return builder.icmp_unsigned("!=", row, ir.Constant(row.type, [-1] * lanes.count))
+
+
 @intrinsic
-def _same(context: Any, lanes: Any, source: Any) -> Any:  # noqa: ARG001
+def _fill(context: Any, lanes: Any, number: Any, target: Any) -> Any:  # noqa: ARG001
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        row = _Rows(builder, lanes, address=values[1], kind=_INT)[0].value
-        first = builder.extract_element(row, ir.Constant(_INT, 0))
-        differ = builder.icmp_unsigned(
-            "!=", row, _Rows(builder, lanes, address=values[1], kind=_INT).same(first).value
+        row = _Rows(builder, lanes, address=values[2])
+        row[0] = row.same(values[1])
+        return made.get_dummy_value()
+
+    return types.void(lanes, types.float64, types.int64), build
+
+
+fill: Any = _fill
+"""Write one number to all lanes of a row."""
+
+
+@intrinsic
+def _hits(context: Any, lanes: Any, geometry: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        flags = builder.bitcast(_hit(builder, lanes, values[1]), ir.IntType(lanes.count))
+        return builder.zext(flags, ir.IntType(64))
+
+    return types.int64(lanes, types.int64), build
+
+
+hits: Any = _hits
+"""A bit for each lane that hit a geometry of a row at an address."""
+
+
+@intrinsic
+def _sole(context: Any, lanes: Any, geometry: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, address=values[1], kind=_INT)
+        row, bits = rows[0].value, ir.IntType(lanes.count)
+        reduce = builder.module.declare_intrinsic(
+            f"llvm.vector.reduce.umin.v{lanes.count}i32", (), ir.FunctionType(_INT, [row.type])
         )
-        bits = ir.IntType(lanes.count)
-        return builder.icmp_unsigned("==", builder.bitcast(differ, bits), ir.Constant(bits, 0))
+        least = builder.call(reduce, [row])
+        other = builder.icmp_unsigned("!=", row, rows.same(least).value)
+        differ = builder.bitcast(builder.and_(other, _hit(builder, lanes, values[1])), bits)
+        found = builder.icmp_unsigned("==", differ, ir.Constant(bits, 0))
+        return builder.select(found, builder.zext(least, ir.IntType(64)), ir.IntType(64)(-1))
 
-    return types.boolean(lanes, types.int64), build
+    return types.int64(lanes, types.int64), build
 
 
-same: Any = _same
-"""Whether all 32-bit numbers of a row are the same."""
+sole: Any = _sole
+"""The geometry that all lanes of a row that hit one have hit; -1 if there are several."""
 
 
 @intrinsic
@@ -201,11 +251,222 @@ Returns whether all directions have length 1 and all origins are below `HUGE`.""
 
 
 @intrinsic
-def _look_up(context: Any, lanes: Any, planes: Any, size: Any, faces: Any, work: Any) -> Any:  # noqa: ARG001
+def _shorten(context: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, address=values[1])
+        rounded = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
+        ox, oy, oz, x, y, z = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
+        squared = x * x + y * y + z * z
+        length = squared.root()
+        inverse = rows.same(1.0) / length
+        rows[INVERSE] = inverse
+        for r, way in enumerate((x, y, z)):
+            rounded[RAY_DX + r] = way * inverse
+        rounded[RAY_NEAR] = rounded[RAY_NEAR].double() * length
+        rounded[RAY_FAR] = rows[FAR] * length * rows.same(UP)
+        near = (abs(ox) + abs(oy) + abs(oz)).all("<", rows.same(HUGE))
+        finite = builder.and_(squared.all(">", rows.same(0.0)), squared.all("<", rows.same(HUGE)))
+        return builder.and_(near, finite)
+
+    return types.boolean(lanes, types.int64, types.int64, types.float64), build
+
+
+shorten: Any = _shorten
+"""Write unit directions to Embree's packet for rays of any length, after `settle`.
+
+Returns whether all directions and origins are valid."""
+
+
+@intrinsic
+def _nudge(context: Any, lanes: Any, work: Any, packet: Any, angle: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, address=values[1])
+        rounded = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
+        inverse, angle = rows[INVERSE], rows.same(values[3])
+        x, y, z = (rows[r] * inverse for r in (DX, DY, DZ))
+        least_x, least_y = abs(x).least(abs(y), abs(z)), abs(y).least(abs(z))
+        least_y = builder.and_(builder.not_(least_x), least_y)
+        least_z = builder.not_(builder.or_(least_x, least_y))
+        for r, (way, least) in enumerate(((x, least_x), (y, least_y), (z, least_z))):
+            rounded[RAY_DX + r] = _Row(builder, builder.select(least, (way + angle).value, way.value))
+        rounded[RAY_FAR] = rows[FAR] / inverse * rows.same(UP)
+        return made.get_dummy_value()
+
+    return types.void(lanes, types.int64, types.int64, types.float64), build
+
+
+nudge: Any = _nudge
+"""Turn the directions of Embree's packet by an angle, radians, and set far again."""
+
+
+def _vectors(builder: Any, column: Any, stride: Any, rows: list[Any]) -> list[Any]:
+    """The first three numbers of rows of a float64 column at an address, and a fourth that means nothing."""
+    three = ir.VectorType(_DOUBLE, 3)
+    widened = ir.Constant(ir.VectorType(_INT, 4), [0, 1, 2, 2])
+    out = []
+    for row in rows:
+        place = builder.inttoptr(builder.add(column, builder.mul(row, stride)), three.as_pointer())
+        vector = builder.load(place, align=8)
+        out.append(builder.shuffle_vector(vector, vector, widened))
+    return out
+
+
+def _columns(builder: Any, vectors: list[Any], count: int) -> list[_Row]:
+    """The four rows of numbers of ``count`` lanes whose vectors of four are given, one a lane.
+
+    Fours of lanes are transposed by the pairs of shuffles that processors have.
+    """
+
+    def shuffled(one: Any, other: Any, *lanes: int) -> Any:
+        return builder.shuffle_vector(one, other, ir.Constant(ir.VectorType(_INT, len(lanes)), lanes))
+
+    padded = vectors + vectors[-1:] * (-len(vectors) % 4)
+    parts: list[list[Any]] = [[], [], [], []]
+    for k in range(0, len(padded), 4):
+        a, b, c, d = padded[k : k + 4]
+        low = shuffled(a, b, 0, 4, 2, 6), shuffled(c, d, 0, 4, 2, 6)
+        high = shuffled(a, b, 1, 5, 3, 7), shuffled(c, d, 1, 5, 3, 7)
+        for r, (one, other) in enumerate((low, high, low, high)):
+            first = 2 * (r // 2)
+            parts[r].append(shuffled(one, other, first, first + 1, first + 4, first + 5))
+    rows = []
+    for column in parts:
+        while len(column) > 1:
+            n = 2 * column[0].type.count
+            pairs = zip(column[::2], column[1::2], strict=True)
+            column = [shuffled(one, other, *range(n)) for one, other in pairs]  # noqa: PLW2901
+        rows.append(_Row(builder, shuffled(column[0], column[0], *range(count))))
+    return rows
+
+
+def _numbers(builder: Any, lanes: Any, column: Any) -> list[Any]:
+    """The int64 numbers of the lanes of a row at an address."""
+    base = builder.inttoptr(column, ir.IntType(64).as_pointer())
+    return [builder.load(builder.gep(base, [ir.Constant(_INT, k)])) for k in range(lanes.count)]
+
+
+@intrinsic
+def _spread(
+    context: Any,  # noqa: ARG001
+    lanes: Any,
+    ids: Any,  # noqa: ARG001
+    column: Any,  # noqa: ARG001
+    stride: Any,  # noqa: ARG001
+    target: Any,  # noqa: ARG001
+) -> Any:
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        ids, column, stride, target = values[1:]
+        vectors = _vectors(builder, column, stride, _numbers(builder, lanes, ids))
+        rows = _Rows(builder, lanes, address=target)
+        for r, row in enumerate(_columns(builder, vectors, lanes.count)[:3]):
+            rows[r] = row
+        return made.get_dummy_value()
+
+    return types.void(lanes, *[types.int64] * 4), build
+
+
+spread: Any = _spread
+"""Write three rows, at an address, of the vectors of a column with a stride in bytes."""
+
+
+def _turning(*, placed: bool) -> Any:
+    """`turn` if the places of poses are the first rows of work, else `shift`."""
+
+    @intrinsic
+    def turn(
+        context: Any,  # noqa: ARG001
+        lanes: Any,
+        ids: Any,  # noqa: ARG001
+        column: Any,  # noqa: ARG001
+        stride: Any,  # noqa: ARG001
+        pose: Any,  # noqa: ARG001
+        position: Any,  # noqa: ARG001
+        matrix: Any,  # noqa: ARG001
+        work: Any,  # noqa: ARG001
+    ) -> Any:
+        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            ids, column, stride, pose, position, matrix, work = values[1:]
+            numbers = _numbers(builder, lanes, ids)
+            long, rows = ir.IntType(64), _Rows(builder, lanes, address=work)
+            poses = [
+                builder.load(builder.gep(builder.inttoptr(pose, long.as_pointer()), [number]))
+                for number in numbers
+            ]
+            vectors = _vectors(builder, column, stride, numbers)
+
+            def write(turned: list[_Row], places: list[_Row]) -> None:
+                for r in range(3):
+                    if placed:
+                        rows[OX + r], rows[DX + r] = places[r], turned[r]
+                    else:
+                        rows[OX + r] = rows[OX + r] + turned[r]
+
+            differ = functools.reduce(
+                builder.or_, [builder.xor(poses[0], other) for other in poses[1:]], long(0)
+            )
+            with builder.if_else(builder.icmp_unsigned("==", differ, long(0))) as (alike, mixed):
+                with alike:
+                    start = builder.add(matrix, builder.mul(poses[0], long(72)))
+                    entry = builder.inttoptr(start, _DOUBLE.as_pointer())
+                    m = [rows.same(builder.load(builder.gep(entry, [long(e)]))) for e in range(9)]
+                    x, y, z, _ = _columns(builder, vectors, lanes.count)
+                    turned = [m[r] * x + m[r + 1] * y + m[r + 2] * z for r in (0, 3, 6)]
+                    start = builder.add(position, builder.mul(poses[0], long(24)))
+                    entry = builder.inttoptr(start, _DOUBLE.as_pointer())
+                    write(turned, [rows.same(builder.load(builder.gep(entry, [long(e)]))) for e in range(3)])
+                with mixed:
+                    turned = _by_lane(builder, vectors, matrix, poses)
+                    places = _vectors(builder, position, long(24), poses)
+                    write(turned, _columns(builder, places, lanes.count)[:3])
+            return made.get_dummy_value()
+
+        return types.void(lanes, *[types.int64] * 7), build
+
+    return turn
+
+
+def _by_lane(builder: Any, vectors: list[Any], matrix: Any, poses: list[Any]) -> list[_Row]:
+    """The rows of vectors, one a lane, turned by the matrices of the lanes' poses."""
+    four, long = ir.VectorType(_DOUBLE, 4), ir.IntType(64)
+    products: list[list[Any]] = [[], [], []]
+    for vector, pose in zip(vectors, poses, strict=True):
+        start = builder.add(matrix, builder.mul(pose, long(72)))
+        # The last row is read with a number before it, for the one after it may be beyond the table.
+        late = builder.shuffle_vector(vector, vector, ir.Constant(ir.VectorType(_INT, 4), [0, 0, 1, 2]))
+        for r, (offset, factor) in enumerate(((0, vector), (24, vector), (40, late))):
+            place = builder.inttoptr(builder.add(start, long(offset)), four.as_pointer())
+            products[r].append(builder.fmul(builder.load(place, align=8), factor))
+    turned = []
+    for r, product in enumerate(products):
+        columns = _columns(builder, product, len(vectors))
+        x, y, z = columns[1:] if r == 2 else columns[:3]
+        turned.append(x + y + z)
+    return turned
+
+
+turn, shift = _turning(placed=True), _turning(placed=False)
+"""Turn the vectors of a column, with a stride in bytes, by the matrices of their poses.
+
+`turn` writes them as directions, and the positions of the poses as origins; `shift` adds them to the origins.
+"""
+
+
+@intrinsic
+def _look_up(
+    context: Any,  # noqa: ARG001
+    lanes: Any,
+    planes: Any,  # noqa: ARG001
+    size: Any,  # noqa: ARG001
+    faces: Any,  # noqa: ARG001
+    geometry: Any,  # noqa: ARG001
+    work: Any,  # noqa: ARG001
+) -> Any:
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:
-        start, size, faces, work = values[1:]
+        start, size, faces, geometry, work = values[1:]
         rows, long = _Rows(builder, lanes, address=work), ir.IntType(64)
         places = _Rows(builder, lanes, address=faces, kind=_INT)[0].value
+        hit = _hit(builder, lanes, geometry)
+        places = builder.select(hit, places, ir.Constant(places.type, [0] * lanes.count))
         four, margin, packed = ir.VectorType(_DOUBLE, 4), ir.Constant(rows.kind, ir.Undefined), []
         for k in range(lanes.count):
             lane = ir.Constant(_INT, k)
@@ -225,11 +486,13 @@ def _look_up(context: Any, lanes: Any, planes: Any, size: Any, faces: Any, work:
         rows[MARGIN] = _Row(builder, margin)
         return made.get_constant(signature.return_type, 0)
 
-    return types.int64(lanes, *[types.int64] * 4), build
+    return types.int64(lanes, *[types.int64] * 5), build
 
 
 look_up: Any = _look_up
 """Write the planes of a row of faces, from a table at an address with a size in bytes of its rows.
+
+A lane without a geometry gets the first plane.
 
 Rows written lane by lane could not be read as vectors at once: the processor would wait for the writes."""
 

@@ -162,4 +162,6 @@ def _check(lib: Library) -> None:
         lib.call("rtcReleaseScene", scene)
     distance, numbers = float(ray.view(np.float32)[8]), tuple(int(v) for v in ray[17:21])
     if not (abs(distance - 2.0) < 1e-5 and numbers == (1, 0, 0, 1)):
-        raise BackendError(f"Embree returns {(distance, *numbers)} for a test ray instead of (2.0, 1, 0, 0, 1)")
+        raise BackendError(
+            f"Embree returns {(distance, *numbers)} for a test ray instead of (2.0, 1, 0, 0, 1)"
+        )

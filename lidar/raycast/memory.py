@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import types
+from numba import carray, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
 from geoscene.compiled import njit
@@ -41,6 +41,35 @@ float32_at = _loader(types.float32, 4)
 int64_at = _loader(types.int64, 8)
 int32_at = _loader(types.int32, 4)
 """The number at an index of the column at an address."""
+
+
+def _pointer(kind: Any) -> Any:
+    @intrinsic
+    def point(context: Any, address: Any) -> Any:  # noqa: ARG001
+        def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+            return builder.inttoptr(values[0], target.get_value_type(kind).as_pointer())
+
+        pointer: Any = types.CPointer
+        return pointer(kind)(types.int64), build
+
+    return point
+
+
+def _column(kind: Any) -> Any:
+    point = _pointer(kind)
+
+    @njit(nogil=True)
+    def column(address: Any, shape: Any) -> Any:
+        return carray(point(address), shape)
+
+    return column
+
+
+float64_column = _column(types.float64)
+int64_column = _column(types.int64)
+int32_column = _column(types.int32)
+uint32_column = _column(types.uint32)
+"""The column at an address as an array of a shape; the caller keeps the memory."""
 
 
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}

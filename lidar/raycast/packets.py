@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lidar.raycast.columns import Rays, Target
-from lidar.raycast.lanes import HUGE, UP, settle
+from lidar.raycast.lanes import HUGE, fill, settle, shift, shorten, spread, turn
 from lidar.raycast.memory import (
     float32_at,
     float64_at,
@@ -24,52 +22,17 @@ from lidar.raycast.memory import (
     occluded4,
     occluded8,
     occluded16,
-    vector,
 )
-from lidar.raycast.rows import (
-    DX,
-    DY,
-    DZ,
-    FAR,
-    INVERSE,
-    OX,
-    OY,
-    OZ,
-    PACKET_ROWS,
-    RAY_DX,
-    RAY_DY,
-    RAY_DZ,
-    RAY_FAR,
-    RAY_NEAR,
-    TIME,
-)
+from lidar.raycast.rows import DX, DY, DZ, FAR, INVERSE, OX, OY, OZ, PACKET_ROWS, RAY_FAR, TIME
 
-_NUDGE = 3e-7  # radians; the smallest that closed all leaks of a million rays aimed at vertices
+VECTOR = 24
+"""Bytes of a row of a column of vectors."""
+
+NUDGE = 3e-7
+"""Radians, turn of the second trace: the least that closed all leaks of a million rays aimed at vertices."""
+
 _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster as single rays
 _SPREAD = 4.0  # metres; likewise packets whose origins lie farther apart
-
-
-@inlined
-def _posed(pose: Any, p: int, x: float, y: float, z: float) -> Any:
-    """A vector of the pose's frame in the caster's axes."""
-    R = pose[1] + 72 * p
-    return (
-        float64_at(R, 0) * x + float64_at(R, 1) * y + float64_at(R, 2) * z,
-        float64_at(R, 3) * x + float64_at(R, 4) * y + float64_at(R, 5) * z,
-        float64_at(R, 6) * x + float64_at(R, 7) * y + float64_at(R, 8) * z,
-    )
-
-
-@inlined
-def _shorten(W: int, k: int, work: Any, f: Any) -> None:
-    """Normalise the direction of lane k of Embree's packet."""
-    x, y, z = work[DX * W + k], work[DY * W + k], work[DZ * W + k]
-    length = np.sqrt(x * x + y * y + z * z)
-    inverse = 1.0 / length
-    work[INVERSE * W + k] = inverse
-    f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x * inverse, y * inverse, z * inverse
-    f[RAY_NEAR * W + k] = f[RAY_NEAR * W + k] * length
-    f[RAY_FAR * W + k] = work[FAR * W + k] * length * UP
 
 
 @inlined
@@ -91,66 +54,39 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
     Embree's packet ``f`` gets unit directions and far rounded up.
     """
     W = len(lanes)
-    ordered, posed, timed, reach = rays.order.size, rays.pose.size, rays.time.size, rays.far.size > 1
-    shifted, step = rays.offsets.shape[0] > 0, 1 if rays.offsets.shape[0] > 1 else 0
     directions, offsets, far = rays.directions.ctypes.data, rays.offsets.ctypes.data, rays.far.ctypes.data
-    order, pose_of, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
-    pose = (rays.position.ctypes.data, rays.matrix.ctypes.data)
-    cx, cy, cz = target.origin[0], target.origin[1], target.origin[2]
-    for k in range(W):
-        ids[k] = at + min(k, m - 1)
-    if ordered:
+    order, pose, time = rays.order.ctypes.data, rays.pose.ctypes.data, rays.time.ctypes.data
+    position, matrix = rays.position.ctypes.data, rays.matrix.ctypes.data
+    stride = VECTOR if rays.offsets.shape[0] > 1 else 0
+    number, rows = ids.ctypes.data, work.ctypes.data
+    if m == W:
         for k in range(W):
-            ids[k] = int64_at(order, ids[k])
-    if posed:
-        for k in range(W):
-            p = int64_at(pose_of, ids[k])
-            x, y, z = vector(directions, ids[k])
-            work[DX * W + k], work[DY * W + k], work[DZ * W + k] = _posed(pose, p, x, y, z)
-            work[OX * W + k], work[OY * W + k], work[OZ * W + k] = vector(pose[0], p)
-        if shifted:
-            for k in range(W):
-                x, y, z = vector(offsets, step * ids[k])
-                x, y, z = _posed(pose, int64_at(pose_of, ids[k]), x, y, z)
-                work[OX * W + k] += x
-                work[OY * W + k] += y
-                work[OZ * W + k] += z
+            ids[k] = at + k
     else:
         for k in range(W):
-            work[DX * W + k], work[DY * W + k], work[DZ * W + k] = vector(directions, ids[k])
-            work[OX * W + k], work[OY * W + k], work[OZ * W + k] = vector(offsets, step * ids[k])
-    if reach:
+            ids[k] = at + min(k, m - 1)
+    if rays.order.size:
+        for k in range(W):
+            ids[k] = int64_at(order, ids[k])
+    if rays.pose.size:
+        turn(lanes, number, directions, VECTOR, pose, position, matrix, rows)
+        if rays.offsets.shape[0]:
+            shift(lanes, number, offsets, stride, pose, position, matrix, rows)
+    else:
+        spread(lanes, number, directions, VECTOR, rows + 8 * DX * W)
+        spread(lanes, number, offsets, stride, rows + 8 * OX * W)
+    if rays.far.size > 1:
         for k in range(W):
             work[FAR * W + k] = float64_at(far, ids[k])
     else:
-        limit = float64_at(far, 0)
-        for k in range(W):
-            work[FAR * W + k] = limit
-    if timed:
+        fill(lanes, float64_at(far, 0), rows + 8 * FAR * W)
+    if rays.time.size:
         for k in range(W):
             work[TIME * W + k] = float32_at(time, ids[k])
-    if settle(lanes, work.ctypes.data, f.ctypes.data, cx, cy, cz, rays.near):
+    x, y, z = target.origin[0], target.origin[1], target.origin[2]
+    if settle(lanes, rows, f.ctypes.data, x, y, z, rays.near):
         return True
-    if first_bad(W, ids, work) >= 0:
-        return False
-    for k in range(W):
-        _shorten(W, k, work, f)
-    return True
-
-
-@inlined
-def nudge(W: int, k: int, work: Any, f: Any, far: float) -> None:
-    """Perturb the direction of lane k of Embree's packet and set its far."""
-    inverse = work[INVERSE * W + k]
-    x, y, z = work[DX * W + k] * inverse, work[DY * W + k] * inverse, work[DZ * W + k] * inverse
-    if abs(x) <= abs(y) and abs(x) <= abs(z):
-        x += _NUDGE
-    elif abs(y) <= abs(z):
-        y += _NUDGE
-    else:
-        z += _NUDGE
-    f[RAY_DX * W + k], f[RAY_DY * W + k], f[RAY_DZ * W + k] = x, y, z
-    f[RAY_FAR * W + k] = far / inverse * UP
+    return bool(shorten(lanes, rows, f.ctypes.data, rays.near))
 
 
 @inlined

@@ -23,6 +23,11 @@ EXACTLY = (0.0, 0.0)
 """The footprint of rays without width."""
 
 
+_NO_OFFSETS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
+_NONE, _NO_TIMES = np.empty(0, np.int64), np.empty(0, np.float32)
+_ENDLESS = np.array([np.inf])
+
+
 def _rows(values: ArrayLike, name: str) -> Float:
     rows = np.ascontiguousarray(values, np.float64)
     if rows.ndim != 2 or rows.shape[1] != 3:
@@ -39,7 +44,7 @@ def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
     o = _rows(o[None] if o.ndim == 1 else o, "origins")
     if len(o) not in (1, len(d)):
         raise InputError(f"{len(o)} origins for {len(d)} directions; give one, or one per ray")
-    return _plain(d, o, pose=np.empty(0, np.int64), position=np.empty((0, 3)), matrix=np.empty((0, 3, 3)))
+    return _plain(d, o, _NONE, _NO_OFFSETS, _NO_MATRICES)
 
 
 def posed_rays(
@@ -47,26 +52,47 @@ def posed_rays(
 ) -> Rays:
     """Rays in the frames of poses; see `lidar.raycast.Caster.cast_posed`."""
     d = _rows(directions, "directions")
-    o = np.empty((0, 3)) if offsets is None else _rows(offsets, "offsets")
-    index = np.ascontiguousarray(pose_index, np.int64)
+    o = _NO_OFFSETS if offsets is None else _rows(offsets, "offsets")
+    index, count = np.ascontiguousarray(pose_index, np.int64), len(poses.position)
     if len(o) not in (0, 1, len(d)) or index.shape != (len(d),):
         raise InputError(f"{len(d)} directions, {len(o)} offsets and {len(index)} pose numbers disagree")
-    if len(index) and not int(index.view(np.uint64).max()) < len(poses):  # negative numbers become huge
-        raise InputError(f"a ray has a pose number beyond the {len(poses)} poses")
-    level = bool((poses.scale == 1.0).all())
-    matrix = poses.rotation if level else poses.scale[:, :, None] * poses.rotation
-    return _plain(
-        d,
-        o,
-        pose=index,
-        position=np.ascontiguousarray(poses.position, np.float64),
-        matrix=np.ascontiguousarray(matrix),
-    )
+    if not _numbers(index, count):
+        raise InputError(f"a ray has a pose number beyond the {count} poses")
+    matrix = poses.rotation if _level(poses.scale) else poses.scale[:, :, None] * poses.rotation
+    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), np.ascontiguousarray(matrix))
 
 
-def _plain(d: Float, o: Float, *, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
-    none, start = np.empty(0, np.int64), np.empty(0, np.float32)
-    return Rays(d, o, pose, position, matrix, none, start, 0.0, np.array([np.inf]), ALL, EXACT, True, EXACTLY)
+def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
+    return Rays(d, o, pose, position, matrix, _NONE, _NO_TIMES, 0.0, _ENDLESS, ALL, EXACT, True, EXACTLY)
+
+
+@njit(cache=True, nogil=True)
+def _numbers(index: Any, count: int) -> Any:
+    """Whether all of some numbers are rows of a table."""
+    inside = True
+    for i in range(len(index)):
+        inside &= (index[i] >= 0) & (index[i] < count)
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def _level(scale: Any) -> Any:
+    """Whether all scales (n, 3) are 1."""
+    level = True
+    for i in range(len(scale)):
+        level &= (scale[i, 0] == 1.0) & (scale[i, 1] == 1.0) & (scale[i, 2] == 1.0)
+    return level
+
+
+@njit(cache=True, nogil=True)
+def _permutes(order: Any, named: Any) -> Any:
+    """Whether an order names each row once; ``named`` (n,) is zero, and overwritten."""
+    for i in range(len(order)):
+        row = order[i]
+        if not 0 <= row < len(named) or named[row]:
+            return False
+        named[row] = True
+    return len(order) == len(named)
 
 
 def limited(
@@ -86,37 +112,31 @@ def limited(
     Raises InputError unless 0 <= near <= far, times lie within 0 to 1, the order is a permutation, the
     precision one of `PRECISIONS` and the footprint finite and not negative.
     """
-    n = len(rays.directions)
-    reach = np.ascontiguousarray(far, np.float64).reshape(-1)
-    if len(reach) not in (1, n) or not (near >= 0 and (reach >= near).all()):
+    n, moments, work = len(rays.directions), _NO_TIMES, _NONE
+    if isinstance(far, float):
+        reach, ahead = np.array([far]), far >= near
+    else:
+        reach = np.ascontiguousarray(far, np.float64).reshape(-1)
+        ahead = len(reach) in (1, n) and bool((reach >= near).all())
+    if not (near >= 0 and ahead):
         raise InputError("rays need 0 <= near <= far, far one number or one per ray")
     wide, growth = float(footprint[0]), float(footprint[1])
     if not (0.0 <= wide < np.inf and 0.0 <= growth < np.inf):
         raise InputError(f"a footprint of {footprint}: give metres and metres per metre, 0 or more")
     if precision not in PRECISIONS:
         raise InputError(f"precision {precision!r}: choose one of {', '.join(PRECISIONS)}")
-    limits = rays._replace(
-        near=float(near),
-        far=reach,
-        mask=int(mask) & ALL,
-        precision=PRECISIONS.index(precision),
-        retrace=bool(retrace),
-        footprint=(wide, growth),
-    )
     if time is not None:
         moments = np.ascontiguousarray(time, np.float32)
         if not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):
             raise InputError(f"ray times are numbers from 0 to 1, one for each of {n} rays")
-        limits = limits._replace(time=moments)
     if order is not None:
         work = np.ascontiguousarray(order, np.int64)
-        named = np.zeros(n, np.bool_)
-        if work.shape == (n,) and (n == 0 or (work.min() >= 0 and work.max() < n)):
-            named[work] = True
-        if not named.all():
+        if not (work.ndim == 1 and _permutes(work, np.zeros(n, np.bool_))):
             raise InputError(f"order is not a permutation of {n} rays")
-        limits = limits._replace(order=work)
-    return limits
+    number, ways = PRECISIONS.index(precision), rays[:5]
+    return Rays(
+        *ways, work, moments, float(near), reach, int(mask) & ALL, number, bool(retrace), (wide, growth)
+    )
 
 
 def in_scene(rays: Rays) -> tuple[Float, Float]:
@@ -145,7 +165,7 @@ def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
         directions=_rows(rays.directions.take(row, axis=0), "directions"),
         offsets=_rows(rays.offsets.take(row, axis=0), "origins") if len(rays.offsets) > 1 else rays.offsets,
         pose=rays.pose[row] if len(rays.pose) else rays.pose,
-        order=np.empty(0, np.int64),
+        order=_NONE,
         time=rays.time[row] if len(rays.time) else rays.time,
         far=rays.far[row] if len(rays.far) > 1 else rays.far,
     )

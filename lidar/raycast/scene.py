@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast import kernels
-from lidar.raycast.columns import Rays, Target
+from lidar.raycast.columns import Packed, Rays, Target, packed
 from lidar.raycast.geometry import ALL, Geometry, Instances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share
@@ -53,6 +53,7 @@ class Float64Scene:
         self.parts: dict[int, Geometry] = {}
         self.groups: list[Group] = []
         self.target: Target
+        self.packed: Packed
         self._own: tuple[list[Geometry], NDArray[np.int64]]
 
     def attach(self, number: int, part: Geometry) -> None:
@@ -96,6 +97,7 @@ class Float64Scene:
     def commit(self) -> None:
         """Rebuild what changed, and the tables for the kernels."""
         self.target = self.tables()
+        self.packed = packed(self.target)
 
     def tables(self) -> Target:
         """The tables for the kernels, without those of Embree."""
@@ -169,7 +171,7 @@ class Float64Scene:
         n = len(rays.directions)
         columns = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.float32)
         hits = Hits(*columns, np.empty((n if normals else 0, 3)))
-        kernel, target = self.kernel, self.target
+        kernel, target = self.kernel, self.packed
         share(lambda lo, hi: int(kernel(target, rays, lo, hi, *columns, hits.normal)), rays, threads=threads)
         return hits
 
