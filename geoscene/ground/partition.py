@@ -442,7 +442,8 @@ def _noded_faces(
     string = np.concatenate([plan.string[outlines], string])
     start, end = (np.round(ends / PRECISION).astype(np.int64) for ends in (start, end))
     fresh = np.append(True, (string[1:] != string[:-1]) | (start[1:] != end[:-1]).any(axis=1))
-    points, ends, rank = snap_rounded(start, end, fresh=fresh)
+    corners = np.round(np.array(box) / PRECISION).astype(np.int64)
+    points, ends, rank = snap_rounded(start, end, fresh=fresh, box=corners.tolist())
     return faces(np.asarray(points * PRECISION, float), ends, rank=rank, box=box)
 
 

@@ -42,9 +42,8 @@ def triangulate(partition: Partition) -> Triangles:
     Raises GeosceneError if the triangles of a cell do not add up to its area.
     """
     found = shapely.constrained_delaunay_triangles(partition.polygon)
-    triangles, cell = shapely.get_parts(found, return_index=True)
-    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    return _checked(partition, corners, cell=cell)
+    rings, cell = shapely.get_coordinates(found, return_index=True)
+    return _checked(partition, rings.reshape(-1, 4, 2)[:, :3], cell=cell[::4])
 
 
 def triangulate_relief(partition: Partition, vertices: Lattice) -> Triangles:
