@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from geoscene import polylines
 from geoscene.classes import materials
 from geoscene.frames import Frame
-from geoscene.ground.kerbs import kerb_heights, on_border
+from geoscene.ground.kerbs import AROUND, Beside, has_kerbs, kerb_heights, rows_beside
 from geoscene.ground.layers import Layers
 from geoscene.ground.partition import (
     GroundPlan,
     Partition,
     follows_relief,
     partition_tile,
-    rows_at,
     rows_near,
     tile_lattice,
     values_at,
@@ -38,9 +37,6 @@ _FINE = 2.0
 
 _CUT = 3.0
 """Metres that a river may lie below the terrain; more is a fault of the elevation model or the map."""
-
-_AROUND = 2.0**-6
-_DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,12 +105,17 @@ def drape(
     """
     x, y = triangles.points.T
     z = np.zeros(len(x)) if height is None else np.array(height(x, y), float)
-    if plan.kerbs is not None:
-        z += kerb_heights(plan, plan.kerbs, cells=cells, triangles=triangles)
+    low, high = triangles.points.min(axis=0) - AROUND, triangles.points.max(axis=0) + AROUND
+    near = rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])
+    kerbs = plan.kerbs if has_kerbs(plan, near) else None
+    wet = levels is not None and bool((plan.layers.body[near] != "").any())
+    beside = rows_beside(plan, cells, triangles=triangles) if kerbs is not None or wet else None
+    if kerbs is not None and beside is not None:
+        z += kerb_heights(plan, kerbs, triangles=triangles, beside=beside)
     if plan.raised is not None:
         z += plan.raised.height(triangles.points)
-    if levels is not None:
-        z = _flooded(plan, cells, triangles=triangles, z=z, levels=levels)
+    if levels is not None and wet and beside is not None:
+        z = _flooded(plan, triangles.points, z=z, levels=levels, beside=beside)
     color = np.zeros((256, 3), np.uint8)
     for material in materials().values():
         color[material.code] = material.color
@@ -197,30 +198,15 @@ def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Flo
     return np.concatenate(stations), np.concatenate(heights), tuple(turned)
 
 
-def _flooded(
-    plan: GroundPlan, cells: Partition, *, triangles: Triangles, z: Float, levels: WaterLevels
-) -> Float:
-    """Heights (n,) of the points; points on water take its level."""
-    low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
-    if not (plan.layers.body[rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])] != "").any():
-        return z
-    vertex = triangles.faces.ravel()
-    row = np.repeat(cells.row[triangles.cell], 3)
-    edge = on_border(plan, cells, triangles=triangles)
-    inner = ~edge[vertex] & (row >= 0)
-    vertex, row = vertex[inner], row[inner]
-    around = triangles.points[edge][:, None] + _AROUND * np.stack(
-        [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
-    )
-    beside = rows_at(plan, around.reshape(-1, 2))
-    vertex = np.concatenate([vertex, np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
-    row = np.concatenate([row, beside])
+def _flooded(plan: GroundPlan, points: Float, *, z: Float, levels: WaterLevels, beside: Beside) -> Float:
+    """Heights (n,) of points (n, 2); those that water touches take its level."""
+    vertex, row, _ = beside
     on_water = values_at(plan.layers.body, row, base="") != ""
     vertex, row = vertex[on_water], row[on_water]
     stand = levels.level[row]
     flows = levels.river[row]
     if flows.any():
-        stand[flows] = levels.height[levels.nearest.query(triangles.points[vertex[flows]])[1]]
+        stand[flows] = levels.height[levels.nearest.query(points[vertex[flows]])[1]]
     level = np.full(len(z), np.inf)
     np.minimum.at(level, vertex, stand)
     return np.where(np.isinf(level), z, level)

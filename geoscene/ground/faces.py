@@ -13,7 +13,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +45,32 @@ class Faces:
         """The first half-edge (n,) of each face."""
         return self.ring[self.face[:-1]]
 
-    @property
-    def polygon(self) -> NDArray[np.object_]:
-        """Shapely polygons (n,), made anew; neighbours share all vertices along their common border."""
-        return polygons(self.points[self.a], self.ring, face=self.face)
+    def polygons(self, chosen: Bools | None = None) -> NDArray[np.object_]:
+        """Shapely polygons of the chosen faces (n,), of all by default.
+
+        Neighbours share all vertices along their common border.
+        """
+        rings = np.arange(len(self.ring) - 1)
+        count = np.diff(self.face)
+        if chosen is not None:
+            rings, count = rings[np.repeat(chosen, count)], count[chosen]
+        size = np.diff(self.ring)[rings] + 1
+        closed = np.append(0, np.cumsum(size))
+        place = np.arange(closed[-1]) + np.repeat(self.ring[rings] - closed[:-1], size)
+        place[closed[1:] - 1] = self.ring[rings]
+        made: NDArray[np.object_] = shapely.from_ragged_array(
+            shapely.GeometryType.POLYGON,
+            self.points[self.a[place]],
+            (closed, np.append(0, np.cumsum(count))),
+        )
+        return made
+
+    def inner_points(self) -> Float:
+        """A point (n, 2) within each face."""
+        from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
+
+        inner: Float = kernels.inner_points(self.points, self.a, self.ring, self.face)
+        return inner
 
 
 def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, float, float]) -> Faces:
@@ -69,14 +91,3 @@ def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, flo
     if abs(covered - whole) > 1e-7 * whole:
         raise GeosceneError(f"ground cells of the tile at {box} cover {covered:.6f} m2 of {whole:.6f}")
     return Faces(points, *columns)
-
-
-def polygons(corners: Float, ring: Ints, *, face: Ints) -> NDArray[np.object_]:
-    """Shapely polygons (n,) of rings whose corners (m, 2) follow each other; offsets as in `Faces`."""
-    closed = ring + np.arange(len(ring))
-    place = np.arange(closed[-1]) - np.repeat(np.arange(len(ring) - 1), np.diff(closed))
-    place[closed[1:] - 1] = ring[:-1]
-    made: NDArray[np.object_] = shapely.from_ragged_array(
-        shapely.GeometryType.POLYGON, corners[place], (closed, face)
-    )
-    return made

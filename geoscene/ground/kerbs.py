@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -25,7 +26,7 @@ from geoscene.ground.layers import (
     SIDEWALKS,
     Layers,
 )
-from geoscene.ground.partition import GroundPlan, Partition, rows_at, rows_near, tile_box, values_at
+from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
 from geoscene.typing import Bools, Float, Ints
 
@@ -44,7 +45,9 @@ _END = 2.0
 _MAPPED = 1.5
 """Metres around a mapped kerb that are as it says. Assumed: half the width of a crossing."""
 
-_AROUND = 2.0**-6
+AROUND = 2.0**-6
+"""Metres around a vertex at which the layers that touch it are looked up."""
+
 _DIRECTIONS = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False) + 0.1
 _LEVEL = (
     Class.ROAD,
@@ -151,33 +154,54 @@ def _meeting(shapes: NDArray[np.object_], bands: NDArray[np.object_]) -> tuple[I
     return shape[order], band[order]
 
 
-def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles: Triangles) -> Float:
-    """Metres (n,) by which vertices of triangles are raised: on sidewalks and on the outside of kerbs.
+class Beside(NamedTuple):
+    """What touches the vertices of triangles.
 
-    What touches a carriageway, water or a tunnel's mouth is not raised. The height of a vertex on a tile's
-    border depends on all layers there, so that neighbouring tiles agree.
+    vertex : (k,) numbers of vertices
+    row    : (k,) rows of the layers that touch them, -1 for the base
+    inside : (n,) bool, vertices that are not on a tile's side
     """
-    low, high = triangles.points.min(axis=0) - _AROUND, triangles.points.max(axis=0) + _AROUND
-    near = rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])
-    if not _is_raised(plan.layers.priority[near]).any():
-        return np.zeros(len(triangles.points))
+
+    vertex: Ints
+    row: Ints
+    inside: Bools
+
+
+def rows_beside(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Beside:
+    """The rows of the layers that touch the vertices of triangles.
+
+    On a tile's side they are those of all layers there, so that neighbouring tiles agree.
+    """
     vertex = triangles.faces.ravel()
     row = np.repeat(cells.row[triangles.cell], 3).astype(np.int64)
     edge = on_border(plan, cells, triangles=triangles)
-    points, inside = shapely.points(triangles.points), ~edge
-    inner = inside[vertex]
-    around = triangles.points[edge][:, None] + _AROUND * np.stack(
+    inner = ~edge[vertex]
+    around = triangles.points[edge][:, None] + AROUND * np.stack(
         [np.cos(_DIRECTIONS), np.sin(_DIRECTIONS)], axis=1
     )
     vertex = np.concatenate([vertex[inner], np.repeat(np.flatnonzero(edge), len(_DIRECTIONS))])
-    row = np.concatenate([row[inner], rows_at(plan, around.reshape(-1, 2))])
+    return Beside(vertex, np.concatenate([row[inner], rows_at(plan, around.reshape(-1, 2))]), ~edge)
+
+
+def has_kerbs(plan: GroundPlan, near: Ints) -> bool:
+    """Whether any of the rows near a tile raises the ground there."""
+    return plan.kerbs is not None and bool(_is_raised(plan.layers.priority[near]).any())
+
+
+def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, triangles: Triangles, beside: Beside) -> Float:
+    """Metres (n,) by which vertices of triangles are raised: on sidewalks and on the outside of kerbs.
+
+    What touches a carriageway, water or a tunnel's mouth is not raised.
+    """
+    vertex, row, inside = beside
+    points = shapely.points(triangles.points)
 
     def touched(chosen: Bools) -> Bools:
         return np.bincount(vertex[chosen], minlength=len(triangles.points)) > 0
 
-    def beside(found: Bools) -> Bools:
+    def nearby(found: Bools) -> Bools:
         # Where a lowered kerb begins, its corner and that of the kerb may be a step of the grid apart.
-        near, _ = shapely.STRtree(points[found]).query(points, predicate="dwithin", distance=_AROUND)
+        near, _ = shapely.STRtree(points[found]).query(points, predicate="dwithin", distance=AROUND)
         found = found.copy()
         found[near] |= inside[near]
         return found
@@ -186,8 +210,8 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, cells: Partition, triangles:
     klass = values_at(plan.layers.klass, row, base=plan.base[0])
     raised = touched(_is_raised(priority))
     height = np.where(raised, KERB, 0.0)
-    height[raised & beside(touched(priority == LOWERED))] = KERB_LOWERED
-    height[beside(touched(priority == FLUSH)) | touched(np.isin(klass, _LEVEL))] = 0.0
+    height[raised & nearby(touched(priority == LOWERED))] = KERB_LOWERED
+    height[nearby(touched(priority == FLUSH)) | touched(np.isin(klass, _LEVEL))] = 0.0
     vertex, end = kerbs.ends.query(points, predicate="dwithin", distance=_END)
     away = shapely.distance(points[vertex], kerbs.ends.geometries[end])
     np.minimum.at(height, vertex, KERB * away / _END)

@@ -1,4 +1,4 @@
-"""Compiled loops over the segments of a tile: where they meet, and the rings that they bound."""
+"""Compiled loops: where the segments of a tile meet, the rings that they bound, and what holds a point."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from geoscene.typing import Bools, Float, Ints
 
 _NEAR = 2
 """Steps of the grid around a segment whose cells have it; pixels that it passes are nearer."""
+
+_DOUBT = 1e-15
+"""Share of its two products to which the sign of a determinant of doubles is sure."""
 
 
 @njit(cache=True, nogil=True)
@@ -460,3 +463,99 @@ def _holds(points: Float, start: Ints, stop: Ints, ring: Ints, x: float, y: floa
         if (ay > y) != (by > y) and (side > 0.0) == (by > ay):
             inside = not inside
     return inside
+
+
+@njit(cache=True, nogil=True)
+def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[Ints, Ints, Ints]:
+    """The last of the polygons (n,) around each point, -1 for none; and points and polygons left in doubt.
+
+    A point on an outline is not inside. In doubt are those nearer to an outline than rounding tells.
+
+    xy      : (n, 2) float64, sorted by y
+    corners : (m, 2) float64, of closed rings
+    ring    : (r + 1,) int64, offsets of the rings in them
+    polygon : (r,) int64, the polygon that each ring is of, ascending
+    """
+    x, y = xy[:, 0].copy(), xy[:, 1].copy()
+    west = x.min()
+    best = np.full(len(x), -1, np.int64)
+    state = np.zeros(len(x), np.uint8)  # bit 0: inside, bit 1: in doubt
+    point, of, count = np.empty(16, np.int64), np.empty(16, np.int64), 0
+    first, last = len(x), 0
+    for r in range(len(polygon)):
+        for k in range(ring[r], ring[r + 1] - 1):
+            (ax, ay), (bx, by) = corners[k], corners[k + 1]
+            low, high = min(ay, by), max(ay, by)
+            left, right = min(ax, bx), max(ax, bx)
+            if right < west or high < y[0] or low > y[-1]:
+                continue
+            begin = np.searchsorted(y, low)
+            for p in range(begin, len(y)):
+                if y[p] > high:
+                    last = max(last, p)
+                    break
+                if x[p] > right:
+                    continue
+                on_end = x[p] == bx and y[p] == by
+                if on_end or (low == high and x[p] >= left):
+                    state[p] |= 2
+                elif (ay > y[p]) != (by > y[p]):
+                    if x[p] < left:
+                        state[p] ^= 1
+                        continue
+                    one, other = (ax - x[p]) * (by - y[p]), (ay - y[p]) * (bx - x[p])
+                    if abs(one - other) <= _DOUBT * (abs(one) + abs(other)):
+                        state[p] |= 2
+                    elif (one > other) == (by > ay):
+                        state[p] ^= 1
+            else:
+                last = len(y)
+            first = min(first, begin)
+        if r + 1 < len(polygon) and polygon[r + 1] == polygon[r]:
+            continue
+        for p in range(first, last):
+            if state[p] == 1:
+                best[p] = polygon[r]
+            elif state[p] > 1:
+                if count == len(point):
+                    point, of = np.concatenate((point, point)), np.concatenate((of, of))
+                point[count], of[count] = p, polygon[r]
+                count += 1
+            state[p] = 0
+        first, last = len(x), 0
+    return best, point[:count], of[:count]
+
+
+@njit(cache=True, nogil=True)
+def inner_points(points: Float, a: Ints, ring: Ints, face: Ints) -> Float:
+    """A point (n, 2) within each face: amid the widest section at half its height, between two vertices.
+
+    a, ring, face : as in `geoscene.ground.faces.Faces`
+    """
+    found = np.empty((len(face) - 1, 2))
+    cuts = np.empty(16)
+    for f in range(len(found)):
+        begin, end = ring[face[f]], ring[face[f + 1]]
+        bottom = top = points[a[begin], 1]
+        for k in range(begin, end):
+            bottom, top = min(bottom, points[a[k], 1]), max(top, points[a[k], 1])
+        middle, low, high = 0.5 * (bottom + top), bottom, top
+        for k in range(begin, end):
+            y = points[a[k], 1]
+            if y <= middle:
+                low = max(low, y)
+            else:
+                high = min(high, y)
+        y, count = 0.5 * (low + high), 0
+        for r in range(face[f], face[f + 1]):
+            for k in range(ring[r], ring[r + 1]):
+                p, q = points[a[k]], points[a[k + 1] if k + 1 < ring[r + 1] else a[ring[r]]]
+                if (p[1] > y) != (q[1] > y):
+                    if count == len(cuts):
+                        cuts = np.concatenate((cuts, cuts))
+                    cuts[count] = p[0] + (y - p[1]) * (q[0] - p[0]) / (q[1] - p[1])
+                    count += 1
+        across = np.sort(cuts[:count])
+        widest = 2 * np.argmax(across[1::2] - across[::2])
+        found[f] = 0.5 * (across[widest] + across[widest + 1]), y
+    return found

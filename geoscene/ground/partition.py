@@ -42,6 +42,9 @@ BEND = 0.03
 
 They are what noding leaves on straight borders that hidden outlines cross; tiles' sides keep all."""
 
+_AT_ONCE = 20_000
+"""Polygons in which points are looked up at once."""
+
 _REACH = 1e-2
 """How far beyond a tile's side outlines take part in its noding, metres: several times `PRECISION`."""
 
@@ -262,22 +265,35 @@ def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: 
 
 def rows_at(plan: GroundPlan, xy: Float) -> Ints:
     """The row of the layers (n,) that holds each point (n, 2), -1 where none does."""
-    best = np.full(len(xy), -1, np.int64)
-    point, row = plan.tree.query(shapely.points(xy))
-    polygons = plan.layers.polygon
-    # Release what this call prepared: a prepared geometry takes more memory than its polygon.
-    fresh = np.unique(row)
-    fresh = fresh[~shapely.is_prepared(polygons[fresh])]
-    shapely.prepare(polygons[fresh])
-    hit = shapely.contains_xy(polygons[row], xy[point, 0], xy[point, 1])
-    shapely.destroy_prepared(polygons[fresh])
-    point, row = point[hit], row[hit]
-    # The last of each point has the highest priority and, among equals, is the earliest row.
-    order = np.lexsort((-row, plan.layers.priority[row], point))
-    point, row = point[order], row[order]
-    last = np.flatnonzero(np.diff(point, append=-1))
-    best[point[last]] = row[last]
-    return best
+    if not len(xy):
+        return np.empty(0, np.int64)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    near = rows_near(plan, low[0], ymin=low[1], xmax=high[0], ymax=high[1])
+    axis = int(np.argmax(high - low))
+    if len(near) > _AT_ONCE and low[axis] < high[axis]:  # bounds the memory
+        row, lower = np.empty(len(xy), np.int64), xy[:, axis] < (low[axis] + high[axis]) / 2
+        row[lower], row[~lower] = rows_at(plan, xy[lower]), rows_at(plan, xy[~lower])
+        return row
+    # Of those around a point the last has the highest priority and, among equals, is the earliest row.
+    near = near[np.lexsort((-near, plan.layers.priority[near]))]
+    return np.append(near, -1)[_last_around(plan.layers.polygon[near], xy)]
+
+
+def _last_around(polygons: NDArray[np.object_], xy: Float) -> Ints:
+    """The last of the polygons around each point, -1 for none; a point on an outline is not inside."""
+    from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
+
+    parts, polygon = shapely.get_parts(polygons, return_index=True)
+    rings, part = shapely.get_rings(parts, return_index=True)
+    corners, ring = shapely.get_coordinates(rings, return_index=True)
+    by_y = np.argsort(xy[:, 1])
+    offset = np.searchsorted(ring, np.arange(len(rings) + 1))
+    best, point, of = kernels.last_around(xy[by_y], corners, offset, polygon[part])
+    around = shapely.contains_xy(polygons[of], *xy[by_y[point]].T)
+    np.maximum.at(best, point[around], of[around])
+    last = np.empty_like(best)
+    last[by_y] = best
+    return last
 
 
 def values_at(column: NDArray[Any], row: NDArray[np.integer[Any]], *, base: object) -> NDArray[Any]:
@@ -425,7 +441,7 @@ def _cells(
     i, j = tile
     box = tile_box(plan, i, j=j)
     cells = _noded_faces(plan, outlines, ruling=ruling, box=box)
-    row = rows_at(plan, shapely.get_coordinates(shapely.point_on_surface(cells.polygon)))
+    row = rows_at(plan, cells.inner_points())
     row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
     joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
@@ -451,14 +467,15 @@ def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
     """Rows after each sliver took that of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
     # slivers are among the few cells that pass this; those with a wider spot are then excluded.
-    cells = edges.polygon
-    thin = 2.0 * shapely.area(cells) < SLIVER * shapely.length(cells)
-    thin[thin] = shapely.is_empty(shapely.buffer(cells[thin], -SLIVER / 2, quad_segs=4))
+    p, q = edges.points[edges.a] - edges.points[0], edges.points[edges.b] - edges.points[0]
+    length = np.hypot(*(p - q).T)
+    area = 0.5 * np.bincount(edges.cell, q[:, 0] * p[:, 1] - p[:, 0] * q[:, 1])
+    thin = 2.0 * area < SLIVER * np.bincount(edges.cell, length)
+    thin[thin] = shapely.is_empty(shapely.buffer(edges.polygons(thin), -SLIVER / 2, quad_segs=4))
     if not thin.any():
         return row, 0
     row = row.copy()
-    length = np.hypot(*(edges.points[edges.a] - edges.points[edges.b]).T)
-    changed = np.zeros(len(cells), bool)
+    changed = np.zeros(len(edges), bool)
     todo = thin.copy()
     while todo.any():
         # Slivers beside a settled cell take its row; then those beside them.
@@ -497,4 +514,4 @@ def _dissolve(
     key = edges.a * len(edges.points) + edges.b
     order = np.argsort(key)
     first = joined.a[joined.first] * len(edges.points) + joined.b[joined.first]
-    return joined.polygon, row[edges.cell[order[np.searchsorted(key[order], first)]]]
+    return joined.polygons(), row[edges.cell[order[np.searchsorted(key[order], first)]]]

@@ -39,7 +39,7 @@ def test_faces_are_those_of_the_polygonizer_in_its_order(outlines):
     alone = [coords[k : k + 2] for k in np.flatnonzero(line[:-1] == line[1:])]
     expected = shapely.get_parts(shapely.polygonize(shapely.linestrings(np.array(alone))))
     expected = expected[shapely.covers(shapely.box(*BOX), expected)]
-    assert shapely.to_wkt(found.polygon).tolist() == shapely.to_wkt(expected).tolist()
+    assert shapely.to_wkt(found.polygons()).tolist() == shapely.to_wkt(expected).tolist()
 
 
 @given(st.lists(outline, max_size=12))
@@ -51,16 +51,16 @@ def test_what_lies_left_of_a_half_edge_has_it_on_its_right_the_other_way(outline
     for a, b, other in zip(found.a.tolist(), found.b.tolist(), found.other.tolist(), strict=True):
         assert other == right.get((b, a), -1)
     assert (found.other != found.cell).all()
-    assert shapely.area(found.polygon).sum() == SIDE * SIDE
-    assert (found.cell[found.first] == np.arange(len(found.polygon))).all()
-    starts = shapely.get_coordinates(shapely.get_point(shapely.get_exterior_ring(found.polygon), 0))
+    assert shapely.area(found.polygons()).sum() == SIDE * SIDE
+    assert (found.cell[found.first] == np.arange(len(found.polygons()))).all()
+    starts = shapely.get_coordinates(shapely.get_point(shapely.get_exterior_ring(found.polygons()), 0))
     assert (starts == found.points[found.a[found.first]]).all()
 
 
 def test_two_squares_that_touch_in_a_corner_are_holes_of_one_face():
     found = of([shapely.LinearRing(RING), *(shapely.box(k, k, k + 2, k + 2).exterior for k in (2, 4))])
-    assert sorted(shapely.area(found.polygon)) == [4.0, 4.0, SIDE * SIDE - 8.0]
-    assert shapely.is_valid(found.polygon).all()
+    assert sorted(shapely.area(found.polygons())) == [4.0, 4.0, SIDE * SIDE - 8.0]
+    assert shapely.is_valid(found.polygons()).all()
 
 
 def test_a_box_that_is_not_covered_is_an_error():
