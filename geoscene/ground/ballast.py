@@ -9,7 +9,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.typing import Float
+from geoscene.ground.nearby import shapes_near
+from geoscene.typing import Float, Ints
 
 HEIGHT = 0.4
 """Metres from the ground to the top of the ballast. Assumed: 30 cm below sleepers of 21 cm, partly sunk."""
@@ -40,18 +41,21 @@ class Beds:
     def height(self, xy: Float) -> Float:
         """Metres (n,) by which beds stand above the ground at points (n, 2), by the place alone."""
         z = np.zeros(len(xy))
-        points = shapely.points(xy)
-        point, top = self.tops.query(points, predicate="dwithin", distance=SLOPE)
-        if len(point):
-            away = shapely.distance(points[point], self.tops.geometries[top])
-            np.maximum.at(z, point, HEIGHT * (1.0 - away / SLOPE))
-        point, end = self.ends.query(points, predicate="dwithin", distance=FADE)
-        if len(point):
+        point, away = _distances(self.tops, xy, reach=SLOPE)
+        np.maximum.at(z, point, HEIGHT * (1.0 - away / SLOPE))
+        if z.any():
             share = np.ones(len(xy))
-            np.minimum.at(share, point, shapely.distance(points[point], self.ends.geometries[end]) / FADE)
+            point, away = _distances(self.ends, xy, reach=FADE)
+            np.minimum.at(share, point, away / FADE)
             z *= share
         return np.asarray(z, float)
 
     def square_metres(self, box: Sequence[float]) -> float:
         """Area of the tops within a box (xmin, ymin, xmax, ymax)."""
         return float(shapely.area(shapely.intersection(self.tops.geometries, shapely.box(*box))).sum())
+
+
+def _distances(tree: shapely.STRtree, xy: Float, *, reach: float) -> tuple[Ints, Float]:
+    """Points (k,), and metres (k,) to geometries of a tree; of points (n, 2) all that are in reach."""
+    point, row = shapes_near(tree, xy, reach=reach)
+    return point, shapely.distance(shapely.points(xy[point]), tree.geometries[row])

@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from geoscene.ground.ballast import Beds
+from geoscene.ground.nearby import shapes_near
 from geoscene.typing import Float
 
 CAMBER = 0.025
@@ -67,8 +68,7 @@ class Camber:
         z = np.zeros(len(xy))
         if not len(self.start):
             return z
-        reach = float(self.half.max())
-        point, piece = self.tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
+        point, piece = shapes_near(self.tree, xy, reach=self.half)
         along = self.end[piece] - self.start[piece]
         square = np.maximum((along**2).sum(axis=1), 1e-12)
         share = np.clip(((xy[point] - self.start[piece]) * along).sum(axis=1) / square, 0.0, 1.0)

@@ -26,6 +26,7 @@ from geoscene.ground.layers import (
     SIDEWALKS,
     Layers,
 )
+from geoscene.ground.nearby import points_in_boxes, shapes_near
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
 from geoscene.typing import Bools, Float, Ints
@@ -194,14 +195,15 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, triangles: Triangles, beside
     What touches a carriageway, water or a tunnel's mouth is not raised.
     """
     vertex, row, inside = beside
-    points = shapely.points(triangles.points)
+    points = triangles.points
 
     def touched(chosen: Bools) -> Bools:
-        return np.bincount(vertex[chosen], minlength=len(triangles.points)) > 0
+        return np.bincount(vertex[chosen], minlength=len(points)) > 0
 
     def nearby(found: Bools) -> Bools:
         # Where a lowered kerb begins, its corner and that of the kerb may be a step of the grid apart.
-        near, _ = shapely.STRtree(points[found]).query(points, predicate="dwithin", distance=AROUND)
+        near, of = points_in_boxes(points, np.tile(points[found], 2), wider=AROUND)
+        near = near[np.hypot(*(points[near] - points[found][of]).T) <= AROUND]
         found = found.copy()
         found[near] |= inside[near]
         return found
@@ -212,8 +214,8 @@ def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, triangles: Triangles, beside
     height = np.where(raised, KERB, 0.0)
     height[raised & nearby(touched(priority == LOWERED))] = KERB_LOWERED
     height[nearby(touched(priority == FLUSH)) | touched(np.isin(klass, _LEVEL))] = 0.0
-    vertex, end = kerbs.ends.query(points, predicate="dwithin", distance=_END)
-    away = shapely.distance(points[vertex], kerbs.ends.geometries[end])
+    vertex, end = shapes_near(kerbs.ends, points, reach=_END)
+    away = shapely.distance(shapely.points(points[vertex]), kerbs.ends.geometries[end])
     np.minimum.at(height, vertex, KERB * away / _END)
     return height
 

@@ -559,3 +559,19 @@ def inner_points(points: Float, a: Ints, ring: Ints, face: Ints) -> Float:
         widest = 2 * np.argmax(across[1::2] - across[::2])
         found[f] = 0.5 * (across[widest] + across[widest + 1]), y
     return found
+
+
+@njit(cache=True, nogil=True)
+def in_boxes(xy: Float, boxes: Float) -> tuple[Ints, Ints]:
+    """Points and boxes (k,) that hold them; points (n, 2) float64 sorted by y, boxes (m, 4) float64."""
+    x, y = xy[:, 0].copy(), xy[:, 1].copy()
+    point, box, count = np.empty(64, np.int64), np.empty(64, np.int64), 0
+    for b in range(len(boxes)):
+        west, south, east, north = boxes[b]
+        for p in range(np.searchsorted(y, south), np.searchsorted(y, north, "right")):
+            if west <= x[p] <= east:
+                if count == len(point):
+                    point, box = np.concatenate((point, point)), np.concatenate((box, box))
+                point[count], box[count] = p, b
+                count += 1
+    return point[:count], box[:count]
