@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import reduce
+import math
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Bools, Float, Ints
-
-_AT_ONCE = 50_000
-"""Pairs of faces tested at once, which bounds the memory."""
 
 CLEARANCE = 0.2
 """Grid steps: 0.02 mm; faces closer than this may cross in a CityJSON file, whose coordinates are rounded to
@@ -25,8 +21,8 @@ _LOW = 25
 
 _MASK = (1 << _LOW) - 1
 
-_EDGES = ((0, 1), (1, 2), (2, 0))
-"""Start and end of each edge of a triangle."""
+_AFTER = (1, 2, 0)
+"""The corner that follows each corner of a triangle: edge k goes from corner k to it."""
 
 
 def intersecting_faces(cells: Ints, faces: Ints, *, owner: NDArray[np.integer]) -> Ints:
@@ -54,100 +50,34 @@ def close_faces(
     if not len(faces):
         return np.empty((0, 2), np.int64), np.empty(0, np.bool_)
     corners = cells[faces]
-    i, j = _near_pairs(corners, owner, body=body)
-    planes = _Planes.of(corners, faces)
-    found, crossing = [np.empty((0, 2), np.int64)], [np.empty(0, np.bool_)]
-    for first in range(0, len(i), _AT_ONCE):
-        a, b = planes.not_apart(i[first : first + _AT_ONCE], j[first : first + _AT_ONCE])
-        same = common_corners(faces[a], faces[b])
-        hit = _intersect(corners[a], corners[b], same=same)
-        near = hit | (distances(corners[a], corners[b], same=same) < CLEARANCE)
-        found.append(np.stack([a, b], axis=1)[near])
-        crossing.append(hit[near])
-    return np.concatenate(found), np.concatenate(crossing)
+    pairs = _near_pairs(corners, owner, body=body)
+    state = _meetings(corners - corners[0, 0], np.ascontiguousarray(faces, np.int64), pairs)
+    close = state > _APART
+    return pairs[close], state[close] == _CROSSING
 
 
-def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None) -> tuple[Ints, Ints]:
-    """Pairs i < j of triangles (m, 3, 3) of one owner, and of two bodies if given, whose boxes overlap."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    # owners stand apart, so that triangles find only those of their own
-    apart = owner * float(high[:, 0].max() - low[:, 0].min() + 1)
-    boxes = shapely.box(low[:, 0] + apart, low[:, 1], high[:, 0] + apart, high[:, 1])
-    tree = shapely.STRtree(boxes)
-    bottom, top = low[:, 2].copy(), high[:, 2].copy()
-    # the first body, of which there is most, is only asked
-    start = 0 if body is None else int(np.searchsorted(body, body[0], side="right"))
-    found = [np.empty((2, 0), np.int64)]
-    for first in range(start, len(boxes), 20_000):
-        j, i = tree.query(boxes[first : first + 20_000])
-        j += first
-        above = i < j if body is None else body[i] < body[j]
-        i, j = i[above], j[above]
-        near = (bottom[i] <= top[j]) & (bottom[j] <= top[i])
-        found.append(np.stack([i[near], j[near]]))
-    i, j = np.concatenate(found, axis=1)
-    return i, j
+def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None) -> Ints:
+    """Pairs (k, 2) of triangles (m, 3, 3) of one owner, and of two bodies if given, whose boxes overlap.
 
-
-@dataclass(frozen=True, slots=True)
-class _Planes:
-    """Planes of triangles and of their edges, rounded, which tell most pairs of triangles apart.
-
-    vertices : (3, m) numbers of the corners
-    points   : (3, 3, m) grid steps: corner, axis, triangle
-    normal   : (4, 3, m) unit vectors: of the triangle, and in its plane out of each edge
-    offset   : (4, m) normal . x of the points x of each plane
+    The first of a pair has the smaller number; the pairs are sorted by the second, then by the first.
     """
+    boxes = np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    owners, of = np.unique(owner, return_inverse=True)
+    low, high = np.empty((2, len(owners), 3), np.int64)
+    low[of], high[of] = boxes[:, 0], boxes[:, 1]  # each owner's of any of its faces, then of all
+    np.minimum.at(low, of, boxes[:, 0])
+    np.maximum.at(high, of, boxes[:, 1])
+    # along the longest side of each owner's box the fewest faces lie side by side
+    along = np.argmax(high - low, axis=1)[of]
+    order = np.lexsort((boxes[np.arange(len(of)), 0, along], of))
+    several = np.arange(len(of)) if body is None else body
+    pairs = _swept(boxes[order], of[order], along[order], several[order])
+    pairs = np.sort(order[pairs], axis=1)
+    return np.asarray(pairs[np.lexsort(pairs.T)], np.int64)
 
-    vertices: NDArray[np.int32]
-    points: Float
-    normal: Float
-    offset: Float
 
-    @classmethod
-    def of(cls, corners: Ints, faces: Ints) -> _Planes:
-        """The planes of triangles (m, 3, 3)."""
-        points = np.ascontiguousarray((corners - corners[0, 0]).transpose(1, 2, 0))
-        along = np.roll(points, -1, axis=0) - points
-        upright = np.cross(along[0], along[1], axis=0).astype(float)  # of whole numbers, so it is exact
-        normal = np.stack([upright, *(np.cross(edge, upright, axis=0) for edge in along)])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1.0)
-        offset = (normal * points[[0, 0, 1, 2]]).sum(axis=1)
-        return cls(np.ascontiguousarray(faces.T, np.int32), points.astype(float), normal, offset)
-
-    def not_apart(self, a: Ints, b: Ints) -> tuple[Ints, Ints]:
-        """The pairs of triangles a and b (n,) that no plane of either clearly separates."""
-        for separated in (self._by_face, self._by_edges):
-            for _ in range(2):
-                rest = ~separated(a, b)
-                a, b = b[rest], a[rest]
-        return a, b
-
-    def _by_face(self, a: Ints, b: Ints) -> Bools:
-        """(n,) bool, the plane of a has all corners of b on one side, except for common corners."""
-        above, below = self._sides(0, a, b=b, common=(0, 1, 2))
-        return above | below
-
-    def _by_edges(self, a: Ints, b: Ints) -> Bools:
-        """(n,) bool, b lies outside an edge of a, except for common ends of the edge."""
-        outside = [self._sides(k + 1, a, b=b, common=ends)[0] for k, ends in enumerate(_EDGES)]
-        return np.asarray(np.any(outside, axis=0), np.bool_)
-
-    def _sides(self, plane: int, a: Ints, *, b: Ints, common: tuple[int, ...]) -> tuple[Bools, Bools]:
-        """(n,) bool, whether the corners of b are clearly above a plane of a, or clearly below it.
-
-        common : corners of a that b may have
-        """
-        normal, offset = self.normal[plane][:, a], self.offset[plane][a]
-        own = self.vertices[list(common)][:, a]
-        above, below = np.ones((2, len(a)), np.bool_)
-        for corner, number in zip(self.points, self.vertices, strict=True):
-            x, y, z = corner[:, b]
-            away = normal[0] * x + normal[1] * y + normal[2] * z - offset
-            known = reduce(np.logical_or, own == number[b])
-            above &= known | (away > CLEARANCE)
-            below &= known | (away < -CLEARANCE)
-        return above, below
+_APART, _NEAR, _CROSSING = 0, 1, 2
+"""How two faces lie to each other: apart, closer than `CLEARANCE`, or with a point in common."""
 
 
 def common_corners(first: Ints, second: Ints) -> Bools:
@@ -160,112 +90,8 @@ def distances(first: Ints, second: Ints, *, same: Bools) -> Float:
 
     same : (3, 3, n) bool, corner i of the first is corner j of the second
     """
-    least = np.full(len(first), np.inf)
-    for one, two, common in ((first, second, same), (second, first, same.transpose(1, 0, 2))):
-        for k in range(3):
-            away = _from_triangles(one[:, k], two)
-            least = np.where(common[k].any(axis=0), least, np.minimum(least, away))
-    for a, b in _EDGES:
-        for c, d in _EDGES:
-            known = same[a, c] | same[a, d] | same[b, c] | same[b, d]
-            away = _between(first[:, a], first[:, b], c=second[:, c], d=second[:, d])
-            least = np.where(known, least, np.minimum(least, away))
-    return least
-
-
-def _from_triangles(points: Ints, triangles: Ints) -> Float:
-    """Distance (n,) of points (n, 3) from triangles (n, 3, 3); one without area is its edges."""
-    a, b, c = triangles.transpose(1, 0, 2).astype(float)
-    across = np.cross(b - a, c - a)
-    size = np.linalg.norm(across, axis=1, keepdims=True)
-    normal = np.divide(across, size, out=np.full_like(across, np.nan), where=size > 0)
-    sides = [(end - start, points - start) for start, end in ((a, b), (b, c), (c, a))]
-    over = np.all([np.vecdot(np.cross(side, away), normal) >= 0 for side, away in sides], axis=0)
-    beside = np.min([_from_edges(away, side) for side, away in sides], axis=0)
-    return np.asarray(np.where(over, np.abs(np.vecdot(points - a, normal)), beside), float)
-
-
-def _from_edges(away: Float, edge: Float) -> Float:
-    """Distance (n,) of points from edges; both (n, 3) from the start of each edge."""
-    share = np.clip(np.vecdot(away, edge) / np.vecdot(edge, edge), 0, 1)
-    return np.asarray(np.linalg.norm(away - share[:, None] * edge, axis=1), float)
-
-
-def _between(a: Ints, b: Ints, *, c: Ints, d: Ints) -> Float:
-    """Distance (n,) of segments a b and c d, each (n, 3) (Ericson 2005, section 5.1.9)."""
-    u, v, w = (b - a).astype(float), (d - c).astype(float), (a - c).astype(float)
-    uu, vv, uv, uw, vw = (np.vecdot(x, y) for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
-    spread = uu * vv - uv * uv
-    s = np.divide(uv * vw - uw * vv, spread, out=np.zeros_like(uu), where=spread > 1e-12 * uu * vv)
-    t = np.clip((uv * np.clip(s, 0, 1) + vw) / vv, 0, 1)
-    s = np.clip((uv * t - uw) / uu, 0, 1)
-    return np.asarray(np.linalg.norm(w + s[:, None] * u - t[:, None] * v, axis=1), float)
-
-
-def _intersect(first: Ints, second: Ints, *, same: Bools) -> Bools:
-    """(n,) bool, pairs of triangles (n, 3, 3) that intersect outside their common corners and edges.
-
-    same : (3, 3, n) bool, corner i of the first is corner j of the second
-    """
-    shared = same.sum(axis=(0, 1))
-    common: tuple[Bools, Bools] = np.any(same, axis=1), np.any(same, axis=0)
-    hit: Bools = shared == 3
-    own, others = _sides(second, first), _sides(first, second)
-    apart = _one_side(own, common[0]) | _one_side(others, common[1])
-    rows = np.flatnonzero(~hit & ~apart)
-    folded = rows[shared[rows] == 2]
-    hit[folded] = _folded(first[folded], second[folded], common=(common[0][:, folded], common[1][:, folded]))
-    rows = rows[shared[rows] < 2]
-    edges = []
-    for one, two, side, known in ((first, second, own, common[0]), (second, first, others, common[1])):
-        for a, b in _EDGES:
-            free = rows[~known[a, rows] & ~known[b, rows]]
-            edges.append((free, one[free, a], one[free, b], two[free], side[a, free], side[b, free]))
-    row, p, q, triangle, *ends = (np.concatenate(column) for column in zip(*edges, strict=True))
-    hit[row[_pierces(p, q, triangle=triangle, ends=(ends[0], ends[1]))]] = True
-    return hit
-
-
-def _one_side(sides: Ints, common: Bools) -> Bools:
-    """(n,) bool, all corners that are not common lie strictly on one side of a plane; both (3, n)."""
-    up = ((sides > 0) | common).all(axis=0)
-    down = ((sides < 0) | common).all(axis=0)
-    return np.asarray(up | down, np.bool_)
-
-
-def _sides(triangle: Ints, points: Ints) -> Ints:
-    """Sides (3, n) of planes of triangles (n, 3, 3) on which points (n, 3, 3) lie: 1, 0 or -1."""
-    a, b, c = triangle.transpose(1, 2, 0)
-    return np.stack([_sign(_cross(b - a, c - a), point - a) for point in points.transpose(1, 2, 0)])
-
-
-def _cross(u: Ints, v: Ints) -> Ints:
-    """Cross products of vectors (3, n)."""
-    return np.stack([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
-
-
-def _sign(normal: Ints, along: Ints) -> Ints:
-    """Signs (n,) of the scalar products of vectors (3, n), of which the first are cross products."""
-    high, low = 0, 0
-    for part, w in zip(normal, along, strict=True):
-        high = high + w * (part >> _LOW)
-        low = low + w * (part & _MASK)
-    high += low >> _LOW
-    return np.asarray(np.where(high != 0, np.sign(high), np.sign(low & _MASK)), np.int64)
-
-
-def _pierces(p: Ints, q: Ints, *, triangle: Ints, ends: tuple[Ints, Ints]) -> Bools:
-    """(n,) bool, whether segments p q meet triangles (n, 3, 3); ``ends`` are the sides of p and q."""
-    hit = np.zeros(len(p), np.bool_)
-    level = (ends[0] == 0) & (ends[1] == 0)
-    rows = np.flatnonzero(level)
-    hit[rows] = _meet_in_plane(p[rows], q[rows], triangle=triangle[rows])
-    rows = np.flatnonzero(~level & (ends[0] * ends[1] <= 0))
-    along = (q[rows] - p[rows]).T
-    corners = (triangle[rows] - p[rows, None]).transpose(1, 2, 0)
-    turns = np.stack([_sign(_cross(along, corners[a]), corners[b]) for a, b in _EDGES])
-    hit[rows] = (turns >= 0).all(axis=0) | (turns <= 0).all(axis=0)
-    return hit
+    one, two, common = (np.ascontiguousarray(a) for a in (first, second, same.transpose(2, 0, 1)))
+    return np.asarray(_distances(one, two, common), float)
 
 
 def plan_axes(triangles: Ints | Float) -> Ints:
@@ -275,40 +101,300 @@ def plan_axes(triangles: Ints | Float) -> Ints:
     return axes
 
 
-def _turn(a: Ints, b: Ints, *, c: Ints) -> Ints:
-    """Sign (n,) of the area of triangles in the plane (n, 2 each)."""
-    u, v = b - a, c - a
-    return np.asarray(np.sign(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), np.int64)
+@njit(cache=True, nogil=True)
+def _swept(boxes: Ints, owner: Ints, along: Ints, body: Ints) -> Ints:
+    """Pairs (k, 2) of boxes (m, 2, 3) of one owner that overlap, of different bodies.
 
-
-def _meet_in_plane(p: Ints, q: Ints, *, triangle: Ints) -> Bools:
-    """(n,) bool, whether segments in the planes of triangles (n, 3, 3) meet them."""
-    axes = plan_axes(triangle)
-    p, q = np.take_along_axis(p, axes, axis=1), np.take_along_axis(q, axes, axis=1)
-    corner = [np.take_along_axis(triangle[:, k], axes, axis=1) for k in range(3)]
-    inside = np.stack([_turn(corner[a], corner[b], c=p) for a, b in _EDGES])
-    hit = (inside >= 0).all(axis=0) | (inside <= 0).all(axis=0)
-    for a, b in _EDGES:
-        hit |= _segments_cross(p, q, a=corner[a], b=corner[b])
-    return np.asarray(hit, np.bool_)
-
-
-def _segments_cross(p: Ints, q: Ints, *, a: Ints, b: Ints) -> Bools:
-    """(n,) bool, whether segments p q and a b in the plane have a point in common."""
-    turns = (_turn(p, q, c=a) * _turn(p, q, c=b) <= 0) & (_turn(a, b, c=p) * _turn(a, b, c=q) <= 0)
-    overlap = (np.maximum(p, q) >= np.minimum(a, b)) & (np.maximum(a, b) >= np.minimum(p, q))
-    return np.asarray(turns & overlap.all(axis=1), np.bool_)
-
-
-def _folded(first: Ints, second: Ints, *, common: tuple[Bools, Bools]) -> Bools:
-    """(n,) bool, whether coplanar triangles with a common edge lie on the same side of it.
-
-    common : which corners (3, n) of the first and of the second are those of the edge
+    They are sorted by owner, then by their low ends on the axis that is the owner's in ``along``.
     """
-    n, tips = np.arange(len(first)), [np.argmin(known, axis=0) for known in common]
-    axes = plan_axes(first)
-    tip, a, b, other = (
-        np.take_along_axis(x, axes, axis=1)
-        for x in (*(first[n, (tips[0] + k) % 3] for k in range(3)), second[n, tips[1]])
-    )
-    return np.asarray(_turn(a, b, c=tip) == _turn(a, b, c=other), np.bool_)
+    found = np.empty((max(4 * len(boxes), 64), 2), np.int64)
+    n = 0
+    for i in range(len(boxes)):
+        axis = along[i]
+        j = i + 1
+        while j < len(boxes) and owner[j] == owner[i] and boxes[j, 0, axis] <= boxes[i, 1, axis]:
+            near = body[i] != body[j]
+            for k in range(3):
+                near = near and boxes[i, 0, k] <= boxes[j, 1, k] and boxes[j, 0, k] <= boxes[i, 1, k]
+            if near:
+                if n == len(found):
+                    found = np.concatenate((found, np.empty_like(found)))
+                found[n] = i, j
+                n += 1
+            j += 1
+    return found[:n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distances(first: Ints, second: Ints, same: Bools) -> Float:
+    """`distances`, of triangles whose common corners are in the columns of ``same`` (n, 3, 3)."""
+    found = np.empty(len(first))
+    for k in range(len(first)):
+        found[k] = _distance(first[k], second[k], same[k])
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meetings(corners: Ints, faces: Ints, pairs: Ints) -> NDArray[np.uint8]:
+    """How each pair (k, 2) of triangles lies to each other.
+
+    corners : (m, 3, 3) grid steps of the triangles' corners
+    faces   : (m, 3) vertices of the triangles
+    """
+    planes = np.empty((len(corners), 4, 4))
+    for k in range(len(corners)):
+        _find_planes(corners[k], planes[k])
+    found = np.zeros(len(pairs), np.uint8)
+    same = np.empty((3, 3), np.bool_)
+    for k in range(len(pairs)):
+        a, b = pairs[k]
+        one, two = corners[a], corners[b]
+        shared = 0
+        for i in range(3):
+            for j in range(3):
+                same[i, j] = faces[a, i] == faces[b, j]
+                shared += same[i, j]
+        if _separated(planes[a], two, same) or _separated(planes[b], one, same.T):
+            continue
+        if _intersect(one, two, same, shared):
+            found[k] = _CROSSING
+        elif _distance(one, two, same) < CLEARANCE:
+            found[k] = _NEAR
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _find_planes(corner: Ints, planes: Float) -> None:
+    """Set the rounded planes (4, 4) of a triangle, and in it through each edge: unit normal and offset."""
+    ux, uy, uz = corner[1] - corner[0]
+    vx, vy, vz = corner[2] - corner[1]
+    n = (float(uy * vz - uz * vy), float(uz * vx - ux * vz), float(ux * vy - uy * vx))  # exact
+    for k in range(4):
+        x, y, z = n
+        at = corner[max(k - 1, 0)]
+        if k:
+            ex, ey, ez = corner[_AFTER[k - 1]] - at
+            x, y, z = ey * n[2] - ez * n[1], ez * n[0] - ex * n[2], ex * n[1] - ey * n[0]
+        size = max(math.sqrt(x * x + y * y + z * z), 1.0)
+        planes[k, 0], planes[k, 1], planes[k, 2] = x / size, y / size, z / size
+        planes[k, 3] = planes[k, 0] * at[0] + planes[k, 1] * at[1] + planes[k, 2] * at[2]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _separated(planes: Float, other: Ints, same: Bools) -> bool:
+    """Whether a plane of a triangle clearly has another triangle on one side, except for common corners.
+
+    That is the triangle's own plane, or one through an edge, which it lies outside of; there only the ends
+    of the edge count as common.
+    """
+    for k in range(4):
+        above = below = True
+        for j in range(3):
+            if k == 0:
+                known = same[0, j] or same[1, j] or same[2, j]
+            else:
+                known = same[k - 1, j] or same[_AFTER[k - 1], j]
+            if known:
+                continue
+            away = planes[k, 0] * other[j, 0] + planes[k, 1] * other[j, 1] + planes[k, 2] * other[j, 2]
+            away -= planes[k, 3]
+            above &= away > CLEARANCE
+            below &= away < -CLEARANCE
+        if above or (k == 0 and below):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _distance(first: Ints, second: Ints, same: Bools) -> float:
+    """Grid steps between those corners, edges and faces of two triangles that share no corner."""
+    least = np.inf
+    for k in range(3):
+        if not same[k].any():
+            least = min(least, _from_triangle(first[k], second))
+        if not same[:, k].any():
+            least = min(least, _from_triangle(second[k], first))
+    for i in range(3):
+        for j in range(3):
+            a, b, c, d = i, _AFTER[i], j, _AFTER[j]
+            if not (same[a, c] or same[a, d] or same[b, c] or same[b, d]):
+                least = min(least, _between(first[a], first[b], second[c], second[d]))
+    return least
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _from_triangle(point: Ints, triangle: Ints) -> float:
+    """Distance of a point from a triangle; one without area is its edges."""
+    ux, uy, uz = _difference(triangle[1], triangle[0])
+    vx, vy, vz = _difference(triangle[2], triangle[0])
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    over, beside = size > 0, np.inf
+    for k in range(3):
+        ex, ey, ez = _difference(triangle[_AFTER[k]], triangle[k])
+        x, y, z = _difference(point, triangle[k])
+        over &= (ey * z - ez * y) * nx + (ez * x - ex * z) * ny + (ex * y - ey * x) * nz >= 0
+        square = ex * ex + ey * ey + ez * ez
+        share = min(max((x * ex + y * ey + z * ez) / square, 0.0), 1.0) if square > 0 else 0.0
+        x, y, z = x - share * ex, y - share * ey, z - share * ez
+        beside = min(beside, math.sqrt(x * x + y * y + z * z))
+    if over:
+        x, y, z = _difference(point, triangle[0])
+        return abs(x * nx + y * ny + z * nz) / size
+    return beside
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _between(a: Ints, b: Ints, c: Ints, d: Ints) -> float:
+    """Distance of segments a b and c d (Ericson 2005, section 5.1.9)."""
+    ux, uy, uz = _difference(b, a)
+    vx, vy, vz = _difference(d, c)
+    wx, wy, wz = _difference(a, c)
+    uu, vv = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz
+    uv, uw = ux * vx + uy * vy + uz * vz, ux * wx + uy * wy + uz * wz
+    vw = vx * wx + vy * wy + vz * wz
+    spread = uu * vv - uv * uv
+    s = (uv * vw - uw * vv) / spread if spread > 1e-12 * uu * vv else 0.0
+    t = min(max((uv * min(max(s, 0.0), 1.0) + vw) / vv, 0.0), 1.0) if vv > 0 else 0.0
+    s = min(max((uv * t - uw) / uu, 0.0), 1.0) if uu > 0 else 0.0
+    x, y, z = wx + s * ux - t * vx, wy + s * uy - t * vy, wz + s * uz - t * vz
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _difference(a: Ints, b: Ints) -> tuple[float, float, float]:
+    """The vector from b to a."""
+    return float(a[0] - b[0]), float(a[1] - b[1]), float(a[2] - b[2])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _intersect(first: Ints, second: Ints, same: Bools, shared: int) -> bool:
+    """Whether two triangles intersect outside their common corners and edges.
+
+    shared : number of common corners
+    """
+    if shared == 3:
+        return True
+    own, others = np.empty(3, np.int64), np.empty(3, np.int64)
+    for k in range(3):
+        own[k], others[k] = _side(second, first[k]), _side(first, second[k])
+    if _one_side(own, same) or _one_side(others, same.T):
+        return False
+    if shared == 2:
+        return _folded(first, second, same)
+    return _edges_pierce(first, second, own, same) or _edges_pierce(second, first, others, same.T)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _side(triangle: Ints, point: Ints) -> int:
+    """Side of the plane of a triangle on which a point lies: 1, 0 or -1."""
+    return _volume_sign(triangle[1] - triangle[0], triangle[2] - triangle[0], point - triangle[0])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _volume_sign(u: Ints, v: Ints, w: Ints) -> int:
+    """Sign of the scalar product of u x v and w."""
+    high, low = np.int64(0), np.int64(0)
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        part = u[i] * v[j] - u[j] * v[i]
+        high += w[k] * (part >> _LOW)
+        low += w[k] * (part & _MASK)
+    high += low >> _LOW
+    return _sign(high) if high != 0 else _sign(low & _MASK)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sign(value: int) -> int:
+    """1, 0 or -1."""
+    return int(value > 0) - int(value < 0)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _one_side(sides: Ints, same: Bools) -> bool:
+    """Whether all corners (3,) that are not common lie strictly on one side of a plane."""
+    up = down = True
+    for k in range(3):
+        if not same[k].any():
+            up &= sides[k] > 0
+            down &= sides[k] < 0
+    return up or down
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _edges_pierce(one: Ints, two: Ints, sides: Ints, same: Bools) -> bool:
+    """Whether an edge of a triangle without common corners meets another triangle.
+
+    sides : (3,) of the other's plane on which the corners lie
+    """
+    for a in range(3):
+        b = _AFTER[a]
+        if same[a].any() or same[b].any():
+            continue
+        p, q = one[a], one[b]
+        if sides[a] == 0 and sides[b] == 0:
+            if _meet_in_plane(p, q, two):
+                return True
+        elif sides[a] * sides[b] <= 0:
+            left = right = True
+            for k in range(3):
+                turn = _volume_sign(q - p, two[k] - p, two[_AFTER[k]] - p)
+                left &= turn >= 0
+                right &= turn <= 0
+            if left or right:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _axes(triangle: Ints) -> tuple[int, int]:
+    """The two axes onto which a triangle projects with the greatest area."""
+    u, v = triangle[1] - triangle[0], triangle[2] - triangle[0]
+    most, axes = np.int64(-1), (1, 2)
+    for i, j in ((1, 2), (2, 0), (0, 1)):
+        size = abs(u[i] * v[j] - u[j] * v[i])
+        if size > most:
+            most, axes = size, (i, j)
+    return axes
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _turn(a: Ints, b: Ints, c: Ints, i: int, j: int) -> int:
+    """Sign of the area of a triangle in the plane of axes i and j."""
+    return _sign((b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i]))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meet_in_plane(p: Ints, q: Ints, triangle: Ints) -> bool:
+    """Whether a segment in the plane of a triangle meets it."""
+    i, j = _axes(triangle)
+    left = right = True
+    for k in range(3):
+        a, b = triangle[k], triangle[_AFTER[k]]
+        turn = _turn(a, b, p, i, j)
+        left &= turn >= 0
+        right &= turn <= 0
+        if (
+            _turn(p, q, a, i, j) * _turn(p, q, b, i, j) <= 0
+            and _turn(a, b, p, i, j) * _turn(a, b, q, i, j) <= 0
+            and max(p[i], q[i]) >= min(a[i], b[i])
+            and max(a[i], b[i]) >= min(p[i], q[i])
+            and max(p[j], q[j]) >= min(a[j], b[j])
+            and max(a[j], b[j]) >= min(p[j], q[j])
+        ):
+            return True
+    return left or right
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _folded(first: Ints, second: Ints, same: Bools) -> bool:
+    """Whether coplanar triangles with a common edge lie on the same side of it."""
+    tip = other = 0
+    for k in range(3):
+        if not same[k].any():
+            tip = k
+        if not same[:, k].any():
+            other = k
+    i, j = _axes(first)
+    a, b = first[_AFTER[tip]], first[_AFTER[_AFTER[tip]]]
+    return _turn(a, b, first[tip], i, j) == _turn(a, b, second[other], i, j)

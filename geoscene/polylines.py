@@ -49,6 +49,22 @@ def cut(line: Float, start: float, *, end: float, gap: float = 0.0, least: float
     return points_at(line, np.concatenate([[start], along[inside], [end]]), along=along)
 
 
+def parts(line: Float, cuts: Float) -> NDArray[np.object_]:
+    """The parts (k,) of a line (n, 2) between ascending stations (k + 1,), as shapely lines; see `cut`."""
+    along = stations(line)
+    cuts = np.clip(cuts, 0.0, along[-1])
+    ends = points_at(line, cuts, along=along)
+    begin, stop = np.searchsorted(along, cuts[:-1], side="right"), np.searchsorted(along, cuts[1:])
+    inside = np.maximum(stop - begin, 0)
+    vertex = np.repeat(begin - np.cumsum(inside) + inside, inside) + np.arange(inside.sum())
+    part = np.arange(len(inside))
+    points = np.concatenate([ends[:-1], line[vertex], ends[1:]])
+    of = np.concatenate([part, np.repeat(part, inside), part])
+    order = np.argsort(of, kind="stable")
+    found: NDArray[np.object_] = shapely.linestrings(points[order], indices=of[order])
+    return found
+
+
 def summed(steps: Float, first: Ints) -> Float:
     """Sums (n,) of steps (n,) after given earlier ones (n,): stations of points of many lines in one array.
 

@@ -112,10 +112,17 @@ def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tu
     points : (n, 3) metres, finite, within 1e5 m of the origin
     """
     cell = grid_cells(points, grid=grid)
-    cell -= cell.min(axis=0, initial=np.iinfo(np.int64).max, keepdims=True) if len(cell) else 0
-    ids, _ = _pair_ids(cell[:, 0], cell[:, 1])
-    ids, _ = _pair_ids(ids, cell[:, 2])
-    return _pair_ids(owner.astype(np.int64), ids)
+    x, y, z = (axis - axis.min(initial=0) for axis in cell.T)
+    # products of ranges within 2e9 steps stay below 2**63
+    keys = y * (z.max(initial=0) + 1) + z, owner.astype(np.int64) * (x.max(initial=0) + 1) + x
+    order = np.lexsort(keys)
+    new = np.zeros(len(order), np.bool_)
+    for key in keys:
+        ordered = key[order]
+        new |= np.diff(ordered, prepend=ordered[:1] - 1) != 0
+    ids = np.empty(len(order), np.int64)
+    ids[order] = np.cumsum(new) - 1
+    return ids, order[new]
 
 
 def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
 from geoscene.roadgraph.graph import RoadGraph
@@ -90,17 +93,9 @@ def graded_ground(
     pieces = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
     reach = float(half.max()) + batter
     rows = _beside_ramps(pieces, start, end=end, reach=2 * reach) if level else np.arange(len(pieces))
-    return partial(
-        _graded_height,
-        ground=ground,
-        tree=shapely.STRtree(pieces[rows]),
-        start=start[rows],
-        end=end[rows],
-        half=half[rows],
-        square_ends=square_ends[rows],
-        batter=batter,
-        surveyed=surveyed,
-    )
+    rows = rows[shapely.STRtree(pieces[rows]).query(shapely.box(*shapely.total_bounds(pieces)))]
+    roads = _Pieces.of(start[rows], end[rows], half=half[rows], square_ends=square_ends[rows], batter=batter)
+    return partial(_graded_height, ground=ground, roads=roads, surveyed=surveyed)
 
 
 def _beside_ramps(pieces: NDArray[np.object_], start: Float, *, end: Float, reach: float) -> Ints:
@@ -109,47 +104,135 @@ def _beside_ramps(pieces: NDArray[np.object_], start: Float, *, end: Float, reac
     return np.unique(shapely.STRtree(pieces).query(ramps, predicate="dwithin", distance=reach)[1])
 
 
-def _graded_height(
-    x: Float,
-    y: Float,
-    *,
-    ground: Height,
-    tree: shapely.STRtree,
+@dataclass(frozen=True, slots=True)
+class _Pieces:
+    """Pieces of road that ground is graded to, and those in reach of each square of a grid.
+
+    start, end  : (n, 3) metres
+    half        : (n,) half of the width with shoulders
+    square_ends : (n, 2) whether the grading ends square at the start and the end
+    batter      : metres beyond the shoulder in which the ground blends into the terrain
+    side        : metres of the squares
+    corner      : (2,) numbers of the grid's first column and row
+    shape       : (2,) numbers of columns and rows
+    square      : (k,) sorted numbers of the squares with pieces in reach, column by column
+    first       : (k + 1,) where the pieces of each of them begin in ``piece``
+    piece       : (m,) rows of pieces, ascending in each square
+    """
+
+    start: Float
+    end: Float
+    half: Float
+    square_ends: Bools
+    batter: float
+    side: float
+    corner: Ints
+    shape: Ints
+    square: Ints
+    first: Ints
+    piece: Ints
+
+    @classmethod
+    def of(cls, start: Float, end: Float, *, half: Float, square_ends: Bools, batter: float) -> _Pieces:
+        """The table of pieces; see the columns."""
+        reach = float(half.max(initial=0.0)) + batter
+        side = 2 * reach
+        ends = np.stack([start[:, :2], end[:, :2]])
+        low = np.floor((ends.min(axis=0) - reach) / side).astype(np.int64)
+        span = np.floor((ends.max(axis=0) + reach) / side).astype(np.int64) - low + 1
+        corner = low.min(axis=0, initial=0)
+        shape = (low + span).max(axis=0, initial=0) - corner
+        copies = span.prod(axis=1)
+        piece = np.repeat(np.arange(len(start)), copies)
+        column, row = np.divmod(
+            np.arange(len(piece)) - np.repeat(np.cumsum(copies) - copies, copies), span[piece, 1]
+        )
+        column, row = column + low[piece, 0] - corner[0], row + low[piece, 1] - corner[1]
+        number = column * shape[1] + row
+        order = np.argsort(number, kind="stable")
+        square, first = np.unique(number[order], return_index=True)
+        first = np.append(first, len(order))
+        return cls(start, end, half, square_ends, batter, side, corner, shape, square, first, piece[order])
+
+    def around(self, x: Float, y: Float) -> tuple[Ints, Ints]:
+        """Where in ``piece`` the pieces in reach of points (n,) begin and end."""
+        column, row = (
+            np.floor(value / self.side).astype(np.int64) - first
+            for value, first in zip((x, y), self.corner.tolist(), strict=True)
+        )
+        within = (column >= 0) & (column < self.shape[0]) & (row >= 0) & (row < self.shape[1])
+        number = np.where(within, column * self.shape[1] + row, -1)
+        at = np.searchsorted(self.square, number)
+        known = np.append(self.square, -2)[at] == number
+        return np.where(known, self.first[at], 0), np.where(known, np.append(self.first, 0)[at + 1], 0)
+
+
+def _graded_height(x: Float, y: Float, *, ground: Height, roads: _Pieces, surveyed: bool) -> Float:
+    """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
+    z = np.asarray(ground(x, y), float)
+    xy = np.stack([x, y], axis=1).astype(float)
+    begin, stop = roads.around(x, y)
+    road_z, most, near = _weighed(
+        xy,
+        begin,
+        stop,
+        roads.piece,
+        roads.start,
+        roads.end,
+        roads.half,
+        roads.square_ends,
+        roads.batter,
+    )
+    road_z = np.where(near, road_z, z)
+    if surveyed:
+        # steeper towards the end of the reach, so that high fills and deep cuts end there without a step
+        with np.errstate(divide="ignore"):
+            free_of = _CUT * roads.batter * (1.0 - most) / most
+        return np.where(near, np.clip(z, road_z - free_of, road_z + free_of), z)
+    blend = most * most * (3.0 - 2.0 * most)
+    graded: Float = z + blend * (road_z - z)
+    return graded
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weighed(
+    xy: Float,
+    begin: Ints,
+    stop: Ints,
+    piece: Ints,
     start: Float,
     end: Float,
     half: Float,
     square_ends: Bools,
     batter: float,
-    surveyed: bool,
-) -> Float:
-    """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
-    z = np.asarray(ground(x, y), float).copy()
-    xy = np.stack([x, y], axis=1)
-    reach = float(half.max(initial=0.0)) + batter
-    point, road = tree.query(shapely.points(xy), predicate="dwithin", distance=reach)
-    along = end[road, :2] - start[road, :2]
-    square = np.maximum((along**2).sum(axis=1), 1e-12)
-    free = ((xy[point] - start[road, :2]) * along).sum(axis=1) / square
-    t = np.clip(free, 0.0, 1.0)
-    foot = start[road] + t[:, None] * (end[road] - start[road])
-    away = np.hypot(*(xy[point] - foot[:, :2]).T)
-    beyond = np.maximum(away - half[road], 0.0)
-    ahead = np.abs(free - t) * np.sqrt(square)
-    cut = np.where(free < t, *square_ends[road].T) & (ahead > 0)
-    aside = np.sqrt(np.maximum(away**2 - ahead**2, 0.0)) - half[road]
-    beyond[cut] = np.hypot(np.maximum(aside, 0.0), ahead)[cut]
-    share = np.clip(1.0 - beyond / batter, 0.0, 1.0)
-    weight = share**2 / (_SHARP + (away / half[road]) ** 2) ** 2
-    total = np.bincount(point, weight, len(z))
-    near = total > 0
-    road_z = np.divide(np.bincount(point, weight * foot[:, 2], len(z)), total, out=z.copy(), where=near)
-    most = np.zeros(len(z))
-    np.maximum.at(most, point, share)
-    if surveyed:
-        # steeper towards the end of the reach, so that high fills and deep cuts end there without a step
-        with np.errstate(divide="ignore"):
-            free_of = _CUT * batter * (1.0 - most) / most
-        return np.where(near, np.clip(z, road_z - free_of, road_z + free_of), z)
-    blend = most * most * (3.0 - 2.0 * most)
-    graded: Float = z + blend * (road_z - z)
-    return graded
+) -> tuple[Float, Float, Bools]:
+    """The height of the roads at points (n, 2), the greatest share that one has there, and whether any has.
+
+    begin, stop : (n,) where in ``piece`` the pieces begin and end that each point may be in reach of
+    """
+    z, most, near = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), np.bool_)
+    for p in range(len(xy)):
+        total = heights = 0.0
+        for r in piece[begin[p] : stop[p]]:
+            along_x, along_y = end[r, 0] - start[r, 0], end[r, 1] - start[r, 1]
+            square = max(along_x * along_x + along_y * along_y, 1e-12)
+            free = ((xy[p, 0] - start[r, 0]) * along_x + (xy[p, 1] - start[r, 1]) * along_y) / square
+            t = min(max(free, 0.0), 1.0)
+            away = math.hypot(xy[p, 0] - (start[r, 0] + t * along_x), xy[p, 1] - (start[r, 1] + t * along_y))
+            beyond = max(away - half[r], 0.0)
+            if beyond >= batter:
+                continue
+            ahead = abs(free - t) * math.sqrt(square)
+            if ahead > 0 and square_ends[r, 0 if free < t else 1]:
+                aside = math.sqrt(max(away * away - ahead * ahead, 0.0)) - half[r]
+                beyond = math.hypot(max(aside, 0.0), ahead)
+            share = min(max(1.0 - beyond / batter, 0.0), 1.0)
+            nearness = away / half[r]
+            fall = _SHARP + nearness * nearness
+            weight = share * share / (fall * fall)
+            total += weight
+            heights += weight * (start[r, 2] + t * (end[r, 2] - start[r, 2]))
+            most[p] = max(most[p], share)
+        near[p] = total > 0
+        z[p] = heights / total if total > 0 else 0.0
+    return z, most, near

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -57,22 +56,25 @@ def ground_below(table: Structures, height: Height) -> Height:
     bridges = np.flatnonzero(~table.tunnel)
     if not len(bridges):
         return height
-    tree = shapely.STRtree(table.polygon[bridges])
-
-    return partial(_lowered_height, table=table, height=height, tree=tree, bridges=bridges)
+    return partial(_lowered_height, table=table, height=height, bridges=bridges)
 
 
-def _lowered_height(
-    x: Float, y: Float, *, table: Structures, height: Height, tree: shapely.STRtree, bridges: Ints
-) -> Float:
+def _lowered_height(x: Float, y: Float, *, table: Structures, height: Height, bridges: Ints) -> Float:
     """The height of `ground_below`; a function of a module, so that worker processes can take it."""
     z = np.asarray(height(x, y), float).copy()
-    points = shapely.points(x, y)
-    point, found = tree.query(points, predicate="intersects")
-    for bridge in np.unique(found).tolist():
-        rows, k = point[found == bridge], int(bridges[bridge])
+    if not len(z):
+        return z
+    decks = table.polygon[bridges]
+    low, high = np.split(shapely.bounds(decks), 2, axis=1)
+    near = (low <= [x.max(), y.max()]).all(axis=1) & (high >= [x.min(), y.min()]).all(axis=1)
+    for d in np.flatnonzero(near).tolist():
+        rows = np.flatnonzero((x >= low[d, 0]) & (x <= high[d, 0]) & (y >= low[d, 1]) & (y <= high[d, 1]))
+        rows = rows[shapely.intersects_xy(decks[d], x[rows], y[rows])] if len(rows) else rows
+        if not len(rows):
+            continue
+        k = int(bridges[d])
         deck = surface_heights(table, k, xy=np.column_stack([x[rows], y[rows]]))
-        away = shapely.distance(points[rows], table.approach[k])
+        away = shapely.distance(shapely.points(x[rows], y[rows]), table.approach[k])
         away = np.where(np.isnan(away), np.inf, away)
         below = np.minimum(_FALL * away, table.body[k] + _BELOW)
         z[rows] = np.minimum(z[rows], deck - below)
@@ -101,15 +103,13 @@ def find_low_decks(table: Structures, height: Height | None, *, near: Bools) -> 
 
 def _strips(table: Structures, k: int) -> NDArray[np.object_]:
     """A piece's outline cut into strips across its line."""
-    flat = shapely.LineString(table.line[k][:, :2])
+    line = table.line[k][:, :2]
     reach = float(table.half[k]) + 5.0
-    cuts = np.linspace(0.0, flat.length, max(int(np.ceil(flat.length / _STEP)), 1) + 1)
-    strips = [
-        shapely.LineString(polylines.cut(table.line[k], a, end=b)[:, :2]).buffer(reach, cap_style="flat")
-        for a, b in pairwise(cuts)
-    ]
+    length = shapely.LineString(line).length
+    cuts = np.linspace(0.0, length, max(int(np.ceil(length / _STEP)), 1) + 1)
+    strips = shapely.buffer(polylines.parts(line, cuts), reach, cap_style="flat", quad_segs=16)
     rest = table.polygon[k].difference(shapely.union_all(strips))  # beyond the line's ends, as at bends
-    across = shapely.intersection(np.array(strips, object), table.polygon[k])
+    across = shapely.intersection(strips, table.polygon[k])
     return np.append(across, shapely.get_parts(areal(rest, least=_TINY)))
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from geoscene.compiled import njit
 from geoscene.structures.table import Structures
 from geoscene.typing import Bools, Float
 
@@ -22,15 +25,25 @@ SHARED, PARTED = 0.5, 1.0
 
 def nearest_on_line(line: Float, xy: Float) -> tuple[Float, Float, Bools]:
     """Nearest point on a line (k, 3) to points (n, 2): its z, its distance, whether it is not an end."""
-    start, along = line[:-1], np.diff(line, axis=0)
-    square = np.maximum((along[:, :2] ** 2).sum(axis=1), 1e-12)
-    t = ((xy[:, None] - start[:, :2]) * along[:, :2]).sum(axis=2) / square
-    there = start + np.clip(t, 0.0, 1.0)[..., None] * along
-    metres = np.hypot(*(xy[:, None] - there[..., :2]).transpose(2, 0, 1))
-    best = metres.argmin(axis=1)
-    row = np.arange(len(xy))
-    ends = ((best == 0) & (t[row, best] < 0)) | ((best == len(along) - 1) & (t[row, best] > 1))
-    return there[row, best, 2], metres[row, best], ~ends
+    return _nearest(np.ascontiguousarray(line, float), np.ascontiguousarray(xy, float))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(line: Float, xy: Float) -> tuple[Float, Float, Bools]:
+    """The result of `nearest_on_line`; of parts as near, the first counts."""
+    z, metres, inner = np.empty(len(xy)), np.full(len(xy), np.inf), np.ones(len(xy), np.bool_)
+    last = len(line) - 2
+    for p in range(len(xy)):
+        for k in range(last + 1):
+            x, y = line[k + 1, 0] - line[k, 0], line[k + 1, 1] - line[k, 1]
+            t = ((xy[p, 0] - line[k, 0]) * x + (xy[p, 1] - line[k, 1]) * y) / max(x * x + y * y, 1e-12)
+            on = min(max(t, 0.0), 1.0)
+            away = math.hypot(xy[p, 0] - (line[k, 0] + on * x), xy[p, 1] - (line[k, 1] + on * y))
+            if away < metres[p] or k == 0:
+                metres[p] = away
+                z[p] = line[k, 2] + on * (line[k + 1, 2] - line[k, 2])
+                inner[p] = not ((k == 0 and t < 0) or (k == last and t > 1))
+    return z, metres, inner
 
 
 def surface_heights(table: Structures, piece: int, *, xy: Float) -> Float:

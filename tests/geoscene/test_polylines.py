@@ -64,3 +64,12 @@ def test_heads_of_many_lines_are_those_cut_one_by_one():
         expected = [shapely.LineString(polylines.cut(xy, 0.0, end=end)) for xy in lines]
         assert shapely.hausdorff_distance(found, expected).max() < 1e-9
         assert np.allclose(shapely.length(found), shapely.length(expected))
+
+
+@given(lines())
+def test_parts_are_those_cut_one_by_one(line):
+    cuts = np.linspace(0.0, polylines.length(line), 4)
+    found = polylines.parts(line[:, :2], cuts)
+    for part, start, end in zip(found, cuts[:-1], cuts[1:], strict=True):
+        expected = polylines.cut(line, start, end=end)[:, :2]
+        assert np.array_equal(shapely.get_coordinates(part), expected)

@@ -248,6 +248,24 @@ def test_of_several_bodies_only_faces_of_different_ones_count(seed):
     assert sorted(found.tolist()) == sorted(between.tolist())
 
 
+def test_pairs_of_close_faces_are_those_of_all_pairs():
+    rng = np.random.default_rng(7)
+    # owners long and narrow in different directions
+    at = rng.integers(0, [[[400, 40, 40]], [[40, 40, 400]], [[40, 400, 40]]], (3, 20, 3)).reshape(60, 1, 3)
+    cells = (at + rng.integers(-60, 60, (60, 3, 3))).reshape(-1, 3)
+    faces, owner = np.arange(180).reshape(60, 3), np.repeat(np.arange(3), 20)
+    pairs, crossing = close_faces(cells, faces, owner=owner)
+    alone = [
+        (i, j)
+        for j in range(60)
+        for i in range(j)
+        if owner[i] == owner[j] and len(close_faces(cells, faces[[i, j]], owner=np.zeros(2, np.int64))[0])
+    ]
+    assert len(alone) > 10
+    assert pairs.tolist() == [list(pair) for pair in alone]
+    assert crossing.any()
+
+
 def test_a_triangle_without_area_is_as_far_away_as_its_edges():
     flat = np.array([[[0, 0, 0], [4, 0, 0], [2, 0, 0]]])
     other = np.array([[[0, 0, 3], [4, 0, 3], [2, 5, 3]]])

@@ -270,7 +270,7 @@ def test_level_ground_is_graded_to_ramps_alone_with_the_same_heights():
     z = whole(x, y)
     assert z.max() > 2.0
     np.testing.assert_allclose(near(x, y), z, atol=2e-6)
-    assert len(near.keywords["start"]) < len(whole.keywords["start"])
+    assert len(near.keywords["roads"].start) < len(whole.keywords["roads"].start)
 
 
 def test_level_ground_without_ramps_stays_level():
