@@ -11,11 +11,11 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, to_grid
-from geoscene.buildings.shells import boundary, distinct_corners, lift, triangulate
+from geoscene.buildings.shells import distinct_corners, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
 from geoscene.columns import Columns
 from geoscene.typing import Float, Ints
-from geoscene.watertight import weld
+from geoscene.watertight import edge_uses, weld
 
 ON_LINE = 1e-3
 """Corners closer to a contour line than this count as on it, which avoids slivers; metres of the field."""
@@ -35,15 +35,25 @@ class Cells(Columns):
     face: Ints
 
 
-def sloped_cells(polygon: Any, direction: Float) -> Cells:
-    """The Delaunay triangles of a polygon, all of one face, with the field xy . direction."""
-    xy, owner = triangulate(np.array([polygon], dtype=object))
-    return Cells(xy, xy @ direction, owner)
+def sloped_cells(polygons: Polygons, direction: Float) -> Cells:
+    """The Delaunay triangles of polygons (n,), each of one face, with the field xy . direction (n, 2)."""
+    xy, owner = triangulate(polygons)
+    parts = zip(np.split(xy, _ends(owner, len(polygons))[:-1]), direction, strict=True)
+    return Cells(xy, np.concatenate([np.empty((0, 3)), *(part @ way for part, way in parts)]), owner)
 
 
-def cut(cells: Cells, level: float) -> Cells:
-    """The cells, split along the contour line of a level; faces on its two sides get different numbers."""
-    side = cells.field - level
+def _ends(owner: Ints, count: int) -> Ints:
+    """Where the rows of each owner (count,) end among rows sorted by owner."""
+    return np.searchsorted(owner, np.arange(count), side="right")
+
+
+def cut(cells: Cells, level: float | Float) -> Cells:
+    """The cells, split along the contour lines of a level, or of one each (m,).
+
+    A face k becomes 2 k below the line and 2 k + 1 above it.
+    """
+    level = np.broadcast_to(level, len(cells))
+    side = cells.field - level[:, None]
     side = np.where(np.abs(side) < ON_LINE, 0.0, side)
     sign = np.sign(side)
     crossed = (sign.min(axis=1) < 0) & (sign.max(axis=1) > 0)
@@ -62,11 +72,11 @@ def cut(cells: Cells, level: float) -> Cells:
     xy, field = xy[rows, turn], field[rows, turn]
     a, b, c = (xy[:, k] for k in range(3))
     fa, fb, fc = (field[:, k] for k in range(3))
-    at = np.full(len(xy), level)
+    at = level[crossed]
 
-    p = _crossing(b, c, fa=fb, fb=fc, level=level)
-    q = _crossing(a, b, fa=fa, fb=fb, level=level)
-    r = _crossing(a, c, fa=fa, fb=fc, level=level)
+    p = _crossing(b, c, fa=fb, fb=fc, level=at)
+    q = _crossing(a, b, fa=fa, fb=fb, level=at)
+    r = _crossing(a, c, fa=fa, fb=fc, level=at)
     t, u = on_line, ~on_line
     tip = (np.take_along_axis(sign, turn[:, :1], axis=1)[:, 0] > 0).astype(np.int64)
     first = (np.take_along_axis(sign, turn[:, 1:2], axis=1)[:, 0] > 0).astype(np.int64)
@@ -82,16 +92,28 @@ def cut(cells: Cells, level: float) -> Cells:
     return cut_cells.take(distinct_corners(cut_cells.xy))
 
 
-def outlines(xy: Float, face: Ints) -> Polygons | None:
-    """Unions of the triangles (m, 3, 2) with the same number, as polygons with all vertices on their edges.
+def outlines(xy: Float, face: Ints, *, body: Ints, count: int) -> list[Polygons | None]:
+    """For each body (count,) the unions of its triangles of one number, with all vertices on their edges.
 
     None if the edges do not form valid polygons, as when rounding to the grid has inverted a triangle.
+
+    xy   : (m, 3, 2) triangles
+    face : (m,) their numbers
+    body : (m,) the body of each, ascending
     """
-    corners = lift(xy, np.zeros(len(xy)))
-    edge, owner = boundary(corners, face)
-    ids, _ = weld(edge.reshape(-1, 3), np.repeat(owner, 2))
-    start, stop = ids.reshape(-1, 2).T.tolist()
-    onward = dict(zip(start, zip(stop, edge[:, 0, :2].tolist(), owner.tolist(), strict=True), strict=True))
+    ids, _ = weld(lift(xy, np.zeros(len(xy))).reshape(-1, 3), np.repeat(face, 3))
+    edge, uses, _ = edge_uses(ids.reshape(-1, 3))
+    open_ = np.flatnonzero(uses[edge] == 1)
+    row, k = open_ // 3, open_ % 3
+    start, stop = ids[open_].tolist(), ids[3 * row + (k + 1) % 3].tolist()
+    onward = list(zip(stop, xy[row, k].tolist(), face[row].tolist(), strict=True))
+    ends = _ends(body[row], count).tolist()
+    return [_joined(start[a:b], onward[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+
+
+def _joined(start: list[int], edges: list[tuple[int, list[float], int]]) -> Polygons | None:
+    """Polygons of edges from vertices, each with its other end, first point and face; None if invalid."""
+    onward = dict(zip(start, edges, strict=True))
     if len(onward) < len(start):
         return None
     shells: list[Any] = []
@@ -122,15 +144,32 @@ def outlines(xy: Float, face: Ints) -> Polygons | None:
     return shapely.orient_polygons(polygons) if shapely.is_valid(polygons).all() else None
 
 
-def merged(cells: Cells) -> Cells:
-    """The cells with each face triangulated again, which removes the slivers that many cuts leave."""
-    polygons = outlines(cells.xy, cells.face)
-    if polygons is None:
-        return cells
-    xy, owner = triangulate(polygons)
-    if len(np.unique(owner)) < len(polygons):
-        return cells
-    return Cells(xy, _values_at(xy, cells.xy.reshape(-1, 2), values=cells.field.ravel()), owner)
+def filled(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:
+    """The triangles (k, 3, 2) of polygons of each body and the polygon of each; None for bodies without."""
+    sizes = [0 if polygons is None else len(polygons) for polygons in found]
+    first = np.cumsum([0, *sizes])
+    xy, owner = triangulate(np.concatenate([np.empty(0, object), *(p for p in found if p is not None)]))
+    cuts = np.searchsorted(owner, first)
+    return [
+        None if polygons is None else (xy[a:b], owner[a:b] - begin)
+        for polygons, begin, a, b in zip(found, first[:-1], cuts[:-1], cuts[1:], strict=True)
+    ]
+
+
+def merged(cells: Cells, body: Ints, *, count: int) -> list[Cells]:
+    """The cells of each body, each face triangulated again, which removes the slivers that many cuts leave.
+
+    body : (m,) the body of each triangle, ascending
+    """
+    found = outlines(cells.xy, cells.face, body=body, count=count)
+    out, ends = [], _ends(body, count).tolist()
+    for a, b, polygons, made in zip([0, *ends[:-1]], ends, found, filled(found), strict=True):
+        own = cells.take(slice(a, b))
+        if polygons is not None and made is not None and len(np.unique(made[1])) == len(polygons):
+            xy, owner = made
+            own = Cells(xy, _values_at(xy, own.xy.reshape(-1, 2), values=own.field.ravel()), owner)
+        out.append(own)
+    return out
 
 
 def _values_at(xy: Float, known: Float, *, values: Float) -> Float:
@@ -142,8 +181,8 @@ def _values_at(xy: Float, known: Float, *, values: Float) -> Float:
     return found
 
 
-def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: float) -> Float:
-    """Grid points where the field equals a level between a and b; swapping a and b gives the same points."""
+def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: Float) -> Float:
+    """Grid points where the field equals a level (n,) between a and b, the same if a and b are swapped."""
     swap = (a[:, 0] > b[:, 0]) | ((a[:, 0] == b[:, 0]) & (a[:, 1] > b[:, 1]))
     first, last = np.where(swap[:, None], b, a), np.where(swap[:, None], a, b)
     f0, f1 = np.where(swap, fb, fa), np.where(swap, fa, fb)

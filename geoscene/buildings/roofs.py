@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -12,14 +13,15 @@ import shapely
 from geoscene.buildings.cells import (
     Cells,
     cut,
+    filled,
     merged,
     outlines,
     raise_gables,
     skeleton_cells,
     sloped_cells,
 )
-from geoscene.buildings.footprints import to_grid
-from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms, triangulate
+from geoscene.buildings.footprints import Polygons, to_grid
+from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms
 from geoscene.buildings.skeleton import straight_skeleton
 from geoscene.mesh import FLOOR, ROOF
 from geoscene.typing import Float
@@ -98,29 +100,56 @@ class RoofSpec:
 def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
     """The closed shell of a body with its roof (piece 0), and a note if the shape had to be replaced.
 
+    For the arguments see `roof_shells`.
+    """
+    shells, notes = roof_shells(np.array([polygon], dtype=object), [spec])
+    return shells, notes[0]
+
+
+def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[Triangles, list[str]]:
+    """The closed shells of bodies (n,) with their roofs, and a note on each whose shape had to be replaced.
+
     Pyramids, cones, domes and onions are built of rings about the centroid if all corners are visible from
     it. Ridged shapes take their ridge from the smallest enclosing rectangle if the footprint nearly fills it
     or a direction is tagged. All others are built on the straight skeleton.
 
-    polygon : valid, on the grid, exterior counter-clockwise
+    polygons : valid, on the grid, exteriors counter-clockwise
     """
-    if spec.shape in RADIAL and _is_star_shaped(polygon):
-        return _radial(polygon, spec), ""
-    if spec.shape == "skillion":
-        return _from_cells(_skillion(polygon, spec), spec), ""
-    if spec.shape in SECTIONS and (
-        _nearly_rectangular(polygon) or np.isfinite(spec.direction) or spec.across
-    ):
-        return _from_cells(_ridged(polygon, spec), spec), ""
-    cells, raised = _inward(polygon, spec)
-    if cells is None:
-        low, high = np.array([spec.low]), np.array([spec.high])
-        flat = prisms(np.array([polygon], dtype=object), np.zeros(1, np.int64), low=low, high=high)
-        return flat, f"{spec.shape} roof made flat"
-    fallback = _FALLBACK.get(spec.shape, "")
-    if spec.shape in GABLE_SHARE and not raised:
-        fallback = "hipped"
-    return _from_cells(cells, spec), f"{spec.shape} roof made {fallback}" if fallback else ""
+    notes = [""] * len(specs)
+    radial, ridged, fields = list[int](), list[int](), dict[int, Cells]()
+    for k, (polygon, spec) in enumerate(zip(polygons, specs, strict=True)):
+        if spec.shape in RADIAL and _is_star_shaped(polygon):
+            radial.append(k)
+        elif spec.shape == "skillion":
+            fields[k] = _skillion(polygon, spec)
+        elif spec.shape in SECTIONS and (
+            _nearly_rectangular(polygon) or np.isfinite(spec.direction) or spec.across
+        ):
+            ridged.append(k)
+        else:
+            cells, raised = _inward(polygon, spec)
+            if cells is None:
+                notes[k] = f"{spec.shape} roof made flat"
+                continue
+            fields[k] = cells
+            fallback = _FALLBACK.get(spec.shape, "")
+            if spec.shape in GABLE_SHARE and not raised:
+                fallback = "hipped"
+            notes[k] = f"{spec.shape} roof made {fallback}" if fallback else ""
+    for shape in sorted({specs[k].shape for k in ridged}):
+        own = [k for k in ridged if specs[k].shape == shape]
+        fields |= zip(own, _ridged(polygons[own], [specs[k] for k in own]), strict=True)
+    tops = {k: _rings(polygons[k], specs[k]) for k in radial} | {
+        k: _raised(cells, specs[k]) for k, cells in fields.items()
+    }
+    flat = np.array([k for k in range(len(specs)) if k not in tops], np.int64)
+    low, high = (np.array([(s.low, s.high) for s in specs]).reshape(-1, 2)[flat]).T
+    made = [
+        prisms(polygons[flat], flat, low=low, high=high),
+        _closed(polygons, tops, fields=fields, specs=specs),
+    ]
+    shells = Triangles.concatenate(made)
+    return shells.take(np.argsort(shells.piece, kind="stable")), notes
 
 
 def _is_star_shaped(polygon: Any) -> bool:
@@ -167,31 +196,43 @@ def _slope(polygon: Any, spec: RoofSpec) -> Float:
     return nearest if nearest @ wanted > np.cos(np.radians(22.5)) else wanted
 
 
-def _profile(field: Float, span: float, *, profile: Profile) -> Float:
+def _profile(field: Float, span: float | Float, *, profile: Profile) -> Float:
     share, height = np.array(profile, float).T
     return np.asarray(np.interp(field / span, share, height), float)
 
 
 def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
     """One plane; the field is the share of the roof's height."""
-    cells = sloped_cells(polygon, _slope(polygon, spec))
+    cells = sloped_cells(np.array([polygon], dtype=object), _slope(polygon, spec)[None])
     low, high = cells.field.min(), cells.field.max()
     return replace(cells, field=(cells.field - low) / (high - low))
 
 
-def _ridged(polygon: Any, spec: RoofSpec) -> Cells:
-    """A cross-section extruded along the ridge; the field is the share of the roof's height."""
-    up = _slope(polygon, spec)
-    profile = SECTIONS[spec.shape]
-    cells = sloped_cells(polygon, up)
-    low = float(cells.field.min())
-    span = float(cells.field.max()) - low
-    cells = replace(cells, field=cells.field - low)
+def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[Cells]:
+    """Cross-sections of one shape extruded along ridges; the fields are shares of the roofs' heights."""
+    up = np.array([_slope(polygon, spec) for polygon, spec in zip(polygons, specs, strict=True)])
+    shape, count = specs[0].shape, len(specs)
+    profile = SECTIONS[shape]
+    cells = sloped_cells(polygons, up)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, cells.face, cells.field.min(axis=1))
+    np.maximum.at(high, cells.face, cells.field.max(axis=1))
+    span = high - low
+    cells = replace(cells, field=cells.field - low[cells.face, None])
+    cuts = 0  # each doubles the numbers of faces
     for share, _ in profile[1:-1]:
-        cells = cut(cells, share * span)
-    if spec.shape == "half-hipped":
-        return merged(_hipped_ends(cells, up, low=low, span=span))
-    return merged(replace(cells, field=_profile(cells.field, span, profile=profile)))
+        cells = cut(cells, share * span[cells.face >> cuts])
+        cuts += 1
+    if shape == "half-hipped":
+        parts = [cells.take(cells.face >> cuts == k) for k in range(count)]
+        hipped = [
+            _hipped_ends(part, up[k], low=float(low[k]), span=float(span[k])) for k, part in enumerate(parts)
+        ]
+        return [merged(part, np.zeros(len(part), np.int64), count=1)[0] for part in hipped]
+    cells = cells.take(np.argsort(cells.face >> cuts, kind="stable"))
+    body = cells.face >> cuts
+    raised = replace(cells, field=_profile(cells.field, span[body, None], profile=profile))
+    return merged(raised, body, count=count)
 
 
 def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
@@ -230,31 +271,49 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
     if len(profile) > 2:
-        cells = merged(cells)
+        (cells,) = merged(cells, np.zeros(len(cells), np.int64), count=1)
     return replace(cells, field=_profile(cells.field, span, profile=profile)), len(skeleton.xy) > corners
 
 
-def _from_cells(cells: Cells, spec: RoofSpec) -> Triangles:
-    """The shell below cells whose field is the share of the roof's height."""
-    eaves = spec.high - spec.height
+def _raised(cells: Cells, spec: RoofSpec) -> Float:
+    """Triangles (m, 3, 3) of a roof above cells whose field is the share of its height."""
     # the highest point has the tagged height even if the footprint excludes the ridge
     share = cells.field / cells.field.max()
-    corners = np.concatenate([cells.xy, to_grid(eaves + share * spec.height)[..., None]], axis=2)
-    polygons = outlines(cells.xy, np.zeros(len(corners), np.int64))
-    return _closed(corners, cells.xy if polygons is None else triangulate(polygons)[0], low=spec.low)
+    return np.concatenate(
+        [cells.xy, to_grid(spec.high - spec.height + share * spec.height)[..., None]], axis=2
+    )
 
 
-def _closed(corners: Float, xy: Float, *, low: float) -> Triangles:
-    """The shell of roof triangles (m, 3, 3) over a floor at ``low`` of triangles in plan (k, 3, 2)."""
-    bottom = to_grid(np.array([low]))
-    none, zeros = np.zeros(len(corners), np.int64), np.zeros(len(xy), np.int64)
-    top = Triangles(corners, none, np.full(len(corners), ROOF, np.uint8))
-    floor = Triangles(lift(xy, bottom[zeros]), zeros, np.full(len(xy), FLOOR, np.uint8))
-    return close(top, floor, underside=bottom)
+def _closed(
+    polygons: Polygons, tops: dict[int, Float], *, fields: dict[int, Cells], specs: Sequence[RoofSpec]
+) -> Triangles:
+    """The shells of roof triangles (m, 3, 3) by piece.
+
+    Floors are polygons, or of pieces with cells the outlines of these, whose edges have the roof's vertices.
+    """
+    pieces = sorted(tops)
+    size = np.array([len(tops[k]) for k in pieces], np.int64)
+    owner = np.repeat(np.arange(len(pieces)), size)
+    corners = np.concatenate([np.empty((0, 3, 3)), *(tops[k] for k in pieces)])
+    on_cells = np.array([k in fields for k in pieces], np.bool_)[owner]
+    rims = outlines(corners[on_cells, :, :2], owner[on_cells], body=owner[on_cells], count=len(pieces))
+    found: list[Polygons | None] = [
+        rim if k in fields else polygons[[k]] for k, rim in zip(pieces, rims, strict=True)
+    ]
+    floors = [
+        fields[k].xy if made is None else made[0] for k, made in zip(pieces, filled(found), strict=True)
+    ]
+    bottom = to_grid(np.array([specs[k].low for k in pieces], float))
+    of = np.repeat(np.arange(len(pieces)), [len(floor) for floor in floors])
+    xy = np.concatenate([np.empty((0, 3, 2)), *floors])
+    top = Triangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
+    floor = Triangles(lift(xy, bottom[of]), of, np.full(len(xy), FLOOR, np.uint8))
+    shells = close(top, floor, underside=bottom)
+    return replace(shells, piece=np.array(pieces, np.int64)[shells.piece])
 
 
-def _radial(polygon: Any, spec: RoofSpec) -> Triangles:
-    """The shell of rings: the footprint scaled about its centroid, at rising heights."""
+def _rings(polygon: Any, spec: RoofSpec) -> Float:
+    """Triangles (m, 3, 3) between rings: the footprint scaled about its centroid, at rising heights."""
     ring = shapely.get_coordinates(polygon)[:-1]
     centroid = _centroid(polygon)
     eaves = spec.high - spec.height
@@ -270,5 +329,4 @@ def _radial(polygon: Any, spec: RoofSpec) -> Triangles:
         a, b, c, d = lower, np.roll(lower, -1, axis=0), np.roll(upper, -1, axis=0), upper
         triangles += [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
     corners = np.concatenate(triangles)
-    floor, _ = triangulate(np.array([polygon], dtype=object))
-    return _closed(corners[distinct_corners(corners)], floor, low=spec.low)
+    return np.asarray(corners[distinct_corners(corners)], float)

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, clean, groups
-from geoscene.buildings.roofs import RoofSpec, roof_shell
+from geoscene.buildings.roofs import RoofSpec, roof_shells
 from geoscene.buildings.shells import Triangles, parapets, prisms
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
@@ -18,7 +18,7 @@ from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.errors import InputError
 from geoscene.mesh import FLOOR, ROOF, Mesh
-from geoscene.report import Problem, described
+from geoscene.report import Problem, described, make_without_failures
 from geoscene.typing import Bools, Float, Ints
 from geoscene.watertight import check_solids, weld
 
@@ -285,27 +285,41 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Prob
     if len(walled):
         low, high, rise = pieces.low[walled], pieces.high[walled], pieces.parapet[walled]
         made.append(parapets(pieces.polygon[walled], walled.astype(np.int64), low=low, high=high, rise=rise))
-    for k in np.flatnonzero(~pieces.flat):
-        row = pieces.row[k]
-        spec = RoofSpec(
-            shape=str(buildings.roof_shape[row]),
-            low=float(pieces.low[k]),
-            high=float(pieces.high[k]),
-            height=float(buildings.roof_height[row]),
-            direction=float(buildings.roof_direction[row]),
-            across=bool(buildings.roof_across[row]),
-        )
-        try:
-            shell, fallback = roof_shell(pieces.polygon[k], spec)
-        except Exception as error:  # noqa: BLE001 - one roof must not end a build
-            shell = prisms(
-                pieces.polygon[k : k + 1], np.zeros(1, np.int64), low=pieces.low[[k]], high=pieces.high[[k]]
-            )
-            fallback = f"{spec.shape} roof made flat, {described(error)}"
-        if fallback:
-            notes.append(_problem(buildings, row, action="repaired", reason="roof-fallback", detail=fallback))
-        made.append(replace(shell, piece=np.full(len(shell), k, np.int64)))
+
+    def failed(k: int, error: Exception) -> None:
+        one = slice(k, k + 1)
+        shell = prisms(pieces.polygon[one], np.array([k]), low=pieces.low[one], high=pieces.high[one])
+        shape = buildings.roof_shape[pieces.row[k]]
+        given.append((shell, {k: f"{shape} roof made flat, {described(error)}"}))
+
+    given: list[tuple[Triangles, dict[int, str]]] = []
+    given += make_without_failures(
+        lambda rows: _roofed(buildings, pieces, rows=rows), np.flatnonzero(~pieces.flat), failed=failed
+    )
+    made += [shells for shells, _ in given]
+    for _, replaced in given:
+        notes += [
+            _problem(buildings, pieces.row[k], action="repaired", reason="roof-fallback", detail=note)
+            for k, note in replaced.items()
+        ]
     return Triangles.concatenate(made), notes
+
+
+def _roofed(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[Triangles, dict[int, str]]:
+    """The closed shells of pieces (rows) with their roofs, and what was replaced of them, by piece."""
+    of = pieces.row[rows]
+    columns = (
+        buildings.roof_shape[of],
+        pieces.low[rows],
+        pieces.high[rows],
+        buildings.roof_height[of],
+        buildings.roof_direction[of],
+        buildings.roof_across[of],
+    )
+    specs = [RoofSpec(*values) for values in zip(*(column.tolist() for column in columns), strict=True)]
+    shells, notes = roof_shells(pieces.polygon[rows], specs)
+    shells = replace(shells, piece=rows[shells.piece])
+    return shells, {k: note for k, note in zip(rows.tolist(), notes, strict=True) if note}
 
 
 def _mesh(buildings: Buildings, triangles: Triangles) -> Mesh:

@@ -14,7 +14,7 @@ from geoscene.buildings.facades.fit import Sheet
 from geoscene.buildings.facades.grids import Elevations, nth
 from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_openings
 from geoscene.buildings.facades.setting import Setting
-from geoscene.buildings.facades.solids import outlines
+from geoscene.buildings.facades.solids import are_simple
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.mesh import Mesh
 from geoscene.splitmix import uniform_at
@@ -61,7 +61,7 @@ def wall_relief(
     if not len(mesh):
         return Layout(WallRelief.empty(), Attached(mesh, np.empty(0, np.bool_), {}), {})
     walls, of_face = find_walls(mesh)
-    simple = np.array([o is not None for o in outlines(mesh, of_face, count=len(walls))], np.bool_)
+    simple = are_simple(mesh, of_face, count=len(walls))
     at = Elevations.of(walls, setting, mesh=mesh, of_face=of_face, usable=simple, base=base, height=height)
     walls, grids, cells = at.walls, at.grids, at.cells
     planes = {"touching": int((~simple).sum()), "small": int(simple.sum()) - len(walls)}

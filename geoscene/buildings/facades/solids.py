@@ -96,15 +96,7 @@ def outlines(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> list[list
 
     of_face : (m,) wall of each face, -1 for none
     """
-    face = np.flatnonzero(of_face >= 0)
-    wall = of_face[face].astype(np.int64)
-    # one vertex has one number in each wall
-    vertex, faces = np.unique(mesh.faces[face].ravel(), return_inverse=True)
-    own = wall[:, None] * len(vertex) + faces.reshape(-1, 3)
-    edge, uses, _ = edge_uses(own)
-    open_ = uses[edge] == 1
-    start, stop = own.ravel()[open_], np.roll(own, -1, axis=1).ravel()[open_]
-    of = np.repeat(wall, 3)[open_]
+    vertex, start, stop, of = _open_edges(mesh, of_face)
     order = np.lexsort((start, of))
     start, stop, of = start[order], stop[order], of[order]
     cuts = np.searchsorted(of, np.arange(count + 1))
@@ -112,6 +104,31 @@ def outlines(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> list[list
         _rings(start[a:b] % len(vertex), stop[a:b] % len(vertex), vertex=vertex)
         for a, b in pairwise(cuts.tolist())
     ]
+
+
+def are_simple(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> Bools:
+    """Whether the outline of each wall (count,) does not touch itself: `outlines` has rings of it."""
+    _, start, stop, of = _open_edges(mesh, of_face)
+    order = np.argsort(start, kind="stable")
+    start, of = start[order], of[order]
+    # of rings, each vertex is one edge's start and one edge's stop; vertices have numbers of their wall
+    odd = (np.sort(stop) != start) | (np.diff(start, prepend=-1) == 0)
+    return np.bincount(of[odd], minlength=count) == 0
+
+
+def _open_edges(mesh: Mesh, of_face: NDArray[np.int32]) -> tuple[NDArray[np.int32], Ints, Ints, Ints]:
+    """Vertices (v,) of walls, and edges (n,) of one face of a wall: start and stop, and the wall.
+
+    Starts and stops are rows of the vertices plus v times the wall.
+    """
+    face = np.flatnonzero(of_face >= 0)
+    wall = of_face[face].astype(np.int64)
+    # one vertex has one number in each wall
+    vertex, faces = np.unique(mesh.faces[face].ravel(), return_inverse=True)
+    own = wall[:, None] * len(vertex) + faces.reshape(-1, 3)
+    edge, uses, _ = edge_uses(own)
+    open_ = uses[edge] == 1
+    return vertex, own.ravel()[open_], np.roll(own, -1, axis=1).ravel()[open_], np.repeat(wall, 3)[open_]
 
 
 def _rings(start: Ints, stop: Ints, *, vertex: NDArray[np.int32]) -> list[Ints] | None:

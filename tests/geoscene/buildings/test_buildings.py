@@ -359,7 +359,9 @@ def test_a_building_that_cannot_be_read_is_dropped_alone(monkeypatch):
 
 
 def test_a_roof_that_cannot_be_built_is_made_flat(monkeypatch):
-    fails_for(monkeypatch, "geoscene.buildings.solids.roof_shell", lambda polygon: polygon.bounds[0] < 5)
+    fails_for(
+        monkeypatch, "geoscene.buildings.roofs._nearly_rectangular", lambda polygon: polygon.bounds[0] < 5
+    )
     areas = [house(n, box(20 * n, 0, 10, 8), height="9", roof__shape="gabled") for n in range(2)]
     _, _, verdict, problems = built(*areas)
     assert verdict.volume[0] == pytest.approx(720)

@@ -230,7 +230,7 @@ def test_a_replaced_roof_shape_is_reported():
 
 
 def test_a_cut_splits_cells_at_the_level_and_keeps_their_area():
-    cells = sloped_cells(turned(L_SHAPE, 12.0), np.array([0.6, 0.8]))
+    cells = sloped_cells(np.array([turned(L_SHAPE, 12.0)]), np.array([[0.6, 0.8]]))
     level = float(cells.field.mean())
     parts = cut(cells, level)
     assert triangle_areas(parts.xy).sum() == pytest.approx(triangle_areas(cells.xy).sum(), rel=1e-5)
