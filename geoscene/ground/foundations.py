@@ -19,7 +19,7 @@ _SHORE = 10.0
 _MARGIN = 0.5
 """Metres that walls on sloping ground reach below the lowest ground; assumed, less than any storey."""
 
-_AT_ONCE = 10_000
+_AT_ONCE = 1000
 """Footprints whose ground is looked up at once, which bounds the memory."""
 
 

@@ -44,7 +44,7 @@ _MARGIN = 3
 
 _REMEDY = "give an elevation file that GDAL reads, such as GeoTIFF or .hgt"
 
-_AT_ONCE = 10_000
+_AT_ONCE = 1000
 """Footprints whose ground is looked up at once: some 300,000 places, which bounds the memory."""
 
 

@@ -154,34 +154,14 @@ class _Pieces:
         first = np.append(first, len(order))
         return cls(start, end, half, square_ends, batter, side, corner, shape, square, first, piece[order])
 
-    def around(self, x: Float, y: Float) -> tuple[Ints, Ints]:
-        """Where in ``piece`` the pieces in reach of points (n,) begin and end."""
-        column, row = (
-            np.floor(value / self.side).astype(np.int64) - first
-            for value, first in zip((x, y), self.corner.tolist(), strict=True)
-        )
-        within = (column >= 0) & (column < self.shape[0]) & (row >= 0) & (row < self.shape[1])
-        number = np.where(within, column * self.shape[1] + row, -1)
-        at = np.searchsorted(self.square, number)
-        known = np.append(self.square, -2)[at] == number
-        return np.where(known, self.first[at], 0), np.where(known, np.append(self.first, 0)[at + 1], 0)
-
 
 def _graded_height(x: Float, y: Float, *, ground: Height, roads: _Pieces, surveyed: bool) -> Float:
     """The height of `graded_ground`; a function of a module, so that worker processes can take it."""
     z = np.asarray(ground(x, y), float)
-    xy = np.stack([x, y], axis=1).astype(float)
-    begin, stop = roads.around(x, y)
+    places = (roads.square, roads.first, roads.piece, roads.corner, roads.shape, roads.side)
+    pieces = (roads.start, roads.end, roads.half, roads.square_ends, roads.batter)
     road_z, most, near = _weighed(
-        xy,
-        begin,
-        stop,
-        roads.piece,
-        roads.start,
-        roads.end,
-        roads.half,
-        roads.square_ends,
-        roads.batter,
+        np.ascontiguousarray(x, float), np.ascontiguousarray(y, float), places, pieces
     )
     road_z = np.where(near, road_z, z)
     if surveyed:
@@ -196,33 +176,37 @@ def _graded_height(x: Float, y: Float, *, ground: Height, roads: _Pieces, survey
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _weighed(
-    xy: Float,
-    begin: Ints,
-    stop: Ints,
-    piece: Ints,
-    start: Float,
-    end: Float,
-    half: Float,
-    square_ends: Bools,
-    batter: float,
+    x: Float,
+    y: Float,
+    places: tuple[Ints, Ints, Ints, Ints, Ints, float],
+    pieces: tuple[Float, Float, Float, Bools, float],
 ) -> tuple[Float, Float, Bools]:
-    """The height of the roads at points (n, 2), the greatest share that one has there, and whether any has.
+    """The height of the roads at points (n,), the greatest share that one has there, and whether any has.
 
-    begin, stop : (n,) where in ``piece`` the pieces begin and end that each point may be in reach of
+    places, pieces : columns of `_Pieces`: those of the grid, and of the pieces
     """
-    z, most, near = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), np.bool_)
-    for p in range(len(xy)):
+    square, first, piece, corner, shape, side = places
+    start, end, half, square_ends, batter = pieces
+    z, most, near = np.zeros(len(x)), np.zeros(len(x)), np.zeros(len(x), np.bool_)
+    for p in range(len(x)):
+        column, row = int(np.floor(x[p] / side)) - corner[0], int(np.floor(y[p] / side)) - corner[1]
+        if not (0 <= column < shape[0] and 0 <= row < shape[1]):
+            continue
+        number = column * shape[1] + row
+        at = np.searchsorted(square, number)
+        if at == len(square) or square[at] != number:
+            continue
         total = heights = 0.0
-        for r in piece[begin[p] : stop[p]]:
+        for r in piece[first[at] : first[at + 1]]:
             along_x, along_y = end[r, 0] - start[r, 0], end[r, 1] - start[r, 1]
-            square = max(along_x * along_x + along_y * along_y, 1e-12)
-            free = ((xy[p, 0] - start[r, 0]) * along_x + (xy[p, 1] - start[r, 1]) * along_y) / square
+            metres2 = max(along_x * along_x + along_y * along_y, 1e-12)
+            free = ((x[p] - start[r, 0]) * along_x + (y[p] - start[r, 1]) * along_y) / metres2
             t = min(max(free, 0.0), 1.0)
-            away = math.hypot(xy[p, 0] - (start[r, 0] + t * along_x), xy[p, 1] - (start[r, 1] + t * along_y))
+            away = math.hypot(x[p] - (start[r, 0] + t * along_x), y[p] - (start[r, 1] + t * along_y))
             beyond = max(away - half[r], 0.0)
             if beyond >= batter:
                 continue
-            ahead = abs(free - t) * math.sqrt(square)
+            ahead = abs(free - t) * math.sqrt(metres2)
             if ahead > 0 and square_ends[r, 0 if free < t else 1]:
                 aside = math.sqrt(max(away * away - ahead * ahead, 0.0)) - half[r]
                 beyond = math.hypot(max(aside, 0.0), ahead)
