@@ -1,4 +1,4 @@
-"""Charts, tables and pages of reports: figures as people read them, scatter plots, self-contained HTML."""
+"""Charts, tables and pages of reports: scatter plots, tables of the console, self-contained HTML."""
 
 from __future__ import annotations
 
@@ -34,28 +34,6 @@ _LEGEND = (
     (_CHOICE, "no other setting is both cheaper and more exact"),
     (_OTHER, "another setting is cheaper and at least as exact"),
 )
-
-
-def metres(value: float) -> str:
-    """A length with a unit that fits it."""
-    for unit, size in (("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("µm", 1e-6), ("nm", 1e-9)):
-        if abs(value) >= size:
-            return f"{value / size:.3g} {unit}"
-    return "0" if value == 0 else "below 1 nm"
-
-
-def share(value: float) -> str:
-    """A share in percent, with its sign if negative."""
-    digits = 3 if abs(value) >= 0.995 else 2
-    return "0" if value == 0 else f"{100 * value:.{digits}g} %"
-
-
-def size(value: float) -> str:
-    """Bytes in decimal units."""
-    for unit, one in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
-        if abs(value) >= one:
-            return f"{value / one:.3g} {unit}"
-    return f"{value:.0f} B"
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +192,8 @@ def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
     pen.rectangle((left, 42, left + 14, 54), fill=_BAND)
     pen.text((left + 22, 48), "published", fill=INK, font=font, anchor="lm")
 
-    def across(share: float) -> float:
-        return left + (right - left) * share
+    def across(part: float) -> float:
+        return left + (right - left) * part
 
     for k, row in enumerate(rows):
         v = top + 26 * k + 13

@@ -9,6 +9,7 @@ version of numba the same; else functions are compiled on their first call.
 from __future__ import annotations
 
 import functools
+import glob
 import hashlib
 import shutil
 import sys
@@ -23,6 +24,7 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import caching
 from numba.core import config as _numba_config
 from numba.core.dispatcher import Dispatcher
+from numba.core.runtime.nrt import rtsys
 
 config: Any = _numba_config
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -36,9 +38,18 @@ LEVELS = {
 first; a processor with less gets code of its own."""
 
 
-def njit(**options: Any) -> Callable[[Function], Function]:
-    """`numba.njit` with the given options, for functions of this package and of `lidar`."""
-    decorated: Callable[[Function], Function] = numba.njit(**options)
+def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Function]:
+    """`numba.njit` with the given options, for functions of this package and of `lidar`.
+
+    cache : keep the machine code on disk
+    """
+
+    def decorated(function: Function) -> Function:
+        found: Any = numba.njit(**options)(function)
+        if cache and hasattr(found, "_cache"):  # a plain function where numba is told not to compile
+            found._cache = _Cache(function)  # noqa: SLF001
+        return found  # type: ignore[no-any-return]
+
     return decorated
 
 
@@ -58,6 +69,69 @@ def _set_up() -> None:
     own = (f"{__name__}.{locator.__name__}" for locator in (_Given, _BesideSource, _OfUser))
     others = config.CACHE_LOCATOR_CLASSES or ",".join(c.__name__ for c in caching.CacheImpl._locator_classes)  # noqa: SLF001
     config.CACHE_LOCATOR_CLASSES = ",".join((*own, others))
+
+
+class _Cache(caching.NullCache):
+    """Machine code of a function on disk.
+
+    Most functions are part of the code of others and never read, so files are sought when the first is.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    @functools.cached_property
+    def _of_function(self) -> _FunctionCache:
+        return _FunctionCache(self._function)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The machine code for types of arguments; None if there is none."""
+        return self._of_function.load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep the machine code for types of arguments."""
+        self._of_function.save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+
+class _FunctionCache(caching.FunctionCache):
+    """Machine code of a function on disk, which several processes may write at a time."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _Files(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """The machine code for types of arguments; None if there is none.
+
+        It needs numba's runtime alone. What numba's own method does first, loading all that is needed to
+        compile, takes as long as importing numba.
+        """
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():  # type: ignore[no-untyped-call]
+            return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+
+class _Files(caching.IndexDataCacheFile):
+    """An index of types of arguments, and a file of machine code for each.
+
+    Files of machine code are named after their contents and written before they are listed. Those that
+    numba numbers can be of another process, for other types or of older sources, and crash when they are run.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Save machine code, and remove what was listed for older sources."""
+        code: bytes = self._dump(data)  # type: ignore[no-untyped-call]
+        name = self._data_name_pattern.replace("{number:d}", hashlib.sha256(code).hexdigest()[:16])
+        with self._open_for_write(self._data_path(name)) as file:  # type: ignore[no-untyped-call]
+            file.write(code)
+        listed = self._load_index() | {key: name}  # type: ignore[no-untyped-call]
+        self._save_index(listed)  # type: ignore[no-untyped-call]
+        if len(listed) == 1:
+            folder, base = Path(self._cache_path), self._data_name_pattern.split(".{")[0]
+            for old in folder.glob(f"{glob.escape(base)}.*.nbc"):
+                if old.name != name:
+                    old.unlink(missing_ok=True)
 
 
 class _Own:

@@ -5,19 +5,21 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings import Buildings
 from geoscene.frames import Frame
-from geoscene.ground import GroundPlan, ground_tiles, tile_span
-from geoscene.options import BuildOptions
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.route_line import route_line
 from geoscene.typing import Float, Ints
+
+if TYPE_CHECKING:
+    from geoscene.buildings import Buildings
+    from geoscene.ground import GroundPlan
+    from geoscene.options import BuildOptions
 
 Tile = tuple[int, int]
 
@@ -155,11 +157,15 @@ class Reach:
 
 def all_tiles(ground: GroundPlan, rows: Mapping[str, Mapping[Tile, Ints]]) -> list[Tile]:
     """Indices (i, j) of the tiles with ground or features, sorted."""
+    from geoscene.ground import ground_tiles  # noqa: PLC0415  (not for drives)
+
     return sorted(set(ground_tiles(ground)).union(*rows.values()))
 
 
 def tile_boxes(ground: GroundPlan, tiles: Sequence[Tile]) -> NDArray[np.object_]:
     """Squares (t,) of tiles, scene metres."""
+    from geoscene.ground import tile_span  # noqa: PLC0415  (not for drives)
+
     low = np.array(tiles, float).reshape(-1, 2)
     high = low + np.array([tile_span(ground, i, j=j) for i, j in tiles])[:, None]
     boxes: NDArray[np.object_] = shapely.box(*(low * ground.tile_size).T, *(high * ground.tile_size).T)

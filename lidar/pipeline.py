@@ -21,7 +21,6 @@ from geoscene.errors import GeosceneError
 from geoscene.files import exclusive, json_bytes, write_json
 from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from lidar.cluster import record_on_cluster
 from lidar.dataset.boxes import merge_box_files, merge_signal_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
@@ -176,6 +175,8 @@ def _driven(
                 shown=None if live is None else live(plan),
             )
         else:
+            from lidar.cluster import record_on_cluster  # noqa: PLC0415
+
             record_on_cluster(
                 plan,
                 recording=recording,

@@ -36,16 +36,12 @@ from lidar.rig.vehicle import Vehicle, load_vehicle
 from lidar.signal.stage import LABELS, POSES, ROAD_USERS
 from lidar.time_scales import check_start
 from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
-from lidar.traffic.fcd import TrafficFile
-from lidar.traffic.fcd_replay import replay
-from lidar.traffic.populate import populate
-from lidar.traffic.signal_heads import SignalStates, signal_states
-from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.world.actors import Actors
 from lidar.world.settings import check_relief, origin_limit
 
 if TYPE_CHECKING:
     from lidar.planning.flight_planning import FlightOptions
+    from lidar.traffic.signal_heads import SignalStates
 
 _RANDOM_SECONDS = 60.0
 
@@ -340,11 +336,10 @@ def plan_motion(
 
     Raises RouteError for a route that it cannot take.
     """
-    from lidar.planning.flight_planning import plan_flight  # noqa: PLC0415
-    from lidar.planning.replay import read_replay  # noqa: PLC0415
-
     route = options.route or "random"
     if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
+        from lidar.planning.replay import read_replay  # noqa: PLC0415
+
         replayed = read_replay(route, scene.frame)
         return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
     if vehicle.kind != "air":
@@ -373,6 +368,8 @@ def plan_motion(
         if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
             trajectory = trajectory.until(round(travel.duration * 1e9))
         return RoadMotion(travel, trajectory)
+    from lidar.planning.flight_planning import plan_flight  # noqa: PLC0415
+
     progress("planning", 0, total=0)
     return plan_flight(scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
 
@@ -408,8 +405,13 @@ def _signals(
     Traffic of SUMO has signals of its own, whose states are not known.
     """
     traffic = options.traffic
-    coloured = any(isinstance(sensor, Camera) and "rgb" in sensor.spec.images for sensor in sensors)
-    if not coloured or isinstance(traffic, SumoOptions | TrafficFile):
+    if not any(isinstance(sensor, Camera) and "rgb" in sensor.spec.images for sensor in sensors):
+        return None
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (not for drives without cameras)
+    from lidar.traffic.signal_heads import signal_states  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
+
+    if isinstance(traffic, SumoOptions | TrafficFile):
         return None
     road = isinstance(motion, RoadMotion)
     fixed = None if road or (traffic is None and vehicle.kind == "air") else motion
@@ -435,6 +437,11 @@ def _with_traffic(
     trajectory = motion if isinstance(motion, Trajectory) else motion.trajectory
     if options.traffic is None:
         return trajectory, None
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (0.1 s)
+    from lidar.traffic.fcd_replay import replay  # noqa: PLC0415
+    from lidar.traffic.populate import populate  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions, drive_in_sumo  # noqa: PLC0415
+
     progress("traffic", 0, total=0)
     traffic = replace(options.traffic, side=options.side_in(scene))
     graph = motion.plan.graph if isinstance(motion, RoadMotion) else scene.road_graph()

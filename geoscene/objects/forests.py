@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 
 from geoscene.classes import Class
-from geoscene.ground.layers import Layers
 from geoscene.mesh import Instances, Mesh
 from geoscene.objects.vegetation import CROWN, HEIGHT, TRUNK, Trees, tree_instances
-from geoscene.sources.data import OsmData
 from geoscene.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
+
+if TYPE_CHECKING:
+    from geoscene.ground.layers import Layers
+    from geoscene.sources.data import OsmData
 
 _ROOM = 0.5
 """Metres of forest floor that a trunk needs on all sides."""

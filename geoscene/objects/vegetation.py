@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.frames import Frame
-from geoscene.ground.partition import GroundPlan
 from geoscene.mesh import Instances
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
-from geoscene.objects.siting import Sites
 from geoscene.report import Problem
-from geoscene.sources.data import OsmData, Tags
 from geoscene.splitmix import uniform_at
 from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float, Height
+
+if TYPE_CHECKING:
+    from geoscene.ground.partition import GroundPlan
+    from geoscene.sources.data import OsmData, Tags
 
 HEIGHT = {"broadleaved": 12.0, "needleleaved": 12.0, "palm": 8.0}
 """Default height in metres.
@@ -162,6 +163,8 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     nearest clear place. Dropped are mapped trees in buildings or without such a place, and the trees that a
     row would put on a road, a track, water or a building.
     """
+    from geoscene.objects.siting import Sites  # noqa: PLC0415  (not for readers of scenes)
+
     xmin, ymin, xmax, ymax = plan.extent
     x, y = trees.xy.T
     trees = trees.take((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))

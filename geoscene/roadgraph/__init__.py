@@ -1,13 +1,37 @@
 """The drivable road graph: built from a map, written and read as GraphML, with heights and surfaces."""
 
-from geoscene.roadgraph.build import RoadOptions as RoadOptions
-from geoscene.roadgraph.build import build_road_graph as build_road_graph
-from geoscene.roadgraph.components import find_components as find_components
-from geoscene.roadgraph.components import main_network as main_network
-from geoscene.roadgraph.grading import find_obstacles as find_obstacles
-from geoscene.roadgraph.grading import graded_ground as graded_ground
-from geoscene.roadgraph.graph import RoadGraph as RoadGraph
-from geoscene.roadgraph.graphml import read_graphml as read_graphml
-from geoscene.roadgraph.graphml import write_graphml as write_graphml
-from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
-from geoscene.roadgraph.longitudinal_profile import profile as profile
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from geoscene.lazy import lazily
+
+if TYPE_CHECKING:
+    from geoscene.roadgraph.build import RoadOptions as RoadOptions
+    from geoscene.roadgraph.build import build_road_graph as build_road_graph
+    from geoscene.roadgraph.components import find_components as find_components
+    from geoscene.roadgraph.components import main_network as main_network
+    from geoscene.roadgraph.grading import find_obstacles as find_obstacles
+    from geoscene.roadgraph.grading import graded_ground as graded_ground
+    from geoscene.roadgraph.graph import RoadGraph as RoadGraph
+    from geoscene.roadgraph.graphml import read_graphml as read_graphml
+    from geoscene.roadgraph.graphml import write_graphml as write_graphml
+    from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
+    from geoscene.roadgraph.longitudinal_profile import profile as profile
+
+__getattr__ = lazily(
+    __name__,
+    {
+        "ProfileOptions": "longitudinal_profile",
+        "RoadGraph": "graph",
+        "RoadOptions": "build",
+        "build_road_graph": "build",
+        "find_components": "components",
+        "find_obstacles": "grading",
+        "graded_ground": "grading",
+        "main_network": "components",
+        "profile": "longitudinal_profile",
+        "read_graphml": "graphml",
+        "write_graphml": "graphml",
+    },
+)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,20 @@ from numpy.typing import NDArray
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.files import atomic_path, not_written
 from geoscene.frames import Frame
+
+_TYPES: Mapping[str, Any] = {
+    "BOOLEAN": np.bool_,
+    "SMALLINT": np.int16,
+    "MEDIUMINT": np.int32,
+    "INTEGER": np.int64,
+    "FLOAT": np.float32,
+    "REAL": np.float64,
+    "TEXT": np.object_,
+}
+"""Types of values by those of columns (GeoPackage 1.4, table 1); the other columns are geometries."""
+
+_ENVELOPES = (0, 32, 48, 48, 64)
+"""Bytes of the envelope between the header of a geometry and its WKB, by code (GeoPackage 1.4, 2.1.3)."""
 
 _DATE = "2000-01-01T00:00:00.000Z"  # constant, so that the same scene gives the same bytes
 
@@ -149,21 +164,37 @@ def read_layer(
 
     Raises SceneFormatError if the file or the layer is missing or damaged.
     """
-    from pyogrio.raw import read  # noqa: PLC0415
-
-    part = {} if rows is None else {"skip_features": rows.start, "max_features": len(rows)}
-    with _reading(path, name):
-        meta, _, wkb, values = read(path, layer=name, read_geometry=geometry != "none", **part)
-        columns = dict(zip(meta["fields"].tolist(), values, strict=True))
+    address = f"{path.absolute().as_uri()}?mode=ro"
+    with _reading(path, name), closing(sqlite3.connect(address, uri=True)) as database:
+        types = dict(database.execute("SELECT name, type FROM pragma_table_info(?) WHERE NOT pk", (name,)))
+        fields = [field for field, kind in types.items() if geometry != "none" or kind in _TYPES]
+        cells = _cells(database, name, fields=fields, rows=rows)
+        columns = {
+            field: np.array(values, _TYPES[types[field]])
+            for field, values in zip(fields, cells, strict=True)
+            if types[field] in _TYPES
+        }
         if geometry == "none":
-            return Layer(name, np.full(len(values[0]) if values else 0, None, object), columns)
-        shapes = shapely.from_wkb(wkb)
+            return Layer(name, np.full(len(cells[0]) if cells else 0, None, object), columns)
+        (blobs,) = (values for field, values in zip(fields, cells, strict=True) if field not in columns)
+        shapes = shapely.from_wkb([blob[8 + _ENVELOPES[blob[3] >> 1 & 7] :] for blob in blobs])
         if geometry == "scene":
             shift = np.array(frame.origin)
             has_z = bool(shapely.has_z(shapes).any())
             shift = np.append(shift, 0.0) if has_z else shift
             shapes = shapely.transform(shapes, lambda c: c - shift, include_z=has_z)
         return Layer(name, shapes, columns)
+
+
+def _cells(
+    database: sqlite3.Connection, name: str, *, fields: Sequence[str], rows: range | None
+) -> list[list[Any]]:
+    """Values of fields of a layer, field by field."""
+    quoted = [f'"{field}"' for field in fields]
+    part = "" if rows is None else f" LIMIT {len(rows)} OFFSET {rows.start}"
+    query = f'SELECT {", ".join(quoted)} FROM "{name}" ORDER BY fid{part}'  # noqa: S608
+    found = database.execute(query).fetchall()
+    return [list(values) for values in zip(*found, strict=True)] or [[] for _ in fields]
 
 
 def _reading(path: Path, name: str) -> AbstractContextManager[None]:

@@ -20,7 +20,6 @@ from lidar.geometry.poses import Trajectory
 from lidar.signal.registry import Stages
 from lidar.signal.stage import Stage, parameter
 from lidar.traffic.ground import ground_height, ground_heights
-from lidar.traffic.populate import first_feature
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors, joined
 
@@ -151,6 +150,8 @@ def with_objects(
     placed = [named.stage for named in stages.stages if isinstance(named.stage, PlacedObject)]
     if not placed:
         return actors
+    from lidar.traffic.populate import first_feature  # noqa: PLC0415  (0.1 s)
+
     groups: Iterable[Actors] = [one.scene(scene, trajectory) for one in placed]
     return joined([*([] if actors is None else [actors]), *groups], first_feature=first_feature(scene))
 

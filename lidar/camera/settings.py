@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from lidar.camera.render import RenderOptions
 from lidar.errors import InputError
 from lidar.raycast import PRECISIONS
 from lidar.rig.specs import CameraSpec
+
+if TYPE_CHECKING:
+    from lidar.camera.render import RenderOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,8 @@ class CameraSettings:
 
     def options(self, camera: CameraSpec) -> RenderOptions:
         """The renderer's options for a camera."""
+        from lidar.camera.render import RenderOptions  # noqa: PLC0415  (0.1 s)
+
         return RenderOptions(
             precision=self.precision,
             retrace=self.retrace,
@@ -73,7 +77,7 @@ class CameraSettings:
             visibility=self.haze,
             cloud=self.cloud,
             exposure=camera.exposure_ev,
-            full_well=camera.full_well if self.camera_noise else np.inf,
+            full_well=camera.full_well if self.camera_noise else inf,
             read_noise=camera.read_noise,
         )
 

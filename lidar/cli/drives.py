@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from lidar.errors import InputError, LidarError
 from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
 
 if TYPE_CHECKING:
+    from lidar.pipeline import Live
     from lidar.scene_source import OpenedScene
 
 
@@ -82,11 +83,14 @@ def drive(
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
-    from lidar.view.live import live_target, opened_live  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
-    target = live_target(live, overwrite=report.overwrite)
+    shows: AbstractContextManager[Live | None] = nullcontext()
+    if live is not None:
+        from lidar.view.live import live_target, opened_live  # noqa: PLC0415
+
+        shows = opened_live(live_target(live, overwrite=report.overwrite))
     if not url_of(out):
         note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
@@ -103,7 +107,7 @@ def drive(
             pick = picked(opened, options, wanted=wanted, out=begun, progress=progress)
         if pick and not report.json:
             print(pick.to_text(options.workers), flush=True)
-        with bar() as progress, opened_live(target) as shown_live:
+        with bar() as progress, shows as shown_live:
             done = driven(
                 opened,
                 folder,

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.camera.render import Frame as Image
 from lidar.dataset.deskew import MOMENTS, deskewed
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.rig.specs import CameraSpec
 from lidar.sensors.cloud import Cloud
+
+if TYPE_CHECKING:
+    from lidar.camera.render import Frame as Image
 
 Columns = dict[str, NDArray[Any]]
 

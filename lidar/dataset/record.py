@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from lidar.dataset.measured import MeasuredCloud, MeasuredImages
 from lidar.dataset.record_clouds import measure_cloud, record_cloud
-from lidar.dataset.record_images import measure_images, record_images
 from lidar.dataset.recording import Recording
 from lidar.rig.devices import Camera, Scanner
 from lidar.world.thread_worlds import Worlds
@@ -15,6 +14,8 @@ def record_frame(
 ) -> MeasuredCloud | MeasuredImages:
     """Simulate one frame and write its files. Several threads may do so at once."""
     if isinstance(sensor, Camera):
+        from lidar.dataset.record_images import record_images  # noqa: PLC0415  (0.1 s)
+
         return record_images(recording, sensor, frame=frame, worlds=worlds)
     return record_cloud(recording, sensor, frame=frame, worlds=worlds)
 
@@ -23,5 +24,8 @@ def measure_frame(
     recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds
 ) -> MeasuredCloud | MeasuredImages:
     """Simulate one frame as `record_frame` does, without files. Several threads may do so at once."""
-    measure = measure_images if isinstance(sensor, Camera) else measure_cloud
-    return measure(recording, sensor, frame=frame, worlds=worlds)  # type: ignore[arg-type]
+    if isinstance(sensor, Camera):
+        from lidar.dataset.record_images import measure_images  # noqa: PLC0415  (0.1 s)
+
+        return measure_images(recording, sensor, frame=frame, worlds=worlds)
+    return measure_cloud(recording, sensor, frame=frame, worlds=worlds)

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +31,13 @@ from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Camera, Scanner
 from lidar.signal.effects import Effects
 from lidar.signal.registry import NO_STAGES, Stages
-from lidar.traffic.signal_heads import SignalStates
 from lidar.world.actors import Actors
 from lidar.world.settings import PLAIN as PLAIN_WORLD
 from lidar.world.settings import WorldSettings
 from lidar.world.visibility import Visibility
+
+if TYPE_CHECKING:
+    from lidar.traffic.signal_heads import SignalStates
 
 
 class Stopwatch:

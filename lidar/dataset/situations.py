@@ -14,7 +14,6 @@ from geoscene.frames import Frame
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.camera.light import Light
-from lidar.camera.render import light_of
 from lidar.camera.sun import sun_direction
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recording import Recording
@@ -131,6 +130,8 @@ def situation_of_unit(
 
 def light_during(recording: Recording, time_ns: int) -> Light:
     """Sun and sky of the images of a drive at a time."""
+    from lidar.camera.render import light_of  # noqa: PLC0415  (of images alone)
+
     contents = recording.contents
     return light_of(sun_during(recording, time_ns), cloud=contents.camera.cloud, snow=contents.world.snow)
 

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from geoscene.charts import Axes, Span, curves, html_matrix, html_page, html_picture, html_table, share, spans
+from geoscene.charts import Axes, Span, curves, html_matrix, html_page, html_picture, html_table, spans
+from geoscene.figures import share
 from geoscene.csv_tables import write_columns
 from geoscene.files import write_atomically, write_json
 from lidar import __version__

@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.files import write_atomically
 from geoscene.typing import Float
-from lidar.camera.render import Frame
 from lidar.errors import LidarError
 from lidar.physics.detector import added_noise
 from lidar.physics.echoes import Echoes, Origin, TracedEchoes, mixed, traced
@@ -25,6 +24,9 @@ from lidar.signal.effects import row_changes
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
+
+if TYPE_CHECKING:
+    from lidar.camera.render import Frame
 
 _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.columns import Columns
 from geoscene.typing import Float
-from lidar.camera.render import Frame
 from lidar.errors import InputError
 from lidar.physics.detector import received
 from lidar.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, traced
@@ -23,6 +22,7 @@ from lidar.sensors.cloud import TracedCloud
 from lidar.signal.situation import Situation
 
 if TYPE_CHECKING:
+    from lidar.camera.render import Frame
     from lidar.navigation.gnss import Fixes
     from lidar.navigation.imu import Inertial
 

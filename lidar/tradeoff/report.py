@@ -14,13 +14,11 @@ from geoscene.charts import (
     html_page,
     html_picture,
     html_table,
-    metres,
     print_lines,
     print_table,
     scatter,
-    share,
-    size,
 )
+from geoscene.figures import metres, share, size
 from geoscene.files import write_atomically, write_json
 from lidar.tradeoff.comparison import Comparison, Kind, Listing, Row
 from lidar.tradeoff.engine import Tradeoff

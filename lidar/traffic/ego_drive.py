@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from geoscene.roadgraph.graph import RoadGraph
@@ -16,11 +18,13 @@ from lidar.rig.vehicle import Vehicle
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
-from lidar.traffic.populate import TrafficOptions, simulated_actors, traffic_setup
 from lidar.traffic.simulation import has_traffic_control, simulate_ego
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
+
+if TYPE_CHECKING:
+    from lidar.traffic.populate import TrafficOptions
 
 _ROUNDS = 3  # maximum number of simulations of the ego vehicle
 _SAME = 25.0  # metres between two trajectories from which the surroundings are the same
@@ -94,6 +98,12 @@ def drive_in_traffic(
     and jerk, never ahead of the simulated one, and the others are simulated again around it.
     Raises InputError for a scene whose features cannot be read.
     """
+    from lidar.traffic.populate import (  # noqa: PLC0415  (not for drives without traffic)
+        TrafficOptions,
+        simulated_actors,
+        traffic_setup,
+    )
+
     options = options or TrafficOptions()
     ego, rounds = first, 0
     while True:

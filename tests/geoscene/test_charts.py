@@ -6,7 +6,8 @@ import numpy as np
 from PIL import Image, ImageFont
 
 from geoscene.canvas import drawable
-from geoscene.charts import Axes, Point, metres, scatter, share
+from geoscene.charts import Axes, Point, scatter
+from geoscene.figures import metres, share
 
 RED = (200, 60, 40)
 

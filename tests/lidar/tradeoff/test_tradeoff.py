@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geoscene.charts import metres
+from geoscene.figures import metres
 from geoscene.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
