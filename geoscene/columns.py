@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -20,7 +21,7 @@ class Columns:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns by name."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = {name: getattr(self, name) for name in _fields_of(type(self))}
         return {name: column for name, column in values.items() if isinstance(column, np.ndarray)}
 
     def take(self, rows: ArrayLike | slice) -> Self:
@@ -42,6 +43,12 @@ class Columns:
         names = tables[0].columns()
         joined = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
         return replace(tables[0], **joined)
+
+
+@functools.cache
+def _fields_of(table: type[Columns]) -> tuple[str, ...]:
+    """Names of the fields of a table; `dataclasses.fields` takes as long as an operation on a column."""
+    return tuple(field.name for field in fields(table))
 
 
 def row_blocks(count: int, size: int, *, overlap: int = 0) -> Iterator[slice]:

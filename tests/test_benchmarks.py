@@ -230,6 +230,16 @@ def test_sides_take_turns_and_ratios_are_of_the_same_repetition(bench):
     assert found.ratio("b") == measure.Summary(3.5, 3.0, 4.0)
 
 
+def test_a_start_cancels_out_in_the_difference_of_two_drives(bench):
+    measure = bench("bench.measure")
+    spent = [measure.Spent(3.0 + rate * 5, 2.0 + rate * 5, 10, 5) for rate in (0.1, 0.4)]
+    found = measure.difference(*(lambda s=s: s for s in spent))
+    assert (found.wall_s, found.cpu_s) == pytest.approx((1.5, 1.5))
+    assert found.peak_bytes == 10
+    with pytest.raises(measure.BenchError, match=r"longer work took 3\.50 s, the shorter 5\.00 s"):
+        measure.difference(*(lambda s=s: s for s in spent[::-1]))
+
+
 def test_memory_of_processes_of_their_own(bench):
     cost = bench("bench.measure").alone(functools.partial, np.ones, 50 * 2**17)
     assert cost.peak_bytes == pytest.approx(50 * 2**20, rel=0.1)

@@ -8,17 +8,19 @@ instances (trees are copied into the OBJ), and its LAS has no CRS.
 
 from __future__ import annotations
 
+import functools
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import laspy
 import numpy as np
 
-from bench.measure import BenchError, Case, Spent, command
+from bench.measure import BenchError, Case, Spent, command, difference
 from bench.scenes import Setup, rig_file
 from geoscene.export.triangles import write_obj
 from lidar.plan import DrivePlan
@@ -37,74 +39,131 @@ _NOTE = (
     " HELIOS++) and as near as it can the same pulses. HELIOS++: level scanner, other azimuth of the first"
     " pulse, copies instead of instances, no CRS"
 )
+_LOOP_NOTE = (
+    "spans of time: a longer drive less a shorter one, both whole processes: without start and loading"
+)
+
+_WHOLE = ((1, 2.0), (1, 20.0), (19, 1.0))
+"""Rays per pulse and seconds of drives that are measured whole, in whole runs."""
+
+_LOOPS = ((1, 5.0, 20.0), (19, 0.5, 2.0))
+"""Rays per pulse and seconds of the shorter and the longer drive whose difference is measured."""
 
 
 def peer(setup: Setup) -> Iterator[Case]:
-    """Drives of a VLP-16 by both programs; none without the program."""
+    """Drives of a VLP-16 by both programs, whole and without start; none without the program."""
     if setup.helios is None:
         return
-    obj = setup.folder / "helios.obj"
-    write_obj(setup.scene, obj)
-    _ours(
-        setup, rays=7, seconds=0.5
-    )  # fills the cache of compiled code, which the first process would wait for
-    for rays, seconds in ((1, 2.0),) if setup.quick else ((1, 2.0), (1, 20.0), (19, 1.0)):
-        plan = setup.plan("VLP-16", seconds=seconds)
-        (scanner,) = plan.sensors
-        pulses = sum(len(firings(scanner.sensor, k)) for k in range(plan.frames[scanner.name]))
-        survey = write_survey(plan, obj, rays=rays)
-        yield Case(
-            "helios",
-            f"VLP-16, {setup.town}, {seconds:g} s, {rays} ray{'s'[: rays > 1]} per pulse",
-            pulses / 1e6,
-            "M pulses",
-            {
-                "lidar": partial(_ours, setup, rays=rays, seconds=seconds),
-                "HELIOS++": partial(_theirs, setup, survey),
-            },
-            _NOTE,
-            clock="wall",
-            simulated_s=plan.trajectory.duration_ns / 1e9,
-            processes=True,
-        )
+    write_obj(setup.scene, setup.folder / "helios.obj")
+    _Drive(setup, 7, 0.5).ours()  # fills the cache of compiled code, which the first process would wait for
+    for rays, seconds in ((1, 2.0),) if setup.quick else _WHOLE:
+        drive = _Drive(setup, rays, seconds)
+        drive.write()
+        yield _case(drive, f"{seconds:g} s", {"lidar": drive.ours, "HELIOS++": drive.theirs}, note=_NOTE)
+    for rays, short, long in () if setup.quick else _LOOPS:
+        less, more = _Drive(setup, rays, short), _Drive(setup, rays, long)
+        less.write()
+        more.write()
+        sides = {
+            "lidar": partial(difference, less.ours, more.ours),
+            "HELIOS++": partial(difference, less.theirs, more.theirs),
+        }
+        yield _case(more, f"{short:g} to {long:g} s", sides, note=_LOOP_NOTE, less=less)
+
+
+def _case(
+    drive: _Drive, span: str, sides: dict[str, Callable[[], object]], *, note: str, less: _Drive | None = None
+) -> Case:
+    """The case of a drive, or of what it has more than a shorter one."""
+    pulses, seconds = drive.extent
+    if less is not None:
+        pulses, seconds = pulses - less.extent[0], seconds - less.extent[1]
+    return Case(
+        "helios",
+        f"VLP-16, {drive.setup.town}, {span}, {drive.rays} ray{'s'[: drive.rays > 1]} per pulse",
+        pulses / 1e6,
+        "M pulses",
+        sides,
+        note,
+        clock="wall",
+        simulated_s=seconds,
+        processes=True,
+    )
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """A drive that both programs do, with files of its own.
+
+    rays    : per pulse
+    seconds : simulated
+    """
+
+    setup: Setup
+    rays: int
+    seconds: float
+
+    @functools.cached_property
+    def plan(self) -> DrivePlan:
+        """The drive as planned."""
+        return self.setup.plan("VLP-16", seconds=self.seconds)
+
+    @functools.cached_property
+    def extent(self) -> tuple[int, float]:
+        """Pulses, and seconds of simulated time."""
+        (scanner,) = self.plan.sensors
+        pulses = sum(len(firings(scanner.sensor, k)) for k in range(self.plan.frames[scanner.name]))
+        return pulses, self.plan.trajectory.duration_ns / 1e9
+
+    @functools.cached_property
+    def folder(self) -> Path:
+        """Of its files."""
+        found = self.setup.folder / f"helios_{self.rays}_rays_{self.seconds:g}_s"
+        found.mkdir(exist_ok=True)
+        return found
+
+    def write(self) -> None:
+        """Write what HELIOS++ reads beside the scene as OBJ."""
+        write_survey(self.plan, self.setup.folder / "helios.obj", rays=self.rays, folder=self.folder)
+
+    def ours(self) -> Spent:
+        """Cost of this program."""
+        setup = self.setup
+        words = [sys.executable, "-m", "lidar", "drive", str(setup.scene.path), "--route", "random"]
+        words += ["--seed", "2", "--rig", str(rig_file("VLP-16", setup.folder))]
+        words += ["--duration", str(self.seconds), "--format", "las", "--set", f"rays={self.rays}"]
+        words += ["--workers", "2", "--out", str(self.folder / "ours"), "--overwrite", "--quiet"]
+        return command(words)
+
+    def theirs(self) -> Spent:
+        """Cost of HELIOS++; raises BenchError if it fails or did not do the same work."""
+        program = self.setup.helios
+        assert program is not None  # noqa: S101
+        out, log = self.folder / "theirs", self.folder / "helios.log"
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir()
+        words = [str(program.resolve()), str(self.folder / "helios_survey.xml"), "--output", str(out)]
+        words += ["--assets", str(self.setup.folder), "--lasOutput", "--seed", "1", "--nthreads", "2"]
+        words += ["--rebuildScene"]
+        with log.open("w+b") as said:
+            try:
+                cost = command(words, errors=said, cwd=_root_of(program.resolve()))
+            except subprocess.CalledProcessError as error:
+                said.seek(0)
+                tail = " ".join(said.read().decode(errors="replace").split())[-300:]
+                raise BenchError(f"{program} ended with {error.returncode}: {tail}") from error
+        ours, theirs = points(self.folder / "ours"), points(out)
+        if abs(theirs - ours) > _ALIKE * ours:
+            raise BenchError(
+                f"{program} wrote {theirs} points, lidar {ours}: not the same work; see the program's log"
+            )
+        return cost
 
 
 def version(program: Path) -> str:
     """What the program says of its version, in one line."""
     said = subprocess.run([program.resolve(), "--version"], capture_output=True, text=True, check=False)
     return " ".join(said.stdout.split())[:80] or "of unknown version"
-
-
-def _ours(setup: Setup, *, rays: int, seconds: float) -> Spent:
-    out = setup.folder / "helios_ours"
-    words = [sys.executable, "-m", "lidar", "drive", str(setup.scene.path), "--route", "random"]
-    words += ["--seed", "2"]
-    words += ["--rig", str(rig_file("VLP-16", setup.folder)), "--duration", str(seconds), "--format", "las"]
-    words += ["--set", f"rays={rays}", "--workers", "2", "--out", str(out), "--overwrite", "--quiet"]
-    return command(words)
-
-
-def _theirs(setup: Setup, survey: Path) -> Spent:
-    """Cost of HELIOS++; raises BenchError if it fails or did not do the same work."""
-    assert setup.helios is not None  # noqa: S101
-    out, log = setup.folder / "helios_theirs", setup.folder / "helios.log"
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir()
-    words = [str(setup.helios.resolve()), str(survey), "--output", str(out), "--assets", str(setup.folder)]
-    words += ["--lasOutput", "--seed", "1", "--nthreads", "2", "--rebuildScene"]
-    with log.open("w+b") as said:
-        try:
-            cost = command(words, errors=said, cwd=_root_of(setup.helios.resolve()))
-        except subprocess.CalledProcessError as error:
-            said.seek(0)
-            tail = " ".join(said.read().decode(errors="replace").split())[-300:]
-            raise BenchError(f"{setup.helios} ended with {error.returncode}: {tail}") from error
-    ours, theirs = points(setup.folder / "helios_ours"), points(out)
-    if abs(theirs - ours) > _ALIKE * ours:
-        raise BenchError(
-            f"{setup.helios} wrote {theirs} points, lidar {ours}: not the same work; see the program's log"
-        )
-    return cost
 
 
 def _root_of(program: Path) -> Path:
@@ -121,9 +180,9 @@ def points(folder: Path) -> int:
     return count
 
 
-def write_survey(plan: DrivePlan, obj: Path, *, rays: int) -> Path:
-    """Write scene, scanner, platform, trajectory and survey of a drive beside the OBJ; returns the survey."""
-    folder, (scanner,) = obj.parent, plan.sensors
+def write_survey(plan: DrivePlan, obj: Path, *, rays: int, folder: Path) -> None:
+    """Write scene, scanner, platform, trajectory and survey of a drive in an OBJ into a folder."""
+    (scanner,) = plan.sensors
     files = {name: folder / f"helios_{name}.xml" for name in ("scene", "scanner", "platform", "survey")}
     files["scene"].write_text(_scene_xml(obj))
     rate = _write_scanner(files["scanner"], scanner, rays=rays)
@@ -150,7 +209,6 @@ def write_survey(plan: DrivePlan, obj: Path, *, rays: int) -> Path:
 </document>
 """
     )
-    return files["survey"]
 
 
 def _scene_xml(obj: Path) -> str:

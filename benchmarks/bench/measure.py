@@ -139,6 +139,18 @@ def timed(work: Callable[[], object]) -> Spent:
     return found if isinstance(found, Spent) else cost
 
 
+def difference(shorter: Callable[[], Spent], longer: Callable[[], Spent]) -> Spent:
+    """What a longer work takes more than a shorter one, which starts alike; memory is that of the longer.
+
+    Raises BenchError if it does not take longer, as beside other programs.
+    """
+    less, more = shorter(), longer()
+    if more.wall_s <= less.wall_s or more.cpu_s <= less.cpu_s:
+        raise BenchError(f"the longer work took {more.wall_s:.2f} s, the shorter {less.wall_s:.2f} s")
+    wall, cpu = more.wall_s - less.wall_s, more.cpu_s - less.cpu_s
+    return replace(more, wall_s=wall, cpu_s=cpu)
+
+
 def alone(function: Callable[..., Callable[[], object]], *arguments: object) -> Spent:
     """Cost of work in a new process; its peak is the growth of the process's memory.
 

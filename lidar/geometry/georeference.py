@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pyproj import CRS, Transformer
 
+from geoscene.compiled import njit
 from geoscene.frames import Frame, utm_crs
 from geoscene.typing import Float
 
@@ -44,6 +46,11 @@ class Georeference:
     exact: bool = False
 
     @functools.cached_property
+    def _is_scene(self) -> bool:
+        """Whether the export CRS is the scene's."""
+        return bool(self.frame.crs == self.crs)
+
+    @functools.cached_property
     def _transformer(self) -> Transformer:
         return Transformer.from_crs(self.frame.crs, self.crs, always_xy=True)
 
@@ -59,31 +66,27 @@ class Georeference:
 
     def points(self, xyz: Float) -> Float:
         """Easting, northing, height (n, 3) of scene points (n, 3); heights are unchanged."""
-        out = np.array(xyz, np.float64)
-        if not len(out):
-            return out
-        if self.frame.crs == self.crs:
-            out[:, 0], out[:, 1] = self.frame.to_projected(out[:, 0], out[:, 1])
-            return out
-        if not self.exact and (fit := self._affine(out[:, :2])) is not None:
-            origin, matrix, shift = fit
-            out[:, :2] = (out[:, :2] - origin) @ matrix + shift
-        else:
-            out[:, 0], out[:, 1] = self._project(out[:, 0], out[:, 1])
-        return out
+        xyz = np.asarray(xyz, np.float64)
+        if not len(xyz):
+            return xyz.copy()
+        if not self.exact and not self._is_scene and (fit := self._affine(xyz)) is not None:
+            moved: Float = _moved(xyz, *fit)
+            return moved
+        project = self.frame.to_projected if self._is_scene else self._project
+        return np.column_stack([*project(xyz[:, 0], xyz[:, 1]), xyz[:, 2]])
 
     def scene_points(self, points: Float) -> Float:
         """Scene points (n, 3) of easting, northing and height (n, 3): the exact inverse of `points`."""
         out = np.array(points, np.float64)
-        if len(out) and self.frame.crs != self.crs:
+        if len(out) and not self._is_scene:
             east, north = out[:, 0], out[:, 1]
             out[:, 0], out[:, 1] = self._transformer.transform(east, north, direction="INVERSE")
         out[:, :2] -= self.frame.origin
         return out
 
-    def _affine(self, xy: Float) -> tuple[Float, Float, Float] | None:
+    def _affine(self, xyz: Float) -> tuple[Float, Float, Float] | None:
         """Origin, matrix and shift of the best affine map over the points; None if beyond `AFFINE_LIMIT`."""
-        low, high = xy.min(axis=0), xy.max(axis=0)
+        low, high = _bounds(xyz)
         origin = (low + high) / 2
         unit = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) / 2
         nodes = unit * np.maximum(high - low, 1.0)
@@ -94,3 +97,26 @@ class Georeference:
         if np.abs(terms @ solution - (target - base)).max() > AFFINE_LIMIT:
             return None
         return origin, solution[:2], solution[2] + base
+
+
+@njit(cache=True, nogil=True)
+def _bounds(xyz: Any) -> Any:
+    """Least and greatest x and y of points."""
+    low, high = xyz[0, :2].copy(), xyz[0, :2].copy()
+    for i in range(len(xyz)):
+        for k in range(2):
+            low[k] = min(low[k], xyz[i, k])
+            high[k] = max(high[k], xyz[i, k])
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _moved(xyz: Any, origin: Any, matrix: Any, shift: Any) -> Any:
+    """Points mapped by (xy - origin) @ matrix + shift; heights are unchanged."""
+    out = np.empty((len(xyz), 3))
+    for i in range(len(xyz)):
+        x, y = xyz[i, 0] - origin[0], xyz[i, 1] - origin[1]
+        out[i, 0] = x * matrix[0, 0] + y * matrix[1, 0] + shift[0]
+        out[i, 1] = x * matrix[0, 1] + y * matrix[1, 1] + shift[1]
+        out[i, 2] = xyz[i, 2]
+    return out

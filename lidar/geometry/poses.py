@@ -220,18 +220,35 @@ class Trajectory(Columns):
         """
         if not len(points):
             return np.empty((0, 3))
-        knot, elapsed = np.divmod(np.asarray(time_ns, np.int64), KNOT_NS)
-        needed, row = _needed_knots(knot)
+        knot, share = np.empty(len(points), np.int64), np.empty(len(points))
+        first, last = _knots_before(np.asarray(time_ns), knot, share)
+        needed, row = _needed_knots(knot, first, last=last)
         knots = self.at(KNOT_NS * needed).mounted(translation, rotation)
         turn = knots.scale[:, :, None] * knots.rotation
         out: Float = np.empty((len(points), 3))
-        _place(points, row, elapsed / KNOT_NS, knots.position, turn, out)
+        _place(points, row, share, knots.position, turn, out)
         return out
 
 
-def _needed_knots(knot: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Knots (k,), and the row (n,) of each given one, which the next one follows."""
-    first, last = int(knot.min()), int(knot.max())
+@njit(cache=True, nogil=True)
+def _knots_before(time_ns: Any, knot: Any, share: Any) -> Any:
+    """Fill the knot before each time and the share of the way to the next; return the least and greatest."""
+    first = last = np.int64(time_ns[0]) // KNOT_NS
+    for i in range(len(time_ns)):
+        t = np.int64(time_ns[i])
+        k = t // KNOT_NS
+        knot[i], share[i] = k, (t - k * KNOT_NS) / KNOT_NS
+        first, last = min(first, k), max(last, k)
+    return first, last
+
+
+def _needed_knots(
+    knot: NDArray[np.int64], first: int, *, last: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Knots (k,), and the row (n,) of each given one, which the next one follows.
+
+    first, last : the least and greatest knot
+    """
     if last - first < 2 * len(knot):
         return np.arange(first, last + 2), knot - first
     each, row = np.unique(knot, return_inverse=True)

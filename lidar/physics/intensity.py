@@ -22,8 +22,10 @@ def reflectivity_code(
 
     whole : round the codes, as the instruments do
     """
-    bright = np.log10(np.maximum(apparent, 1.0)) / np.log10(BRIGHTEST)
-    code = diffuse_code * np.clip(apparent, 0, 1) + (255.0 - diffuse_code) * np.minimum(bright, 1.0)
+    code = diffuse_code * np.clip(apparent, 0, 1)
+    bright = np.flatnonzero(apparent > 1.0)
+    share = np.log10(apparent[bright]) / np.log10(BRIGHTEST)
+    code[bright] += (255.0 - diffuse_code) * np.minimum(share, 1.0)
     coded: NDArray[np.float32] = (np.round(code) if whole else code).astype(np.float32)
     return coded
 

@@ -21,9 +21,9 @@ _MOVING = {10: 252, 31: 253, 30: 254, 32: 255, 13: 257, 18: 258, 20: 259}
 
 def write(path: Path, table: Table) -> None:
     """Write x, y, z (metres, sensor frame) and reflectance (0 to 1) as little-endian float32."""
-    points = columns_as_rows(table, ("x", "y", "z", "intensity"))
-    points[:, 3] /= np.float32(255)
-    write_atomically(path, points)
+    reflectance = table["intensity"].astype(np.float32, copy=False) / np.float32(255)
+    columns = {axis: table[axis] for axis in "xyz"} | {"reflectance": reflectance}
+    write_atomically(path, columns_as_rows(columns, tuple(columns)))
 
 
 def read(path: Path) -> Table:

@@ -10,7 +10,7 @@ import shutil
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -65,7 +65,7 @@ class LasInfo:
     scale   : metres per count of a coordinate
     """
 
-    crs: CRS
+    crs: CRS = field(hash=False)  # its hash takes as long as writing its WKT
     offset: tuple[float, float, float]
     created: datetime
     scale: float = SCALE
@@ -117,16 +117,15 @@ class _Uncompressed:
         self.dest.write(layout.start)
         self._offset, self._scale = layout.header.offsets, layout.header.scales
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
-        self._by_return = np.zeros(16, np.uint64)
+        self._by_return = np.zeros(16, np.int64)
 
     def write_points(self, points: NDArray[np.void]) -> None:
         """Append points."""
         if not len(points):
             return
-        counts = [points[axis] for axis in "XYZ"]
-        self._low = np.minimum(self._low, [c.min() for c in counts] * self._scale + self._offset)
-        self._high = np.maximum(self._high, [c.max() for c in counts] * self._scale + self._offset)
-        self._by_return += np.bincount(points["bit_fields"] & 15, minlength=16).astype(np.uint64)
+        low, high = _summed(points["X"], points["Y"], points["Z"], points["bit_fields"], self._by_return)
+        self._low = np.minimum(self._low, low * self._scale + self._offset)
+        self._high = np.maximum(self._high, high * self._scale + self._offset)
         self.dest.write(points.data)
 
     def close(self) -> None:
@@ -244,6 +243,18 @@ def _count(coordinate: Any, offset: float, scale: float, counts: Any) -> bool:
         fits &= abs(count) < 2.0**31
         counts[i] = np.int32(count)
     return fits
+
+
+@njit(cache=True, nogil=True)
+def _summed(x: Any, y: Any, z: Any, bits: Any, by_return: Any) -> Any:
+    """Add points to the numbers (16,) of points by return; return the least and greatest counts (3,)."""
+    low, high = np.array([x[0], y[0], z[0]]), np.array([x[0], y[0], z[0]])
+    for i in range(len(x)):
+        for k, count in enumerate((x[i], y[i], z[i])):
+            low[k] = min(low[k], count)
+            high[k] = max(high[k], count)
+        by_return[bits[i] & 15] += 1
+    return low, high
 
 
 open_map = open_las

@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.columns import row_blocks
 from geoscene.files import append, atomic_file, spool
 from geoscene.typing import Float
 from lidar.errors import FormatError, LidarError
@@ -54,6 +55,9 @@ class FrameInfo:
     start_ns: int = 0
     pose: Float | None = None
 
+
+CACHED_ROWS = 1 << 15
+"""Rows of records that stay in the processor's cache while they are filled, a column after another."""
 
 NO_FRAME = FrameInfo()
 """Of clouds that are of no drive."""
@@ -119,8 +123,10 @@ def records(table: Table) -> NDArray[np.void]:
     """The table as packed little-endian records, with the columns in order."""
     kinds = np.dtype([(name, column.dtype.newbyteorder("<")) for name, column in table.items()])
     out = np.empty(rows(table), kinds)
-    for name, column in table.items():
-        out[name] = column
+    fields = [(out[name], column) for name, column in table.items()]
+    for block in row_blocks(len(out), CACHED_ROWS):
+        for field, column in fields:
+            field[block] = column[block]
     return out
 
 

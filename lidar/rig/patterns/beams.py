@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Protocol, TypeVar
@@ -78,6 +79,7 @@ class Blocks(Columns):
     time_ns: NDArray[np.int64]
 
 
+@functools.lru_cache(maxsize=64)
 def frame_ns(rate_hz: float) -> Fraction:
     """Exact duration of a frame in nanoseconds."""
     return 10**9 / Fraction(rate_hz).limit_denominator(10**6)

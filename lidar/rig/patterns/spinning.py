@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks, frame_ns, frame_window_ns, frozen, ranks
 from lidar.rig.toml_table import Table
@@ -57,8 +58,7 @@ class Spinning:
         origin = np.empty((len(encoder), len(late), 3))
         x = self.forward * np.cos(late) - self.left * np.sin(ahead)
         y = self.forward * np.sin(late) + self.left * np.cos(ahead)
-        _rotate(encoder, x, y=y, out=origin)
-        origin[:, :, 2] = self.up
+        _rotate(np.cos(encoder), np.sin(encoder), x, y, self.up, origin)
         return origin.reshape(-1, 3)
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
@@ -78,12 +78,12 @@ class Spinning:
         encoder = self.start + self.turn * 2 * np.pi * turned
         late = self.turn * (2 * np.pi / float(period)) * self.fire_ns.astype(np.float64)
         ahead = late + self.turn * self.azimuth
-        level = np.cos(self.elevation)
+        level, up = np.cos(self.elevation), np.sin(self.elevation)
         direction = np.empty((len(block), len(late), 3))
-        _rotate(encoder, level * np.cos(ahead), y=level * np.sin(ahead), out=direction)
-        direction[:, :, 2] = np.sin(self.elevation)
-        ring, column, channel, order, up = _labels(self, len(block))
-        origin = up if self._central else self._origins(encoder, late, ahead=ahead)
+        x, y = level * np.cos(ahead), level * np.sin(ahead)
+        _rotate(np.cos(encoder), np.sin(encoder), x, y, up, direction)
+        ring, column, channel, order, on_axis = _labels(self, len(block))
+        origin = on_axis if self._central else self._origins(encoder, late, ahead=ahead)
         time = (block.time_ns[:, None] + self.fire_ns).ravel()
         pulses = Firings(time, direction.reshape(-1, 3), origin, ring, column, channel, order)
         start, stop = frame_window_ns(frame, rate_hz, start_ns=start_ns)
@@ -128,11 +128,15 @@ def _chosen(pulses: Firings, chosen: NDArray[np.bool_]) -> Firings:
     return replace(kept, order=rank[order])
 
 
-def _rotate(angle: Any, x: Any, *, y: Any, out: Float) -> None:
-    """Write (x, y) of each laser, rotated by the angle of each block, into ``out[:, :, :2]``."""
-    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    out[:, :, 0] = c * x - s * y
-    out[:, :, 1] = s * x + c * y
+@njit(cache=True, nogil=True)
+def _rotate(cosine: Any, sine: Any, x: Any, y: Any, z: Any, out: Any) -> None:
+    """Fill ``out`` (blocks, lasers, 3) with (x, y, z) of each laser, turned by the angle of each block."""
+    for block in range(len(cosine)):
+        c, s = cosine[block], sine[block]
+        for laser in range(len(x)):
+            out[block, laser, 0] = c * x[laser] - s * y[laser]
+            out[block, laser, 1] = s * x[laser] + c * y[laser]
+            out[block, laser, 2] = z[laser]
 
 
 def read_spinning(table: Table) -> Spinning:
