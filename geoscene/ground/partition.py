@@ -445,7 +445,7 @@ def _cells(
     row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
     joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
-    return shapely.coverage_simplify(joined, BEND, simplify_boundary=False), row, slivers
+    return joined.simplified(BEND), row, slivers
 
 
 def _noded_faces(
@@ -497,7 +497,7 @@ def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
 
 def _dissolve(
     edges: Faces, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
-) -> tuple[NDArray[np.object_], Ints]:
+) -> tuple[Faces, Ints]:
     """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 
     Vertices on what remains of the borders all stay.
@@ -514,4 +514,4 @@ def _dissolve(
     key = edges.a * len(edges.points) + edges.b
     order = np.argsort(key)
     first = joined.a[joined.first] * len(edges.points) + joined.b[joined.first]
-    return joined.polygons(), row[edges.cell[order[np.searchsorted(key[order], first)]]]
+    return joined, row[edges.cell[order[np.searchsorted(key[order], first)]]]
