@@ -71,18 +71,19 @@ def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None)
 
     The first of a pair has the smaller number; the pairs are sorted by the second, then by the first.
     """
-    boxes = np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+    low, high = corners.min(axis=1), corners.max(axis=1)
     owners, of = np.unique(owner, return_inverse=True)
-    low, high = np.empty((2, len(owners), 3), np.int64)
-    low[of], high[of] = boxes[:, 0], boxes[:, 1]  # each owner's of any of its faces, then of all
-    np.minimum.at(low, of, boxes[:, 0])
-    np.maximum.at(high, of, boxes[:, 1])
+    bottom, top = np.empty((2, len(owners), 3), np.int64)
+    bottom[of], top[of] = low, high  # each owner's of any of its faces, then of all
+    np.minimum.at(bottom, of, low)
+    np.maximum.at(top, of, high)
     # along the longest side of each owner's box the fewest faces lie side by side
-    along = np.argmax(high - low, axis=1)[of]
-    order = np.lexsort((boxes[np.arange(len(of)), 0, along], of))
+    axes = (np.argmax(top - bottom, axis=1)[of, None] + np.arange(3)) % 3
+    low, high = (np.take_along_axis(ends, axes, axis=1) for ends in (low, high))
+    order = np.lexsort((low[:, 0], of))
+    low, high = (np.ascontiguousarray(ends[order].T) for ends in (low, high))
     several = np.arange(len(of)) if body is None else body
-    pairs = _swept(boxes[order], of[order], along[order], several[order])
-    pairs = np.sort(order[pairs], axis=1)
+    pairs = np.sort(order[_swept(low, high, of[order], several[order])], axis=1)
     return np.asarray(pairs[np.lexsort(pairs.T)], np.int64)
 
 
@@ -112,26 +113,25 @@ def plan_axes(triangles: Ints | Float) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _swept(boxes: Ints, owner: Ints, along: Ints, body: Ints) -> Ints:
-    """Pairs (k, 2) of boxes (m, 2, 3) of one owner that overlap, of different bodies.
+def _swept(low: Ints, high: Ints, owner: Ints, body: Ints) -> Ints:
+    """Pairs (k, 2) of boxes of one owner that overlap, of different bodies.
 
-    They are sorted by owner, then by their low ends on the axis that is the owner's in ``along``.
+    low, high : (3, m) ends of the boxes, sorted by owner, then by their low ends on the first axis
     """
-    found = np.empty((max(4 * len(boxes), 64), 2), np.int64)
+    count = low.shape[1]
+    found = np.empty((max(4 * count, 64), 2), np.int64)
     n = 0
-    for i in range(len(boxes)):
-        axis = along[i]
-        j = i + 1
-        while j < len(boxes) and owner[j] == owner[i] and boxes[j, 0, axis] <= boxes[i, 1, axis]:
-            near = body[i] != body[j]
-            for k in range(3):
-                near = near and boxes[i, 0, k] <= boxes[j, 1, k] and boxes[j, 0, k] <= boxes[i, 1, k]
-            if near:
-                if n == len(found):
-                    found = np.concatenate((found, np.empty_like(found)))
-                found[n] = i, j
-                n += 1
-            j += 1
+    for i in range(count):
+        x1, y0, y1, z0, z1 = high[0, i], low[1, i], high[1, i], low[2, i], high[2, i]
+        for j in range(i + 1, count):
+            if low[0, j] > x1 or owner[j] != owner[i]:
+                break
+            if low[1, j] > y1 or high[1, j] < y0 or low[2, j] > z1 or high[2, j] < z0 or body[i] == body[j]:
+                continue
+            if n == len(found):
+                found = np.concatenate((found, np.empty_like(found)))
+            found[n] = i, j
+            n += 1
     return found[:n]
 
 
