@@ -11,7 +11,7 @@ from shapely import affinity
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.buildings.facades import read_setting, wall_relief
-from geoscene.buildings.facades.solids import outlines, relief_mesh
+from geoscene.buildings.facades.solids import are_simple, outlines, relief_mesh
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.frames import Frame
@@ -301,8 +301,10 @@ def test_an_outline_that_touches_itself_has_no_rings():
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
     mesh = Mesh.of(points, faces, feature=0, surface=WALL)
     assert outlines(mesh, np.zeros(len(mesh), np.int32), count=1) == [None]
+    assert not are_simple(mesh, np.zeros(len(mesh), np.int32), count=1).any()
     apart = np.tile([0, 0, 0, 0, 0, 0, 1], 2).astype(np.int32)
     assert [len(rings) for rings in outlines(mesh, apart, count=2)] == [1, 1]
+    assert are_simple(mesh, apart, count=2).all()
 
 
 def recesses(relief):
