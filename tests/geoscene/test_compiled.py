@@ -111,3 +111,45 @@ def test_code_is_made_for_a_level_of_processors_not_for_one():
     assert compiled.level() in (*levels, "")
     assert not compiled.level() or config.CPU_FEATURES == ""
     assert set(levels["x86-64-v3"]) < set(levels["x86-64-v4"])
+
+
+def test_code_that_is_not_written_yet_is_not_listed(tmp_path, monkeypatch):
+    """Another process would read the code of older sources under its name."""
+    old, new = (compiled._Files(str(tmp_path), "made_up.f-1.py311", stamp) for stamp in ("old", "new"))
+    old.save("ints", "old code")
+    write = new._open_for_write
+
+    def full(path):
+        if path.endswith(".nbc"):
+            raise OSError("no space left")
+        return write(path)
+
+    monkeypatch.setattr(new, "_open_for_write", full)
+    with pytest.raises(OSError, match="no space left"):
+        new.save("ints", "new code")
+    assert new.load("ints") is None
+    assert old.load("ints") == "old code"
+
+
+def test_new_code_replaces_that_of_older_sources(tmp_path):
+    for stamp in ("old", "new"):
+        files = compiled._Files(str(tmp_path), "made_up.f-1.py311", stamp)
+        for types in ("ints", "floats"):
+            files.save(types, f"{stamp} code for {types}")
+    assert files.load("ints") == "new code for ints"
+    assert len(list(tmp_path.glob("*.nbc"))) == 2
+
+
+def test_functions_are_compiled_for_calls_from_python_only_where_it_calls_them():
+    @compiled.njit()
+    def twice(x):
+        return 2 * x
+
+    @compiled.njit()
+    def more(x):
+        return twice(x) + 1
+
+    assert more(3) == 7
+    assert not twice.signatures
+    assert twice(3.5) == 7.0
+    assert len(twice.signatures) == 1
