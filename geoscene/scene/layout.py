@@ -299,6 +299,10 @@ class Scene:
 
     def shapes(self) -> dict[str, Mesh]:
         """The meshes that the tiles' instances copy, by name."""
+        return dict(self._shapes)
+
+    @functools.cached_property
+    def _shapes(self) -> dict[str, Mesh]:  # several worlds of a drive ask for them
         return read_shapes(self.files.shapes)
 
     def features(

@@ -9,15 +9,22 @@ over m), so A = Gd(n0) n0^2 / 4. Fields are periodic tiles of heights, bilinear 
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.files import write_atomically
 from geoscene.mesh import Mesh
+from geoscene.storage import cache_folder
 from geoscene.typing import Float
+from geoscene.untrusted import DAMAGED_ARCHIVE, read_arrays
 
 N0 = 0.1
 """Reference spatial frequency of ISO 8608, cycles per metre."""
@@ -144,7 +151,29 @@ class Roughness(NamedTuple):
 
 @functools.cache
 def roughness() -> Roughness:
-    """The fields and kinds; the same for all scenes."""
+    """The fields and kinds; the same for all scenes.
+
+    To make them takes a third of a second, so they are kept in the user's cache folder.
+    """
+    path, made_by = cache_folder() / "roughness.npz", np.frombuffer(_made_by(), np.uint8)
+    with suppress(*DAMAGED_ARCHIVE):  # also a missing file
+        arrays = read_arrays(path)
+        if np.array_equal(arrays.pop("made_by"), made_by):
+            return Roughness(**arrays)
+    tables, data = _made(), BytesIO()
+    np.savez(data, made_by=made_by, **tables._asdict())
+    with suppress(OSError):  # of a folder that cannot be written
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, data.getvalue())
+    return tables
+
+
+def _made_by() -> bytes:
+    """Digest of this module and of the version of numpy, whose random numbers and transforms it uses."""
+    return hashlib.sha256(Path(__file__).read_bytes() + np.__version__.encode()).digest()
+
+
+def _made() -> Roughness:
     rng = np.random.default_rng(_SEED)
     waves = _below(_field(rng, band=BAND, power=3.0))
     grains = _field(rng, band=_GRAINS, power=2.0)

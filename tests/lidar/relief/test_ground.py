@@ -1,5 +1,7 @@
 """Rough ground: the stated spectra, and rays that end on the surface, however flat they come."""
 
+import importlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -305,3 +307,24 @@ def test_kerbs_walls_and_water_have_no_roughness():
         material=np.array([codes[name].code for name in ("concrete", "asphalt", "water", "asphalt")]),
     )
     assert (ground_tables(mesh, origin=np.zeros(3)).kind >= 0).tolist() == [False, False, False, True]
+
+
+@pytest.mark.parametrize("left", [1000, 0, None])
+def test_tables_are_kept_and_made_again_where_they_are_damaged_or_of_other_sources(home, monkeypatch, left):
+    module = importlib.import_module("lidar.relief.roughness")
+    path = home / ".cache" / "geoscene" / "roughness.npz"
+    tables, calls = roughness(), []
+    path.unlink(missing_ok=True)
+    monkeypatch.setattr(module, "_made", lambda: calls.append(1) or tables)
+
+    def again():
+        found = roughness.__wrapped__()
+        assert all(np.array_equal(one, other) for one, other in zip(found, tables, strict=True))
+        return len(calls)
+
+    assert (again(), again()) == (1, 1)
+    if left is None:
+        monkeypatch.setattr(module, "_made_by", lambda: bytes(32))
+    else:
+        path.write_bytes(path.read_bytes()[:left])
+    assert (again(), again()) == (2, 2)
