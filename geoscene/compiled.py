@@ -27,6 +27,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
 
 config: Any = _numba_config
+_njit: Any = numba.njit  # its types lack options
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGES = ("geoscene", "lidar")
 _V3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
@@ -45,7 +46,7 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Functio
     """
 
     def decorated(function: Function) -> Function:
-        found: Any = numba.njit(no_cfunc_wrapper=True, **options)(function)
+        found = _njit(no_cfunc_wrapper=True, **options)(function)
         if isinstance(found, Dispatcher):  # a plain function where numba is told not to compile
             part = _Part(function, options)
             found.get_call_template, found.get_overload = part.get_call_template, part.get_overload  # type: ignore[method-assign]
@@ -68,7 +69,7 @@ class _Part:
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        return numba.njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self._options)(self._function)
+        return _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self._options)(self._function)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Types of a call, for the caller's compilation; compiles the function for them."""
@@ -134,7 +135,7 @@ class _FunctionCache(caching.FunctionCache):
         compile, takes as long as importing numba.
         """
         rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():  # type: ignore[no-untyped-call]
+        with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
 
