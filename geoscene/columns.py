@@ -21,7 +21,8 @@ class Columns:
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """The columns by name."""
-        values = {name: getattr(self, name) for name in _fields_of(type(self))}
+        kind: Any = type(self)
+        values = {name: getattr(self, name) for name in _fields_of(kind)}
         return {name: column for name, column in values.items() if isinstance(column, np.ndarray)}
 
     def take(self, rows: ArrayLike | slice) -> Self:
@@ -46,7 +47,7 @@ class Columns:
 
 
 @functools.cache
-def _fields_of(table: type[Columns]) -> tuple[str, ...]:
+def _fields_of(table: type[Any]) -> tuple[str, ...]:
     """Names of the fields of a table; `dataclasses.fields` takes as long as an operation on a column."""
     return tuple(field.name for field in fields(table))
 

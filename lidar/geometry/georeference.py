@@ -17,6 +17,10 @@ AFFINE_LIMIT = 1e-4
 """Maximum error in metres of an affine map against the projection: a fifth of half a step in LAS files."""
 
 
+_NODES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) / 2
+"""Where (9, 2) an affine map is compared with the projection, in sides of the points' box from its middle."""
+
+
 def export_crs(frame: Frame, crs: str = "utm") -> CRS:
     """The CRS of exported clouds: ``utm`` (zone of the scene's origin), ``scene``, or any pyproj name.
 
@@ -88,8 +92,7 @@ class Georeference:
         """Origin, matrix and shift of the best affine map over the points; None if beyond `AFFINE_LIMIT`."""
         low, high = _bounds(xyz)
         origin = (low + high) / 2
-        unit = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) / 2
-        nodes = unit * np.maximum(high - low, 1.0)
+        nodes = _NODES * np.maximum(high - low, 1.0)
         target = np.column_stack(self._project(*(origin + nodes).T))
         terms = np.column_stack([nodes, np.ones(len(nodes))])
         base = target[4]

@@ -53,7 +53,7 @@ class Squares:
         touched = [(int(column[k]), int(row[k])) for k in begins]
         for square, mine in zip(touched, np.split(order, begins[1:]), strict=True):
             with self.path(square).open("ab") as file:
-                file.write(data[mine].tobytes())
+                file.write(data.take(mine).tobytes())  # records: far faster than by an index
         self._found.update(touched)
         return touched
 

@@ -24,7 +24,7 @@ def nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
     sorted_cells = cell[order]
     first = np.ones(len(order), bool)
     first[1:] = (sorted_cells[1:] != sorted_cells[:-1]).any(axis=1)
-    return data[order[first]]
+    return data.take(order[first])
 
 
 def thinned(

@@ -147,12 +147,9 @@ def _nodes(points: _Bucket, key: Key, *, low: NDArray[np.int64], side: int) -> I
         for chunk in points.chunks():
             octant = np.empty(len(chunk), np.int8)
             _sample(chunk["X"], chunk["Y"], chunk["Z"], low, side, depth, taken, octant)
-            order = np.argsort(octant, kind="stable")
-            chunk, ends = chunk[order], np.searchsorted(octant[order], np.arange(8))  # noqa: PLW2901
-            first, *others = np.split(chunk, ends)
-            sample.append(first.copy())  # views would keep the whole chunk in memory
-            for child, part in zip(children, others, strict=True):
-                child.append(part.copy())
+            sample.append(chunk.take(np.flatnonzero(octant < 0)))  # records: far faster than by a mask
+            for number, child in enumerate(children):
+                child.append(chunk.take(np.flatnonzero(octant == number)))
         points.__exit__()
         yield key, np.concatenate(sample)
         level, *place = key
