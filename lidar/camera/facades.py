@@ -160,6 +160,19 @@ def _sill(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) 
 
 
 @inlined
+def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool:
+    """Whether a footprint, with these ends in both directions, sees nothing of an opening."""
+    x0, x1 = across
+    y0, y1 = upright
+    within = x1 > kinds[k, march.PANEL] and x0 < kinds[k, march.PANEL + 2]
+    if within and y1 > kinds[k, march.PANEL + 1] and y0 < kinds[k, march.PANEL + 3]:
+        return False
+    if kinds[k, march.SILL_BOX + 2] <= kinds[k, march.SILL_BOX]:
+        return True
+    return _sill(kinds, k, 0, x0, x1, 0.0) * _sill(kinds, k, 1, y0, y1, slope) == 0.0
+
+
+@inlined
 def _paint(facades: Any, face: int, share: float, linear: Any, out: Any) -> None:
     """Add a painted part to what is seen."""
     out[PAINTED] += share
@@ -233,7 +246,7 @@ def facade(facades: Any, w: int, place: Any, direction: Any, size: float, linear
             left = column * width
             cell = tables.first[w] + r * int(columns) + column
             k = tables.cells[cell]
-            if k < 0:
+            if k < 0 or _beside(kinds, k, (x0 - left, x1 - left), (y0 - bottom, y1 - bottom), q):
                 continue
             lx = _lengths(kinds, k, 0, x0 - left, x1 - left, p)
             ly = _lengths(kinds, k, 1, y0 - bottom, y1 - bottom, q)

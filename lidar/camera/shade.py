@@ -15,9 +15,13 @@ from geoscene.classes import Class, materials
 from geoscene.compiled import njit
 from geoscene.typing import Float
 from lidar.camera import ground_texture, texture
-from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, PAINTED, SEEN, UPRIGHT, Facades, facade
+from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, Facades, facade
+from lidar.camera.facades import PAINTED as PAINTED_PARTS
+from lidar.camera.facades import UPRIGHT as UPRIGHT_SIDES
 from lidar.camera.ground_texture import HIGHEST, LOWEST, ground
 from lidar.camera.texture import compiled, detail, grain, hashed, inlined, noise
+from lidar.camera.texture_blocks import BLOCK, DETAIL, PAINTED, PLACES, UPRIGHT, factors
+from lidar.camera.texture_blocks import scratch as block_scratch
 
 Single = NDArray[np.float32]
 
@@ -277,6 +281,88 @@ def _irradiance(
 
 
 @inlined
+def _facing(i: int, normal: Any, wall: Any, frame: Any) -> Any:
+    """The normal of a hit; on a wall that of its plane."""
+    w = wall[i]
+    if w >= 0:
+        return frame[w, 4], -frame[w, 3], 0.0
+    return normal[i, 0], normal[i, 1], normal[i, 2]
+
+
+@inlined
+def _placed(i: int, view: Any, wall: Any, frame: Any, settings: Any) -> Any:
+    """Direction (a unit vector), place, distance, cosine of incidence and widths of a pixel's hit.
+
+    The first width is across the ray, the second one on the surface.
+    """
+    origin, row, direction, range_, normal = view
+    blur, angle, _, _ = settings
+    dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    t, o = range_[i], row[i]
+    x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
+    dx, dy, dz = dx / length, dy / length, dz / length
+    nx, ny, nz = _facing(i, normal, wall, frame)
+    cosine = max(-(nx * dx + ny * dy + nz * dz), 0.0)
+    distance = t * length
+    size = blur + distance * angle
+    return dx, dy, dz, x, y, z, distance, cosine, size, size / math.sqrt(max(cosine, 0.02))
+
+
+@inlined
+def _texture(i: int, at: Any, view: Any, found: Any, frame: Any, tables: Any) -> Any:
+    """Kind of texture of a hit, as of `lidar.camera.texture_blocks`, and what its factor depends on.
+
+    These are u, hx, hy, across and along, of which each kind uses some.
+    """
+    _, _, _, _, normal = view
+    dx, dy, _, x, y, _, _, cosine, size, _ = at
+    klass, material, _, _, wall = found
+    kinds, floors, _, _, _, _ = tables
+    m = material[i] & 127
+    nx, ny, nz = _facing(i, normal, wall, frame)
+    if nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kinds[m] != texture.LIQUID:
+        flat = math.sqrt(dx * dx + dy * dy)
+        hx, hy = (dx / flat, dy / flat) if flat > 1e-9 else (1.0, 0.0)
+        painted = klass[i] == _MARKING
+        kind = (_ASPHALT if painted else int(floors[m])) + (PAINTED if painted else 0)
+        return kind, 0.0, hx, hy, size, size / max(cosine, 0.02)
+    u = 0.0
+    upright = abs(nz) < 0.3
+    if wall[i] >= 0:
+        u = x * -ny + y * nx
+    elif upright:
+        u = (y * nx - x * ny) / math.sqrt(nx * nx + ny * ny)
+    return DETAIL + 2 * int(kinds[m]) + (UPRIGHT if upright else 0), u, 0.0, 0.0, 0.0, 0.0
+
+
+@inlined
+def _factor(texture_: Any, at: Any) -> float:
+    """Factor of a texture on the albedo."""
+    kind, u, hx, hy, across, along = texture_
+    _, _, _, x, y, z, _, _, _, footprint = at
+    if kind >= DETAIL:
+        return detail((kind - DETAIL) // 2, kind & UPRIGHT, x, y, z, u, footprint)
+    return ground(kind & (PAINTED - 1), kind >= PAINTED, x, y, hx, hy, across, along)
+
+
+@inlined
+def _background(i: int, direction: Any, light: Any, colors: Any, out: Any) -> None:
+    """Fill row ``i`` of ``out`` where nothing is hit."""
+    sun, beam, _, sky, horizon = light
+    d, glow = colors[0], colors[1]
+    dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    d[0], d[1], d[2] = dx / length, dy / length, dz / length
+    _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
+    below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
+    facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
+    disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
+    for c in range(3):
+        out[i, c] = glow[c] + below * (horizon[c] - glow[c]) + disc * beam[c] * 100.0
+
+
+@inlined
 def pixel(
     i: int,
     view: Any,
@@ -292,13 +378,48 @@ def pixel(
     gloss: Any,
     facet: Any,
 ) -> None:
-    """Fill row ``i`` of what `shade` fills; ``scratch`` is overwritten."""
-    origin, row, direction, range_, normal = view
+    """Fill row ``i`` of what `shade` fills; ``scratch`` is overwritten. For devices."""
+    _, _, direction, range_, _ = view
+    _, _, _, _, wall = found
+    _, _, _, detailed = settings
+    colors, _, _ = scratch
+    if not range_[i] < np.inf:
+        _background(i, direction, light, colors, out)
+        return
+    at = _placed(i, view, wall, walls.tables.frame, settings)
+    factor = 1.0
+    if detailed:
+        factor = _factor(_texture(i, at, view, found, walls.tables.frame, tables), at)
+    _surface(
+        i, at, factor, view, found, walls, lit, light, tables, settings, covers, scratch, out, gloss, facet
+    )
+
+
+@inlined
+def _surface(
+    i: int,
+    at: Any,
+    factor: float,
+    view: Any,
+    found: Any,
+    walls: Any,
+    lit: Any,
+    light: Any,
+    tables: Any,
+    settings: Any,
+    covers: Any,
+    scratch: Any,
+    out: Any,
+    gloss: Any,
+    facet: Any,
+) -> None:
+    """Fill row ``i`` where a surface is hit, whose texture has this factor."""
+    _, _, _, _, normal = view
     klass, material, color, feature, wall = found
     frame = walls.tables.frame
     sun, beam, ambient, sky, horizon = light
-    kinds, floors, mirrors, plain, soaked, linear = tables
-    blur, angle, extinction, detailed = settings
+    kinds, _, mirrors, plain, soaked, linear = tables
+    _, _, extinction, detailed = settings
     wetness, pools, snow, patches = covers
     colors, seen, town = scratch
     d, glow, albedo, sides, aslant, irradiance = (
@@ -309,49 +430,14 @@ def pixel(
         colors[4],
         colors[5],
     )
-    dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    d[0], d[1], d[2] = dx / length, dy / length, dz / length
-    t = range_[i]
-    if not t < np.inf:
-        _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
-        below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
-        facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
-        disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
-        for c in range(3):
-            out[i, c] = glow[c] + below * (horizon[c] - glow[c]) + disc * beam[c] * 100.0
-        return
-    o = row[i]
-    x, y, z = origin[o, 0] + t * dx, origin[o, 1] + t * dy, origin[o, 2] + t * dz
+    dx, dy, dz, x, y, z, distance, cosine, size, footprint = at
+    d[0], d[1], d[2] = dx, dy, dz
     w = wall[i]
-    nx, ny, nz = normal[i, 0], normal[i, 1], normal[i, 2]
-    if w >= 0:
-        nx, ny, nz = frame[w, 4], -frame[w, 3], 0.0
-    cosine = max(-(nx * d[0] + ny * d[1] + nz * d[2]), 0.0)
-    distance = t * length
-    size = blur + distance * angle
-    footprint = size / math.sqrt(max(cosine, 0.02))
+    nx, ny, nz = _facing(i, normal, wall, frame)
     m = material[i] & 127
     is_open = material[i] > 127
     kind = kinds[m]
     mirror = mirrors[m]
-    upright = abs(nz) < 0.3
-    u = 0.0
-    if w >= 0:
-        u = x * frame[w, 3] + y * frame[w, 4]
-    elif upright:
-        flat = math.sqrt(nx * nx + ny * ny)
-        u = (y * nx - x * ny) / flat
-
-    factor = 1.0
-    if detailed and nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kind != texture.LIQUID:
-        flat = math.sqrt(d[0] * d[0] + d[1] * d[1])
-        hx, hy = (d[0] / flat, d[1] / flat) if flat > 1e-9 else (1.0, 0.0)
-        painted = klass[i] == _MARKING
-        floor = _ASPHALT if painted else floors[m]
-        factor = ground(floor, painted, x, y, hx, hy, size, size / max(cosine, 0.02))
-    elif detailed:
-        factor = detail(kind, upright, x, y, z, u, footprint)
     for c in range(3):
         albedo[c] = linear[color[i, c]] * factor
     if detailed and klass[i] == _BUILDING:
@@ -364,8 +450,8 @@ def pixel(
         open_sky = 0.6 + 0.4 * min(max((z - frame[w, 2]) / 9.0, 0.0), 1.0)
         if detailed:
             facade(walls, w, (x, y, z), (d[0], d[1], d[2]), size, linear, seen)
-            glass, aside, upwards = seen[GLASS], seen[ASIDE], seen[UPRIGHT]
-            front = 1.0 - glass - aside - upwards - seen[PAINTED]
+            glass, aside, upwards = seen[GLASS], seen[ASIDE], seen[UPRIGHT_SIDES]
+            front = 1.0 - glass - aside - upwards - seen[PAINTED_PARTS]
             for c in range(3):
                 sides[c] = albedo[c]
                 albedo[c] = front * albedo[c] + seen[LIGHT + c] + seen[BEHIND + c]
@@ -430,6 +516,13 @@ def pixel(
         facet[i, 2] = nz
 
 
+@inlined
+def _put(texture_: Any, at: Any, j: int, kind: Any, places: Any) -> None:
+    """Write what the factor of a texture depends on into column j of a block."""
+    kind[j], places[3, j], places[4, j], places[5, j], places[6, j], places[7, j] = texture_
+    places[0, j], places[1, j], places[2, j], places[8, j] = at[3], at[4], at[5], at[9]
+
+
 @compiled
 def shade(
     origin: Float,
@@ -467,5 +560,63 @@ def shade(
     scratch = np.empty((6, 3)), np.zeros(SEEN), TOWN * light[4]
     view = origin, row, direction, range_, normal
     found = klass, material, color, feature, wall
-    for i in range(len(range_)):
-        pixel(i, view, found, walls, lit, light, tables, settings, covers, scratch, out, gloss, facet)
+    frame = walls.tables.frame
+    work = block_scratch()
+    at, places = np.empty((10, BLOCK)), np.empty((PLACES, BLOCK))
+    kind, factor = np.empty(BLOCK, np.int64), np.ones(BLOCK)
+    for first in range(0, len(range_), BLOCK):
+        n = min(BLOCK, len(range_) - first)
+        for j in range(n):
+            i, kind[j] = first + j, -1
+            if range_[i] < np.inf:
+                here = _placed(i, view, wall, frame, settings)
+                (
+                    at[0, j],
+                    at[1, j],
+                    at[2, j],
+                    at[3, j],
+                    at[4, j],
+                    at[5, j],
+                    at[6, j],
+                    at[7, j],
+                    at[8, j],
+                    at[9, j],
+                ) = here
+                if settings[3]:
+                    _put(_texture(i, here, view, found, frame, tables), here, j, kind, places)
+        if settings[3]:
+            factors(kind[:n], places, work, factor)
+        for j in range(n):
+            i = first + j
+            if not range_[i] < np.inf:
+                _background(i, direction, light, scratch[0], out)
+                continue
+            here = (
+                at[0, j],
+                at[1, j],
+                at[2, j],
+                at[3, j],
+                at[4, j],
+                at[5, j],
+                at[6, j],
+                at[7, j],
+                at[8, j],
+                at[9, j],
+            )
+            _surface(
+                i,
+                here,
+                factor[j],
+                view,
+                found,
+                walls,
+                lit,
+                light,
+                tables,
+                settings,
+                covers,
+                scratch,
+                out,
+                gloss,
+                facet,
+            )

@@ -85,7 +85,8 @@ class Translation:
         """The function of Warp for one of numba; it has `arrays` as an additional last argument.
 
         given : of arguments that are tuples with arrays for numba, what each item is for Warp, which has no
-                such tuples: a field of the argument, such as ``view.origin``, or an array to work in
+                such tuples: a field of the argument, such as ``view.origin``, or an array to work in.
+                Functions that it calls have arguments of these names for these tuples, too
         """
         if function not in self.functions:
             source = function.py_func
@@ -192,7 +193,7 @@ class _Rewriter(ast.NodeTransformer):
         arguments: list[ast.expr] = [self.visit(argument) for argument in node.args]
         if isinstance(function, Dispatcher):
             label = _own_name(function.py_func)
-            self.names[label] = self.translation.of(function)
+            self.names[label] = self.translation.of(function, self.given)
             return _call(label, [*arguments, _load(_GLOBALS)])
         if name == "len":
             return _expression(f"{ast.unparse(arguments[0])}.shape[0]")
@@ -232,7 +233,8 @@ class _Rewriter(ast.NodeTransformer):
         (target,) = node.targets
         if isinstance(value, ast.Name) and value.id in self.given and isinstance(target, ast.Tuple):
             items = [_expression(text) for text in self.given[value.id]]
-            return [ast.Assign([to], item) for to, item in zip(target.elts, items, strict=True)]
+            given = zip(target.elts, items, strict=True)
+            return [ast.Assign([to], item) for to, item in given if ast.unparse(to) != "_"]
         if isinstance(target, ast.Tuple):
             if (
                 isinstance(value, ast.IfExp)
