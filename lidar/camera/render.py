@@ -25,7 +25,7 @@ from lidar.raycast import Hits
 from lidar.raycast.hits import own_faces
 from lidar.rig.camera_model import project, unproject
 from lidar.rig.specs import CameraSpec
-from lidar.world.surfaces import Surfaces
+from lidar.world.surfaces import Surfaces, label_hits
 from lidar.world.world import World
 
 if TYPE_CHECKING:
@@ -178,6 +178,7 @@ def render(
     exposure = light.exposure * 2.0**options.exposure
     walls = facades_of(world)
     k = options.supersample
+    trace = functools.partial(_traced, poses=poses, world=world, times=times, options=options)
     look = functools.partial(_view, poses=poses, world=world, times=times, options=options)
     colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, options=options)
 
@@ -185,11 +186,15 @@ def render(
         """Labels, depth and colour of the rows of an image."""
         first, last = edges
         here = slice(first * w, last * w)
+        if not coloured:
+            _, _, seen, _, hits = trace(camera, here, sample=sample, normals=False)
+            image.label(here, hits=hits, seen=seen, world=world)
+            return
         view = look(camera, here, sample=sample)
-        image.label(here, view)
-        if coloured and k == 1:
+        image.label(here, hits=view.hits, seen=view.seen, world=world)
+        if k == 1:
             image.light[here] = colour(view, angle=1 / camera.fx)
-        elif coloured:
+        else:
             fine = _finer(camera, k)
             seen = look(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
             image.light[here] = _binned(colour(seen, angle=1 / fine.fx), k, width=w)
@@ -257,14 +262,13 @@ class _Image:
         light = np.empty((n if coloured else 0, 3), np.float32)
         return cls(light, np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
 
-    def label(self, here: slice, view: View) -> None:
+    def label(self, here: slice, *, hits: Hits, seen: NDArray[np.bool_], world: World) -> None:
         """Set depth, class and feature of some pixels."""
-        self.range[here] = view.hits.range
+        self.range[here] = hits.range
+        label_hits(world.faces, hits.face, hits.instance, self.klass[here], self.feature[here])
         klass = self.klass[here]
-        klass[:] = view.surfaces.klass
-        klass[view.hits.face < 0] = Class.SKY
-        klass[~view.seen] = Class.UNLABELED
-        self.feature[here] = view.surfaces.feature
+        klass[hits.face < 0] = Class.SKY
+        klass[~seen] = Class.UNLABELED
 
 
 def light_of(sun: ArrayLike, *, cloud: float, snow: float) -> Light:
@@ -317,10 +321,30 @@ def _view(
     options: RenderOptions,
     rows: int | None = None,
 ) -> View:
-    """Hits and surfaces of pixels of a camera in one sample of the exposure.
+    """Hits and surfaces of pixels of a camera in one sample of the exposure; parameters as of `_traced`."""
+    row, direction, seen, time, hits = _traced(
+        camera, pixels, poses=poses, world=world, sample=sample, times=times, options=options, rows=rows
+    )
+    return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
 
-    pixels : numbers of pixels, row by row from the top
-    rows   : rows of the shutter, where the camera is a finer one
+
+def _traced(
+    camera: CameraSpec,
+    pixels: _Pixels,
+    *,
+    poses: Poses,
+    world: World,
+    sample: int,
+    times: Float | None,
+    options: RenderOptions,
+    rows: int | None = None,
+    normals: bool = True,
+) -> tuple[NDArray[np.int32], Float, NDArray[np.bool_], Float | None, Hits]:
+    """Row, direction, seen, time and hits, as in `View`, of pixels of a camera in one sample of the exposure.
+
+    pixels  : numbers of pixels, row by row from the top
+    rows    : rows of the shutter, where the camera is a finer one
+    normals : whether the hits have normals
     """
     rays = _scaled_rays(camera, pixels)
     moments = (rows or camera.height) if camera.row_ns else 1
@@ -340,14 +364,15 @@ def _view(
         near=camera.near,
         far=world.reach,
         time=time,
-        normals=True,
+        normals=normals,
         precision=options.precision,
         retrace=options.retrace,
         footprint=(0.0, 1.0 / camera.fx),
+        scattered=True,
     )
     if not seen.all():
         hits = _with_misses(hits, ~seen)
-    return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
+    return row, direction, seen, time, hits
 
 
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:

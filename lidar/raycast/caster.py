@@ -146,6 +146,7 @@ class Caster:
         precision: str = "exact",
         retrace: bool = True,
         footprint: tuple[float, float] = EXACTLY,
+        scattered: bool = False,
         threads: int = 1,
     ) -> Hits:
         """The first hit of each ray.
@@ -168,6 +169,8 @@ class Caster:
                      towards a vertex may pass between faces. Without effect on the float64 backend
         footprint  : width of a ray, metres, at its start, and its growth per metre: surfaces of refiners may
                      be averaged over what it covers, for no sensor resolves more; 0: exact first hits
+        scattered  : whether footprints near the border of two levels of detail are of either, by chance, so
+                     that no edge is seen in images
         threads    : threads to use; the result does not depend on it
 
         Raises InputError for rays that are not finite or have a direction of length zero.
@@ -183,6 +186,7 @@ class Caster:
             precision=precision,
             retrace=retrace,
             footprint=footprint,
+            scattered=scattered,
         )
         return self._first_hits(rays, on, normals=normals, threads=threads)
 

@@ -124,6 +124,7 @@ class Rays(NamedTuple):
     precision  : index of one of `PRECISIONS`
     retrace    : whether rays that miss are traced a second time
     footprint  : metres, width of a ray at its start, and its growth per metre
+    scattered  : whether footprints near the border of two levels of detail are of either, by chance
     """
 
     directions: Float
@@ -139,3 +140,4 @@ class Rays(NamedTuple):
     precision: int
     retrace: bool
     footprint: tuple[float, float]
+    scattered: bool

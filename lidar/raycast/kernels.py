@@ -35,6 +35,7 @@ from lidar.raycast.lanes import (
     narrow,
     nudge,
     sole,
+    unit,
 )
 from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
 from lidar.raycast.packets import NUDGE, alike, first_bad, gather, trace
@@ -319,8 +320,11 @@ def cast(
                     ranges[i], cosines[i] = work[RANGE * W + k], work[COSINE * W + k]
                     faces[i], instances[i] = face[k], instance[k]
             if normals.size:
+                unit(target.lanes, work.ctypes.data)
                 for k in range(m):
-                    _normal(normals, ids[k], work[NX * W + k], work[NY * W + k], work[NZ * W + k])
+                    i = ids[k]
+                    normals[i, 0], normals[i, 1] = work[NX * W + k], work[NY * W + k]
+                    normals[i, 2] = work[NZ * W + k]
             for k in range(0 if settled and struck == whole else m):
                 if _decide(target, rays, k, W, work, ids, f, u, stack, columns) or not rays.retrace:
                     continue

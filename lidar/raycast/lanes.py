@@ -498,6 +498,24 @@ Rows written lane by lane could not be read as vectors at once: the processor wo
 
 
 @intrinsic
+def _unit(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
+    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+        rows = _Rows(builder, lanes, address=values[1])
+        x, y, z = rows[NX], rows[NY], rows[NZ]
+        length, zero = (x * x + y * y + z * z).root(), rows.same(0.0)
+        long = builder.fcmp_ordered(">", length.value, zero.value)
+        scale = _Row(builder, builder.select(long, (rows.same(1.0) / length).value, zero.value))
+        rows[NX], rows[NY], rows[NZ] = scale * x, scale * y, scale * z
+        return made.get_dummy_value()
+
+    return types.void(lanes, types.int64), build
+
+
+unit: Any = _unit
+"""Make the normals unit vectors; zero stays zero."""
+
+
+@intrinsic
 def _cross(context: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:  # noqa: ARG001
     def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
         rows = _Rows(builder, lanes, address=values[1])

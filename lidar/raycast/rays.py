@@ -63,7 +63,9 @@ def posed_rays(
 
 
 def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
-    return Rays(d, o, pose, position, matrix, _NONE, _NO_TIMES, 0.0, _ENDLESS, ALL, EXACT, True, EXACTLY)
+    return Rays(
+        d, o, pose, position, matrix, _NONE, _NO_TIMES, 0.0, _ENDLESS, ALL, EXACT, True, EXACTLY, False
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -106,6 +108,7 @@ def limited(
     precision: str = PRECISIONS[EXACT],
     retrace: bool = True,
     footprint: tuple[float, float] = EXACTLY,
+    scattered: bool = False,
 ) -> Rays:
     """The rays with bounds, mask, times, order of work, precision and footprint.
 
@@ -133,10 +136,8 @@ def limited(
         work = np.ascontiguousarray(order, np.int64)
         if not (work.ndim == 1 and _permutes(work, np.zeros(n, np.bool_))):
             raise InputError(f"order is not a permutation of {n} rays")
-    number, ways = PRECISIONS.index(precision), rays[:5]
-    return Rays(
-        *ways, work, moments, float(near), reach, int(mask) & ALL, number, bool(retrace), (wide, growth)
-    )
+    limits = float(near), reach, int(mask) & ALL, PRECISIONS.index(precision), bool(retrace), (wide, growth)
+    return Rays(*rays[:5], work, moments, *limits, bool(scattered))
 
 
 def in_scene(rays: Rays) -> tuple[Float, Float]:
@@ -181,7 +182,12 @@ def beyond(rays: Rays, at: Float) -> Rays:
         _advance(rays.offsets, direction, at, origin)
     far = np.maximum(rays.far - at, 0.0) if np.isfinite(rays.far).any() else rays.far
     return free_rays(origin, direction)._replace(
-        time=rays.time, far=far, mask=rays.mask, retrace=rays.retrace, footprint=rays.footprint
+        time=rays.time,
+        far=far,
+        mask=rays.mask,
+        retrace=rays.retrace,
+        footprint=rays.footprint,
+        scattered=rays.scattered,
     )
 
 

@@ -78,8 +78,8 @@ class GroundRefiner:
     """Refines hits on rough ground; see `lidar.raycast.refine`.
 
     Rays with a footprint meet the mean of the surface over it: heights whose cells, in powers of two, are
-    nearest to half of its length along the ground. Where normals are asked for, as for images, rays near the
-    border of two such levels take either, by chance.
+    nearest to half of its length along the ground. Scattered rays near the border of two such levels take
+    either, by chance.
 
     tables : of the loaded tiles, with scene coordinates
     """
@@ -147,7 +147,7 @@ def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: in
 @inlined
 def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any, n: int) -> Any:
     """Put a ray that hits a rough face into a lane; 1 if it does so, else 0."""
-    distance, face, instance, cosine, normal = columns
+    distance, face, instance, cosine, _ = columns
     f = face[i]
     if f < 0 or instance[i] >= 0 or cosine[i] <= 0.0:
         return 0
@@ -162,7 +162,7 @@ def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any,
     length, (start, growth) = _length(direction), rays.footprint
     patch = (start + growth * t * length) / cosine[i]
     x, y = place[0] + t * way[0], place[1] + t * way[1]
-    level = level_of(patch, len(normal) > 0, x, y)
+    level = level_of(patch, rays.scattered, x, y)
     # The height counts from the hit on the face, so that no ray slips between it and the plane.
     end = t - rough.kinds[k, DEPTH] / way[2]
     begin(rough, k, level, (place[0], place[1], -t * way[2]), way, (t, end), lanes, n)

@@ -114,6 +114,17 @@ def _take_one(table: Any, face: Any, instance: Any, start: Any, named: Any, out:
         out[4][i, c] = color[row, c]
 
 
+@njit(cache=True, nogil=True)
+def label_hits(faces: Faces, face: Any, instance: Any, klass: Any, feature: Any) -> None:
+    """Fill ``klass`` and ``feature`` of hits (n,): 0 and -1 for misses."""
+    start, named, rows = faces.start, faces.named, faces.packed
+    for i in range(len(face)):
+        copy = instance[i]
+        surface = rows[face[i] + start[copy]]
+        klass[i] = (surface >> 8) & 255
+        feature[i] = surface >> 32 if copy < 0 else named[copy]
+
+
 def surfaces_of(mesh: Mesh, settings: WorldSettings) -> Surfaces:
     """The faces of a mesh as surfaces, with the bit `OPEN` where water or snow may lie."""
     material = mesh.material
