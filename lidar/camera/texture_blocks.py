@@ -88,13 +88,16 @@ def factors(kind: NDArray[np.int64], places: Float, work: Scratch, out: Float) -
         for i in range(len(kind)):
             rows[n] = i
             n += kind[i] == k
-        for c in range(PLACES):
-            for j in range(n):
-                own[c, j] = places[c, rows[j]]
+        at = places
+        if n < len(kind):
+            at = own
+            for c in range(PLACES):
+                for j in range(n):
+                    own[c, j] = places[c, rows[j]]
         if k >= DETAIL:
-            _detail((k - DETAIL) // 2, k & UPRIGHT, n, own, work, tone)
+            _detail((k - DETAIL) // 2, k & UPRIGHT, n, at, work, tone)
         else:
-            _ground(k & (PAINTED - 1), k & PAINTED, n, own, work, tone)
+            _ground(k & (PAINTED - 1), k & PAINTED, n, at, work, tone)
         for j in range(n):
             out[rows[j]] = tone[j]
 
