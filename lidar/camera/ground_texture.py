@@ -9,6 +9,7 @@ it is finer than a pixel. The mean of each texture is 1: it changes no surface's
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -270,7 +271,7 @@ def _slope(x: float, y: float, k: int) -> tuple[float, float, float]:
 
 
 @inlined
-def wear(x: float, y: float, kind: int) -> float:
+def wear(x: float, y: float, kind: int) -> Any:
     """Ground with more than 0 is cracked."""
     return noise(x / 9.0, y / 9.0, 80) - _CRACK_FROM[kind] + 0.4 * noise(x / 2.7, y / 2.7, 81)
 
@@ -308,7 +309,7 @@ def cracked(x: float, y: float, hx: float, hy: float, across: float, along: floa
 
 
 @inlined
-def cracks(share: float, kind: int) -> float:
+def cracks(share: float, kind: int) -> Any:
     """Factor of ground of which this share lies in cracks."""
     return (1.0 - (1.0 - _CRACK_DARK) * share) / (1.0 - (1.0 - _CRACK_DARK) * CRACK_SHARE[kind])
 

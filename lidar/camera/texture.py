@@ -48,7 +48,7 @@ def hashed(i: int, j: int, k: int) -> float:
 
 
 @inlined
-def cell(x: float) -> int:
+def cell(x: float) -> Any:
     """The whole number below x, of 32 bits: processors convert several of these at once."""
     return np.int32(np.floor(x))
 

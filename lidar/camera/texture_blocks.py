@@ -195,7 +195,7 @@ def _weigh(n: int, fine: float, across: Float, along: Float, weight: Float) -> N
 
 
 @compiled
-def _samples(n: int, fine: float, along: Float, weight: Float, count: NDArray[np.int32]) -> int:
+def _samples(n: int, fine: float, along: Float, weight: Float, count: NDArray[np.int32]) -> Any:
     """Fill ``count`` with the samples of each pixel; returns the greatest one of those that have weight."""
     most = np.int32(0)
     for i in range(n):
@@ -228,7 +228,7 @@ def _add_mean(
 
 
 @compiled
-def _noises(n: int, k: int, x: Float, y: Float, work: Scratch) -> NDArray[np.float32]:
+def _noises(n: int, k: int, x: Float, y: Float, work: Scratch) -> Any:
     """`lidar.camera.texture.noise` at n places."""
     keys, (u, v, out) = work[3], (work[4][0], work[4][1], work[4][2])
     first = keyed(0, 0, k)
