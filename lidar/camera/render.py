@@ -196,8 +196,8 @@ def render(
             image.light[here] = colour(view, angle=1 / camera.fx)
         else:
             fine = _finer(camera, k)
-            seen = look(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
-            image.light[here] = _binned(colour(seen, angle=1 / fine.fx), k, width=w)
+            sharp = look(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
+            image.light[here] = _binned(colour(sharp, angle=1 / fine.fx), k, width=w)
 
     def refine(pixels: NDArray[np.int64], image: _Image, *, sample: int) -> None:
         """Colour of single pixels of an image, from more rays."""

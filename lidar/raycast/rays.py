@@ -136,8 +136,23 @@ def limited(
         work = np.ascontiguousarray(order, np.int64)
         if not (work.ndim == 1 and _permutes(work, np.zeros(n, np.bool_))):
             raise InputError(f"order is not a permutation of {n} rays")
-    limits = float(near), reach, int(mask) & ALL, PRECISIONS.index(precision), bool(retrace), (wide, growth)
-    return Rays(*rays[:5], work, moments, *limits, bool(scattered))
+    # A microsecond, where `_replace` takes six.
+    return Rays(
+        rays.directions,
+        rays.offsets,
+        rays.pose,
+        rays.position,
+        rays.matrix,
+        work,
+        moments,
+        float(near),
+        reach,
+        int(mask) & ALL,
+        PRECISIONS.index(precision),
+        bool(retrace),
+        (wide, growth),
+        bool(scattered),
+    )
 
 
 def in_scene(rays: Rays) -> tuple[Float, Float]:
