@@ -187,7 +187,8 @@ def _kept(
 @njit(cache=True, nogil=True, inline="always")
 def _area(points: Float, p: int, v: int, q: int) -> float:
     x, y = points[p]
-    return abs((points[q, 0] - x) * (points[v, 1] - y) - (points[v, 0] - x) * (points[q, 1] - y)) / 2.0
+    area: float = abs((points[q, 0] - x) * (points[v, 1] - y) - (points[v, 0] - x) * (points[q, 1] - y)) / 2.0
+    return area
 
 
 @njit(cache=True, nogil=True)

@@ -252,7 +252,8 @@ def _passes(start: Ints, end: Ints, x: int, y: int) -> bool:
     reach = abs(dx) + abs(dy)
     # Of a pixel's corners only the lower left belongs to it.
     falls = (dx < 0) != (dy < 0)
-    return abs(side) < reach or (abs(side) == reach and falls and (side > 0) == (dx > 0))
+    passes: bool = abs(side) < reach or (abs(side) == reach and falls and (side > 0) == (dx > 0))
+    return passes
 
 
 @njit(cache=True, nogil=True)

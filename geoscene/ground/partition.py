@@ -45,6 +45,9 @@ They are what noding leaves on straight borders that hidden outlines cross; tile
 _AT_ONCE = 20_000
 """Polygons in which points are looked up at once."""
 
+_FEW = 4
+"""Points for which polygons are not taken apart."""
+
 _REACH = 1e-2
 """How far beyond a tile's side outlines take part in its noding, metres: several times `PRECISION`."""
 
@@ -281,6 +284,9 @@ def rows_at(plan: GroundPlan, xy: Float) -> Ints:
 
 def _last_around(polygons: NDArray[np.object_], xy: Float) -> Ints:
     """The last of the polygons around each point, -1 for none; a point on an outline is not inside."""
+    if len(xy) <= _FEW:
+        within = shapely.contains_xy(polygons, xy[:, :1], xy[:, 1:])
+        return np.where(within, np.arange(len(polygons)), -1).max(axis=1, initial=-1)
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
     parts, polygon = shapely.get_parts(polygons, return_index=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import shapely
 
@@ -26,13 +28,18 @@ def standing_height(plan: GroundPlan, height: Height | None, *, ground: Mesh | N
     """
     if plan.kerbs is None:
         return height
-    floor = None if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
-    corners = np.empty((0, 3, 3)) if floor is None else floor.vertices[floor.faces]
-    tree = shapely.STRtree(shapely.polygons(corners[..., :2]) if len(corners) else [])
+
+    @functools.cache
+    def floor() -> tuple[Float, shapely.STRtree]:
+        """Corners (m, 3, 3) of the faces to stand on, and a tree of them; few tiles need them."""
+        faces = None if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
+        corners = np.empty((0, 3, 3)) if faces is None else faces.vertices[faces.faces]
+        return corners, shapely.STRtree(shapely.polygons(corners[..., :2]) if len(corners) else [])
 
     def standing(x: Float, y: Float) -> Float:
         xy = np.column_stack([x, y])
         z = np.zeros(len(xy)) if height is None else np.array(height(x, y), float)
+        corners, tree = floor()
         point, face = tree.query(shapely.points(xy), predicate="intersects")
         beyond = np.setdiff1d(np.arange(len(xy)), point)
         priority = values_at(plan.layers.priority, rows_at(plan, xy[beyond]), base=-1.0)
