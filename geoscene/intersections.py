@@ -101,8 +101,8 @@ def distances(first: Ints, second: Ints, *, same: Bools) -> Float:
 
     same : (3, 3, n) bool, corner i of the first is corner j of the second
     """
-    one, two, common = (np.ascontiguousarray(a) for a in (first, second, same.transpose(2, 0, 1)))
-    return np.asarray(_distances(one, two, common), float)
+    one, two = np.ascontiguousarray(first, np.int64), np.ascontiguousarray(second, np.int64)
+    return _distances(one, two, np.ascontiguousarray(same.transpose(2, 0, 1), np.bool_))
 
 
 def plan_axes(triangles: Ints | Float) -> Ints:
@@ -315,7 +315,7 @@ def _volume_sign(u: Ints, v: Ints, w: Ints) -> int:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sign(value: int) -> int:
+def _sign(value: int | np.int64) -> int:
     """1, 0 or -1."""
     return int(value > 0) - int(value < 0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import features
-from geoscene.sources.data import Bounds, OsmData, Progress
+from geoscene.sources.data import Bounds, OsmData, Progress, Tags
 from geoscene.sources.elements import Collector
 from geoscene.sources.extent import checked_bounds
 from geoscene.sources.overpass import collect_answer
@@ -81,7 +82,7 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
     kinds = {"n": "node", "w": "way", "r": "relation"}
     for item in progress(stream):
         if item.is_node():
-            tags = {tag.k: tag.v for tag in item.tags} if item.tags else None
+            tags = _tags(item) if item.tags else None
             if nodes is None:
                 place = item.location
                 collector.node(item.id, place.x, y=place.y, tags=tags)
@@ -90,17 +91,20 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
             if tags is None:
                 continue
         elif item.is_way() and not item.deleted:
-            collector.way(
-                item.id, [node.ref for node in item.nodes], tags={tag.k: tag.v for tag in item.tags}
-            )
+            collector.way(item.id, [node.ref for node in item.nodes], tags=_tags(item))
         elif item.is_relation() and not item.deleted:
             members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
-            collector.relation(item.id, {tag.k: tag.v for tag in item.tags}, members=members)
+            collector.relation(item.id, _tags(item), members=members)
         else:
             continue
         if not stated:
             newest = max(newest, item.timestamp)
     collector.timestamp = stated or (newest.strftime("%Y-%m-%dT%H:%M:%SZ") if newest.timestamp() > 0 else "")
+
+
+def _tags(item: Any) -> Tags:
+    """The tags of an object; equal texts are one object, as most tags of a map are the same few."""
+    return {sys.intern(tag.k): sys.intern(tag.v) for tag in item.tags}
 
 
 def _collect(path: Path, progress: Progress) -> Collector:

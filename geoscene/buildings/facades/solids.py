@@ -113,7 +113,7 @@ def are_simple(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> Bools:
     start, of = start[order], of[order]
     # of rings, each vertex is one edge's start and one edge's stop; vertices have numbers of their wall
     odd = (np.sort(stop) != start) | (np.diff(start, prepend=-1) == 0)
-    return np.bincount(of[odd], minlength=count) == 0
+    return np.asarray(np.bincount(of[odd], minlength=count) == 0, np.bool_)
 
 
 def _open_edges(mesh: Mesh, of_face: NDArray[np.int32]) -> tuple[NDArray[np.int32], Ints, Ints, Ints]:
