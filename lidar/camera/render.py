@@ -188,10 +188,13 @@ def render(
         here = slice(first * w, last * w)
         if not coloured:
             _, _, seen, _, hits = trace(camera, here, sample=sample, normals=False)
-            image.label(here, hits=hits, seen=seen, world=world)
+            klass, feature = image.klass[here], image.feature[here]
+            label_hits(world.faces, hits.face, hits.instance, klass, feature)
+            image.label(here, hits=hits, seen=seen, klass=klass, feature=feature)
             return
         view = look(camera, here, sample=sample)
-        image.label(here, hits=view.hits, seen=view.seen, world=world)
+        found = view.surfaces
+        image.label(here, hits=view.hits, seen=view.seen, klass=found.klass, feature=found.feature)
         if k == 1:
             image.light[here] = colour(view, angle=1 / camera.fx)
         else:
@@ -262,10 +265,17 @@ class _Image:
         light = np.empty((n if coloured else 0, 3), np.float32)
         return cls(light, np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
 
-    def label(self, here: slice, *, hits: Hits, seen: NDArray[np.bool_], world: World) -> None:
+    def label(
+        self,
+        here: slice,
+        *,
+        hits: Hits,
+        seen: NDArray[np.bool_],
+        klass: NDArray[np.uint8],
+        feature: NDArray[np.int32],
+    ) -> None:
         """Set depth, class and feature of some pixels."""
-        self.range[here] = hits.range
-        label_hits(world.faces, hits.face, hits.instance, self.klass[here], self.feature[here])
+        self.range[here], self.klass[here], self.feature[here] = hits.range, klass, feature
         klass = self.klass[here]
         klass[hits.face < 0] = Class.SKY
         klass[~seen] = Class.UNLABELED
