@@ -173,7 +173,7 @@ def rows_beside(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> 
 
     On a tile's side they are those of all layers there, so that neighbouring tiles agree.
     """
-    vertex = triangles.faces.ravel()
+    vertex: Ints = triangles.faces.ravel().astype(np.int64)
     row = np.repeat(cells.row[triangles.cell], 3).astype(np.int64)
     edge = on_border(plan, cells, triangles=triangles)
     inner = ~edge[vertex]

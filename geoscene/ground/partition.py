@@ -286,7 +286,8 @@ def _last_around(polygons: NDArray[np.object_], xy: Float) -> Ints:
     """The last of the polygons around each point, -1 for none; a point on an outline is not inside."""
     if len(xy) <= _FEW:
         within = shapely.contains_xy(polygons, xy[:, :1], xy[:, 1:])
-        return np.where(within, np.arange(len(polygons)), -1).max(axis=1, initial=-1)
+        last: Ints = np.where(within, np.arange(len(polygons)), -1).max(axis=1, initial=-1)
+        return last
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
     parts, polygon = shapely.get_parts(polygons, return_index=True)

@@ -169,7 +169,7 @@ def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool
         return False
     if kinds[k, march.SILL_BOX + 2] <= kinds[k, march.SILL_BOX]:
         return True
-    return _sill(kinds, k, 0, x0, x1, 0.0) * _sill(kinds, k, 1, y0, y1, slope) == 0.0
+    return bool(_sill(kinds, k, 0, x0, x1, 0.0) * _sill(kinds, k, 1, y0, y1, slope) == 0.0)
 
 
 @inlined

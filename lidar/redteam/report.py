@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.charts import Axes, Span, curves, html_matrix, html_page, html_picture, html_table, spans
-from geoscene.figures import share
 from geoscene.csv_tables import write_columns
+from geoscene.figures import share
 from geoscene.files import write_atomically, write_json
 from lidar import __version__
 from lidar.redteam.evaluate import Accuracy, Detection, Matrix, Success, document_of
