@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,7 @@ def outlines(xy: Float, face: Ints, *, body: Ints, count: int) -> list[Polygons 
     start, stop = ids[open_].tolist(), ids[3 * row + (k + 1) % 3].tolist()
     onward = list(zip(stop, xy[row, k].tolist(), face[row].tolist(), strict=True))
     ends = _ends(body[row], count).tolist()
-    return [_joined(start[a:b], onward[a:b]) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+    return [_joined(start[a:b], onward[a:b]) for a, b in pairwise([0, *ends])]
 
 
 def _joined(start: list[int], edges: list[tuple[int, list[float], int]]) -> Polygons | None:
