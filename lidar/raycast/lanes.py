@@ -8,6 +8,8 @@ its length is a compile-time constant.
 from __future__ import annotations
 
 import functools
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -138,16 +140,36 @@ class _Rows:
         return _Row(self.builder, self.builder.shuffle_vector(one, one, every))
 
 
-def _row(kind: Any, kept: Any) -> Any:
-    @intrinsic
-    def move(context: Any, lanes: Any, source: Any, target: Any) -> Any:  # noqa: ARG001
-        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-            _Rows(builder, lanes, address=values[2], kind=kept)[0] = _Rows(
-                builder, lanes, address=values[1], kind=kind
-            )[0]
-            return made.get_dummy_value()
+_PLACE, _NUMBER = types.int64, types.float64
 
-        return types.void(lanes, types.int64, types.int64), build
+
+def _compiled(returned: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Make a function for compiled code of one that generates its instructions.
+
+    The generator takes the builder, the type of the lanes and the values of the arguments, and returns that
+    of the result, None for none. The function takes the lanes and the arguments, which are of these kinds.
+    """
+
+    def decorated(generate: Callable[..., Any]) -> Any:
+        def typed(context: Any, lanes: Any, *arguments: Any) -> Any:  # noqa: ARG001
+            def build(target: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
+                result = generate(builder, lanes, *values[1:])
+                return target.get_dummy_value() if result is None else result
+
+            return returned(lanes, *kinds), build
+
+        named: Any = typed  # numba looks for the arguments' names; the builder stands for the context
+        named.__signature__ = inspect.signature(generate)
+        return intrinsic(named)
+
+    return decorated
+
+
+def _row(kind: Any, kept: Any) -> Any:
+    @_compiled(types.void, _PLACE, _PLACE)
+    def move(builder: Any, lanes: Any, source: Any, target: Any) -> None:
+        row = _Rows(builder, lanes, address=source, kind=kind)[0]
+        _Rows(builder, lanes, address=target, kind=kept)[0] = row
 
     return move
 
@@ -164,139 +186,92 @@ def _hit(builder: Any, lanes: Any, geometry: Any) -> Any:
     return builder.icmp_unsigned("!=", row, ir.Constant(row.type, [-1] * lanes.count))
 
 
-@intrinsic
-def _fill(context: Any, lanes: Any, number: Any, target: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        row = _Rows(builder, lanes, address=values[2])
-        row[0] = row.same(values[1])
-        return made.get_dummy_value()
-
-    return types.void(lanes, types.float64, types.int64), build
+@_compiled(types.void, _NUMBER, _PLACE)
+def fill(builder: Any, lanes: Any, number: Any, target: Any) -> None:
+    """Write one number to all lanes of a row."""
+    row = _Rows(builder, lanes, address=target)
+    row[0] = row.same(number)
 
 
-fill: Any = _fill
-"""Write one number to all lanes of a row."""
+@_compiled(types.int64, _PLACE)
+def hits(builder: Any, lanes: Any, geometry: Any) -> Any:
+    """A bit for each lane that hit a geometry of a row at an address."""
+    flags = builder.bitcast(_hit(builder, lanes, geometry), ir.IntType(lanes.count))
+    return builder.zext(flags, ir.IntType(64))
 
 
-@intrinsic
-def _hits(context: Any, lanes: Any, geometry: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        flags = builder.bitcast(_hit(builder, lanes, values[1]), ir.IntType(lanes.count))
-        return builder.zext(flags, ir.IntType(64))
-
-    return types.int64(lanes, types.int64), build
-
-
-hits: Any = _hits
-"""A bit for each lane that hit a geometry of a row at an address."""
-
-
-@intrinsic
-def _sole(context: Any, lanes: Any, geometry: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, address=values[1], kind=_INT)
-        row, bits = rows[0].value, ir.IntType(lanes.count)
-        reduce = builder.module.declare_intrinsic(
-            f"llvm.vector.reduce.umin.v{lanes.count}i32", (), ir.FunctionType(_INT, [row.type])
-        )
-        least = builder.call(reduce, [row])
-        other = builder.icmp_unsigned("!=", row, rows.same(least).value)
-        differ = builder.bitcast(builder.and_(other, _hit(builder, lanes, values[1])), bits)
-        found = builder.icmp_unsigned("==", differ, ir.Constant(bits, 0))
-        return builder.select(found, builder.zext(least, ir.IntType(64)), ir.IntType(64)(-1))
-
-    return types.int64(lanes, types.int64), build
+@_compiled(types.int64, _PLACE)
+def sole(builder: Any, lanes: Any, geometry: Any) -> Any:
+    """The geometry that all lanes of a row that hit one have hit; -1 if there are several."""
+    rows = _Rows(builder, lanes, address=geometry, kind=_INT)
+    row, bits = rows[0].value, ir.IntType(lanes.count)
+    reduce = builder.module.declare_intrinsic(
+        f"llvm.vector.reduce.umin.v{lanes.count}i32", (), ir.FunctionType(_INT, [row.type])
+    )
+    least = builder.call(reduce, [row])
+    other = builder.icmp_unsigned("!=", row, rows.same(least).value)
+    differ = builder.bitcast(builder.and_(other, _hit(builder, lanes, geometry)), bits)
+    found = builder.icmp_unsigned("==", differ, ir.Constant(bits, 0))
+    return builder.select(found, builder.zext(least, ir.IntType(64)), ir.IntType(64)(-1))
 
 
-sole: Any = _sole
-"""The geometry that all lanes of a row that hit one have hit; -1 if there are several."""
+@_compiled(types.boolean, _PLACE, _PLACE, _NUMBER, _NUMBER, _NUMBER, _NUMBER)
+def settle(builder: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any, near: Any) -> Any:
+    """Make origins relative to a point; write the rays to Embree's packet in float32, with far rounded up.
+
+    Returns whether all directions have length 1 and all origins are below `HUGE`.
+    """
+    rows = _Rows(builder, lanes, address=work)
+    rounded = _Rows(builder, lanes, address=packet, kind=_FLOAT)
+    place = [rows[r] - rows.same(value) for r, value in enumerate((x, y, z))]
+    way = [rows[DX + r] for r in range(3)]
+    for r in range(3):
+        rows[r] = rounded[r] = place[r]
+        rounded[RAY_DX + r] = way[r]
+    rows[INVERSE] = rows.same(1.0)
+    rounded[RAY_NEAR], rounded[RAY_TIME] = rows.same(near), rows[TIME]
+    rounded[RAY_FAR] = rows[FAR] * rows.same(UP)
+    squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
+    close = (abs(place[0]) + abs(place[1]) + abs(place[2])).all("<", rows.same(HUGE))
+    straight = abs(squared - rows.same(1.0)).all("<", rows.same(UNIT))
+    return builder.and_(close, straight)
 
 
-@intrinsic
-def _settle(
-    context: Any,  # noqa: ARG001
-    lanes: Any,
-    work: Any,  # noqa: ARG001
-    packet: Any,  # noqa: ARG001
-    x: Any,  # noqa: ARG001
-    y: Any,  # noqa: ARG001
-    z: Any,  # noqa: ARG001
-    near: Any,  # noqa: ARG001
-) -> Any:
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows, rounded = (
-            _Rows(builder, lanes, address=values[1]),
-            _Rows(builder, lanes, address=values[2], kind=_FLOAT),
-        )
-        place = [rows[r] - rows.same(value) for r, value in enumerate(values[3:6])]
-        way = [rows[DX + r] for r in range(3)]
-        for r in range(3):
-            rows[r] = rounded[r] = place[r]
-            rounded[RAY_DX + r] = way[r]
-        rows[INVERSE] = rows.same(1.0)
-        rounded[RAY_NEAR], rounded[RAY_TIME] = rows.same(values[6]), rows[TIME]
-        rounded[RAY_FAR] = rows[FAR] * rows.same(UP)
-        squared = way[0] * way[0] + way[1] * way[1] + way[2] * way[2]
-        near = (abs(place[0]) + abs(place[1]) + abs(place[2])).all("<", rows.same(HUGE))
-        unit = abs(squared - rows.same(1.0)).all("<", rows.same(UNIT))
-        return builder.and_(near, unit)
+@_compiled(types.boolean, _PLACE, _PLACE)
+def shorten(builder: Any, lanes: Any, work: Any, packet: Any) -> Any:
+    """Write unit directions to Embree's packet for rays of any length, after `settle`.
 
-    return types.boolean(lanes, types.int64, types.int64, *[types.float64] * 4), build
+    Returns whether all directions and origins are valid.
+    """
+    rows = _Rows(builder, lanes, address=work)
+    rounded = _Rows(builder, lanes, address=packet, kind=_FLOAT)
+    ox, oy, oz, x, y, z = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
+    squared = x * x + y * y + z * z
+    length = squared.root()
+    inverse = rows.same(1.0) / length
+    rows[INVERSE] = inverse
+    for r, way in enumerate((x, y, z)):
+        rounded[RAY_DX + r] = way * inverse
+    rounded[RAY_NEAR] = rounded[RAY_NEAR].double() * length
+    rounded[RAY_FAR] = rows[FAR] * length * rows.same(UP)
+    near = (abs(ox) + abs(oy) + abs(oz)).all("<", rows.same(HUGE))
+    finite = builder.and_(squared.all(">", rows.same(0.0)), squared.all("<", rows.same(HUGE)))
+    return builder.and_(near, finite)
 
 
-settle: Any = _settle
-"""Make origins relative to a point; write the rays to Embree's packet in float32, with far rounded up.
-
-Returns whether all directions have length 1 and all origins are below `HUGE`."""
-
-
-@intrinsic
-def _shorten(context: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, address=values[1])
-        rounded = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
-        ox, oy, oz, x, y, z = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
-        squared = x * x + y * y + z * z
-        length = squared.root()
-        inverse = rows.same(1.0) / length
-        rows[INVERSE] = inverse
-        for r, way in enumerate((x, y, z)):
-            rounded[RAY_DX + r] = way * inverse
-        rounded[RAY_NEAR] = rounded[RAY_NEAR].double() * length
-        rounded[RAY_FAR] = rows[FAR] * length * rows.same(UP)
-        near = (abs(ox) + abs(oy) + abs(oz)).all("<", rows.same(HUGE))
-        finite = builder.and_(squared.all(">", rows.same(0.0)), squared.all("<", rows.same(HUGE)))
-        return builder.and_(near, finite)
-
-    return types.boolean(lanes, types.int64, types.int64, types.float64), build
-
-
-shorten: Any = _shorten
-"""Write unit directions to Embree's packet for rays of any length, after `settle`.
-
-Returns whether all directions and origins are valid."""
-
-
-@intrinsic
-def _nudge(context: Any, lanes: Any, work: Any, packet: Any, angle: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, address=values[1])
-        rounded = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
-        inverse, angle = rows[INVERSE], rows.same(values[3])
-        x, y, z = (rows[r] * inverse for r in (DX, DY, DZ))
-        least_x, least_y = abs(x).least(abs(y), abs(z)), abs(y).least(abs(z))
-        least_y = builder.and_(builder.not_(least_x), least_y)
-        least_z = builder.not_(builder.or_(least_x, least_y))
-        for r, (way, least) in enumerate(((x, least_x), (y, least_y), (z, least_z))):
-            rounded[RAY_DX + r] = _Row(builder, builder.select(least, (way + angle).value, way.value))
-        rounded[RAY_FAR] = rows[FAR] / inverse * rows.same(UP)
-        return made.get_dummy_value()
-
-    return types.void(lanes, types.int64, types.int64, types.float64), build
-
-
-nudge: Any = _nudge
-"""Turn the directions of Embree's packet by an angle, radians, and set far again."""
+@_compiled(types.void, _PLACE, _PLACE, _NUMBER)
+def nudge(builder: Any, lanes: Any, work: Any, packet: Any, angle: Any) -> None:
+    """Turn the directions of Embree's packet by an angle, radians, and set far again."""
+    rows = _Rows(builder, lanes, address=work)
+    rounded = _Rows(builder, lanes, address=packet, kind=_FLOAT)
+    inverse, turned = rows[INVERSE], rows.same(angle)
+    x, y, z = (rows[r] * inverse for r in (DX, DY, DZ))
+    least_x, least_y = abs(x).least(abs(y), abs(z)), abs(y).least(abs(z))
+    least_y = builder.and_(builder.not_(least_x), least_y)
+    least_z = builder.not_(builder.or_(least_x, least_y))
+    for r, (way, least) in enumerate(((x, least_x), (y, least_y), (z, least_z))):
+        rounded[RAY_DX + r] = _Row(builder, builder.select(least, (way + turned).value, way.value))
+    rounded[RAY_FAR] = rows[FAR] / inverse * rows.same(UP)
 
 
 def _vectors(builder: Any, column: Any, stride: Any, rows: list[Any]) -> list[Any]:
@@ -345,82 +320,62 @@ def _numbers(builder: Any, lanes: Any, column: Any) -> list[Any]:
     return [builder.load(builder.gep(base, [ir.Constant(_INT, k)])) for k in range(lanes.count)]
 
 
-@intrinsic
-def _spread(
-    context: Any,  # noqa: ARG001
-    lanes: Any,
-    ids: Any,  # noqa: ARG001
-    column: Any,  # noqa: ARG001
-    stride: Any,  # noqa: ARG001
-    target: Any,  # noqa: ARG001
-) -> Any:
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        ids, column, stride, target = values[1:]
-        vectors = _vectors(builder, column, stride, _numbers(builder, lanes, ids))
-        rows = _Rows(builder, lanes, address=target)
-        for r, row in enumerate(_columns(builder, vectors, lanes.count)[:3]):
-            rows[r] = row
-        return made.get_dummy_value()
-
-    return types.void(lanes, *[types.int64] * 4), build
-
-
-spread: Any = _spread
-"""Write three rows, at an address, of the vectors of a column with a stride in bytes."""
+@_compiled(types.void, _PLACE, _PLACE, _PLACE, _PLACE)
+def spread(builder: Any, lanes: Any, ids: Any, column: Any, stride: Any, target: Any) -> None:
+    """Write three rows, at an address, of the vectors of a column with a stride in bytes."""
+    vectors = _vectors(builder, column, stride, _numbers(builder, lanes, ids))
+    rows = _Rows(builder, lanes, address=target)
+    for r, row in enumerate(_columns(builder, vectors, lanes.count)[:3]):
+        rows[r] = row
 
 
 def _turning(*, placed: bool) -> Any:
     """`turn` if the places of poses are the first rows of work, else `shift`."""
 
-    @intrinsic
+    @_compiled(types.void, *[_PLACE] * 7)
     def turn(
-        context: Any,  # noqa: ARG001
+        builder: Any,
         lanes: Any,
-        ids: Any,  # noqa: ARG001
-        column: Any,  # noqa: ARG001
-        stride: Any,  # noqa: ARG001
-        pose: Any,  # noqa: ARG001
-        position: Any,  # noqa: ARG001
-        matrix: Any,  # noqa: ARG001
-        work: Any,  # noqa: ARG001
-    ) -> Any:
-        def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-            ids, column, stride, pose, position, matrix, work = values[1:]
-            numbers = _numbers(builder, lanes, ids)
-            long, rows = ir.IntType(64), _Rows(builder, lanes, address=work)
-            poses = [
-                builder.load(builder.gep(builder.inttoptr(pose, long.as_pointer()), [number]))
-                for number in numbers
-            ]
-            vectors = _vectors(builder, column, stride, numbers)
+        ids: Any,
+        column: Any,
+        stride: Any,
+        pose: Any,
+        position: Any,
+        matrix: Any,
+        work: Any,
+    ) -> None:
+        numbers = _numbers(builder, lanes, ids)
+        long, rows = ir.IntType(64), _Rows(builder, lanes, address=work)
+        poses = [
+            builder.load(builder.gep(builder.inttoptr(pose, long.as_pointer()), [number]))
+            for number in numbers
+        ]
+        vectors = _vectors(builder, column, stride, numbers)
 
-            def write(turned: list[_Row], places: list[_Row]) -> None:
-                for r in range(3):
-                    if placed:
-                        rows[OX + r], rows[DX + r] = places[r], turned[r]
-                    else:
-                        rows[OX + r] = rows[OX + r] + turned[r]
+        def write(turned: list[_Row], places: list[_Row]) -> None:
+            for r in range(3):
+                if placed:
+                    rows[OX + r], rows[DX + r] = places[r], turned[r]
+                else:
+                    rows[OX + r] = rows[OX + r] + turned[r]
 
-            differ = functools.reduce(
-                builder.or_, [builder.xor(poses[0], other) for other in poses[1:]], long(0)
-            )
-            with builder.if_else(builder.icmp_unsigned("==", differ, long(0))) as (alike, mixed):
-                with alike:
-                    start = builder.add(matrix, builder.mul(poses[0], long(72)))
-                    entry = builder.inttoptr(start, _DOUBLE.as_pointer())
-                    m = [rows.same(builder.load(builder.gep(entry, [long(e)]))) for e in range(9)]
-                    x, y, z, _ = _columns(builder, vectors, lanes.count)
-                    turned = [m[r] * x + m[r + 1] * y + m[r + 2] * z for r in (0, 3, 6)]
-                    start = builder.add(position, builder.mul(poses[0], long(24)))
-                    entry = builder.inttoptr(start, _DOUBLE.as_pointer())
-                    write(turned, [rows.same(builder.load(builder.gep(entry, [long(e)]))) for e in range(3)])
-                with mixed:
-                    turned = _by_lane(builder, vectors, matrix, poses)
-                    places = _vectors(builder, position, long(24), poses)
-                    write(turned, _columns(builder, places, lanes.count)[:3])
-            return made.get_dummy_value()
+        def shared(table: Any, count: int) -> list[_Row]:
+            """The numbers of the one pose of all lanes in a table of ``count`` a pose."""
+            start = builder.add(table, builder.mul(poses[0], long(8 * count)))
+            first = builder.inttoptr(start, _DOUBLE.as_pointer())
+            return [rows.same(builder.load(builder.gep(first, [long(e)]))) for e in range(count)]
 
-        return types.void(lanes, *[types.int64] * 7), build
+        differ = functools.reduce(builder.or_, [builder.xor(poses[0], other) for other in poses[1:]], long(0))
+        with builder.if_else(builder.icmp_unsigned("==", differ, long(0))) as (alike, mixed):
+            with alike:
+                m = shared(matrix, 9)
+                x, y, z, _ = _columns(builder, vectors, lanes.count)
+                turned = [m[r] * x + m[r + 1] * y + m[r + 2] * z for r in (0, 3, 6)]
+                write(turned, shared(position, 3))
+            with mixed:
+                turned = _by_lane(builder, vectors, matrix, poses)
+                places = _vectors(builder, position, long(24), poses)
+                write(turned, _columns(builder, places, lanes.count)[:3])
 
     return turn
 
@@ -451,94 +406,61 @@ turn, shift = _turning(placed=True), _turning(placed=False)
 """
 
 
-@intrinsic
-def _look_up(
-    context: Any,  # noqa: ARG001
-    lanes: Any,
-    planes: Any,  # noqa: ARG001
-    size: Any,  # noqa: ARG001
-    faces: Any,  # noqa: ARG001
-    geometry: Any,  # noqa: ARG001
-    work: Any,  # noqa: ARG001
-) -> Any:
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:
-        start, size, faces, geometry, work = values[1:]
-        rows, long = _Rows(builder, lanes, address=work), ir.IntType(64)
-        places = _Rows(builder, lanes, address=faces, kind=_INT)[0].value
-        hit = _hit(builder, lanes, geometry)
-        places = builder.select(hit, places, ir.Constant(places.type, [0] * lanes.count))
-        four, margin, packed = ir.VectorType(_DOUBLE, 4), ir.Constant(rows.kind, ir.Undefined), []
-        for k in range(lanes.count):
-            lane = ir.Constant(_INT, k)
-            face = builder.zext(builder.extract_element(places, lane), long)
-            place = builder.add(start, builder.mul(face, size))
-            packed.append(builder.load(builder.inttoptr(place, four.as_pointer()), align=8))
-            last = builder.inttoptr(builder.add(place, long(32)), _DOUBLE.as_pointer())
-            margin = builder.insert_element(margin, builder.load(last), lane)
-        while len(packed) > 1:
-            count = 2 * packed[0].type.count
-            every = ir.Constant(ir.VectorType(_INT, count), list(range(count)))
-            pairs = zip(packed[::2], packed[1::2], strict=True)
-            packed = [builder.shuffle_vector(one, other, every) for one, other in pairs]
-        for r, row in enumerate((NX, NY, NZ, OFFSET)):
-            column = ir.Constant(ir.VectorType(_INT, lanes.count), list(range(r, 4 * lanes.count, 4)))
-            rows[row] = _Row(builder, builder.shuffle_vector(packed[0], packed[0], column))
-        rows[MARGIN] = _Row(builder, margin)
-        return made.get_constant(signature.return_type, 0)
+@_compiled(types.void, *[_PLACE] * 5)
+def look_up(builder: Any, lanes: Any, planes: Any, size: Any, faces: Any, geometry: Any, work: Any) -> None:
+    """Write the planes of a row of faces, from a table at an address with a size in bytes of its rows.
 
-    return types.int64(lanes, *[types.int64] * 5), build
+    A lane without a geometry gets the first plane.
+
+    Rows written lane by lane could not be read as vectors at once: the processor would wait for the writes.
+    """
+    rows, long = _Rows(builder, lanes, address=work), ir.IntType(64)
+    places = _Rows(builder, lanes, address=faces, kind=_INT)[0].value
+    hit = _hit(builder, lanes, geometry)
+    places = builder.select(hit, places, ir.Constant(places.type, [0] * lanes.count))
+    four, margin, packed = ir.VectorType(_DOUBLE, 4), ir.Constant(rows.kind, ir.Undefined), []
+    for k in range(lanes.count):
+        lane = ir.Constant(_INT, k)
+        face = builder.zext(builder.extract_element(places, lane), long)
+        place = builder.add(planes, builder.mul(face, size))
+        packed.append(builder.load(builder.inttoptr(place, four.as_pointer()), align=8))
+        last = builder.inttoptr(builder.add(place, long(32)), _DOUBLE.as_pointer())
+        margin = builder.insert_element(margin, builder.load(last), lane)
+    for r, row in zip((NX, NY, NZ, OFFSET), _columns(builder, packed, lanes.count), strict=True):
+        rows[r] = row
+    rows[MARGIN] = _Row(builder, margin)
 
 
-look_up: Any = _look_up
-"""Write the planes of a row of faces, from a table at an address with a size in bytes of its rows.
-
-A lane without a geometry gets the first plane.
-
-Rows written lane by lane could not be read as vectors at once: the processor would wait for the writes."""
-
-
-@intrinsic
-def _unit(context: Any, lanes: Any, work: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, address=values[1])
-        x, y, z = rows[NX], rows[NY], rows[NZ]
-        length, zero = (x * x + y * y + z * z).root(), rows.same(0.0)
-        long = builder.fcmp_ordered(">", length.value, zero.value)
-        scale = _Row(builder, builder.select(long, (rows.same(1.0) / length).value, zero.value))
-        rows[NX], rows[NY], rows[NZ] = scale * x, scale * y, scale * z
-        return made.get_dummy_value()
-
-    return types.void(lanes, types.int64), build
+@_compiled(types.void, _PLACE)
+def unit(builder: Any, lanes: Any, work: Any) -> None:
+    """Make the normals unit vectors; zero stays zero."""
+    rows = _Rows(builder, lanes, address=work)
+    x, y, z = rows[NX], rows[NY], rows[NZ]
+    length, zero = (x * x + y * y + z * z).root(), rows.same(0.0)
+    long = builder.fcmp_ordered(">", length.value, zero.value)
+    scale = _Row(builder, builder.select(long, (rows.same(1.0) / length).value, zero.value))
+    rows[NX], rows[NY], rows[NZ] = scale * x, scale * y, scale * z
 
 
-unit: Any = _unit
-"""Make the normals unit vectors; zero stays zero."""
+@_compiled(types.boolean, _PLACE, _PLACE, _NUMBER)
+def cross(builder: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:
+    """Compute the ranges and cosines at which rays intersect their planes.
 
-
-@intrinsic
-def _cross(context: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:  # noqa: ARG001
-    def build(made: Any, builder: Any, signature: Any, values: Any) -> Any:  # noqa: ARG001
-        rows = _Rows(builder, lanes, address=values[1])
-        hits = _Rows(builder, lanes, address=values[2], kind=_FLOAT)
-        ox, oy, oz, dx, dy, dz = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
-        nx, ny, nz, d = (rows[r] for r in (NX, NY, NZ, OFFSET))
-        along = nx * dx + ny * dy + nz * dz
-        t = (d - nx * ox - ny * oy - nz * oz) / along
-        cosine = -along * rows[SCALE]
-        rows[RANGE], rows[COSINE] = t, cosine
-        u, v, margin = hits[HIT_U].double(), hits[HIT_V].double(), rows[MARGIN]
-        settled = builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[FAR]))
-        started = ((t - rows.same(values[3])) * cosine).all(">", rows.same(START) * rows[INVERSE])
-        settled = builder.and_(settled, started)
-        for share in (u, v, rows.same(1.0) - u - v):
-            settled = builder.and_(settled, (share * cosine).all(">=", margin))
-        return settled
-
-    return types.boolean(lanes, types.int64, types.int64, types.float64), build
-
-
-cross: Any = _cross
-"""Compute the ranges and cosines at which rays intersect their planes.
-
-Returns whether all ranges are beyond near and within far, and all rays hit the front of a face, at no grazing
-angle and clearly within its edges."""
+    Returns whether all ranges are beyond near and within far, and all rays hit the front of a face, at no
+    grazing angle and clearly within its edges.
+    """
+    rows = _Rows(builder, lanes, address=work)
+    shares = _Rows(builder, lanes, address=packet, kind=_FLOAT)
+    ox, oy, oz, dx, dy, dz = (rows[r] for r in (OX, OY, OZ, DX, DY, DZ))
+    nx, ny, nz, d = (rows[r] for r in (NX, NY, NZ, OFFSET))
+    along = nx * dx + ny * dy + nz * dz
+    t = (d - nx * ox - ny * oy - nz * oz) / along
+    cosine = -along * rows[SCALE]
+    rows[RANGE], rows[COSINE] = t, cosine
+    u, v, margin = shares[HIT_U].double(), shares[HIT_V].double(), rows[MARGIN]
+    settled = builder.and_(cosine.all(">=", rows.same(GRAZING)), t.all("<=", rows[FAR]))
+    started = ((t - rows.same(near)) * cosine).all(">", rows.same(START) * rows[INVERSE])
+    settled = builder.and_(settled, started)
+    for share in (u, v, rows.same(1.0) - u - v):
+        settled = builder.and_(settled, (share * cosine).all(">=", margin))
+    return settled

@@ -86,7 +86,7 @@ def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, wo
     x, y, z = target.origin[0], target.origin[1], target.origin[2]
     if settle(lanes, rows, f.ctypes.data, x, y, z, rays.near):
         return True
-    return bool(shorten(lanes, rows, f.ctypes.data, rays.near))
+    return bool(shorten(lanes, rows, f.ctypes.data))
 
 
 @inlined
