@@ -163,8 +163,8 @@ def merged(cells: Cells, body: Ints, *, count: int) -> list[Cells]:
     body : (m,) the body of each triangle, ascending
     """
     found = outlines(cells.xy, cells.face, body=body, count=count)
-    out, ends = [], _ends(body, count).tolist()
-    for a, b, polygons, made in zip([0, *ends[:-1]], ends, found, filled(found), strict=True):
+    out, spans = [], pairwise([0, *_ends(body, count).tolist()])
+    for (a, b), polygons, made in zip(spans, found, filled(found), strict=True):
         own = cells.take(slice(a, b))
         if polygons is not None and made is not None and len(np.unique(made[1])) == len(polygons):
             xy, owner = made

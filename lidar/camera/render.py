@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -179,7 +179,6 @@ def render(
     walls = facades_of(world)
     k = options.supersample
     trace = functools.partial(_traced, poses=poses, world=world, times=times, options=options)
-    look = functools.partial(_view, poses=poses, world=world, times=times, options=options)
     colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, options=options)
 
     def band(edges: tuple[int, int], image: _Image, *, sample: int) -> None:
@@ -187,27 +186,27 @@ def render(
         first, last = edges
         here = slice(first * w, last * w)
         if not coloured:
-            _, _, seen, _, hits = trace(camera, here, sample=sample, normals=False)
-            klass, feature = image.klass[here], image.feature[here]
+            traced = trace(camera, here, sample=sample, normals=False)
+            hits, klass, feature = traced.hits, image.klass[here], image.feature[here]
             label_hits(world.faces, hits.face, hits.instance, klass, feature)
-            image.label(here, hits=hits, seen=seen, klass=klass, feature=feature)
+            image.label(here, hits=hits, seen=traced.seen, klass=klass, feature=feature)
             return
-        view = look(camera, here, sample=sample)
+        view = trace(camera, here, sample=sample).view(world)
         found = view.surfaces
         image.label(here, hits=view.hits, seen=view.seen, klass=found.klass, feature=found.feature)
         if k == 1:
             image.light[here] = colour(view, angle=1 / camera.fx)
         else:
             fine = _finer(camera, k)
-            sharp = look(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
-            image.light[here] = _binned(colour(sharp, angle=1 / fine.fx), k, width=w)
+            sharp = trace(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
+            image.light[here] = _binned(colour(sharp.view(world), angle=1 / fine.fx), k, width=w)
 
     def refine(pixels: NDArray[np.int64], image: _Image, *, sample: int) -> None:
         """Colour of single pixels of an image, from more rays."""
         n = options.edge_rays
         fine = _finer(camera, n)
-        seen = look(fine, _finer_pixels(pixels, n, width=w), sample=sample, rows=h)
-        part = colour(seen, angle=1 / fine.fx).reshape(len(pixels), n * n, 3)
+        sharp = trace(fine, _finer_pixels(pixels, n, width=w), sample=sample, rows=h)
+        part = colour(sharp.view(world), angle=1 / fine.fx).reshape(len(pixels), n * n, 3)
         # The same as their mean, of which NumPy adds three numbers at a time.
         image.light[pixels] = sum(part[:, i] for i in range(n * n)) / np.float32(n * n)
 
@@ -320,22 +319,19 @@ def _finer_pixels(pixels: NDArray[np.int64], k: int, *, width: int) -> NDArray[n
     return (rows * (width * k) + columns).reshape(-1)
 
 
-def _view(
-    camera: CameraSpec,
-    pixels: _Pixels,
-    *,
-    poses: Poses,
-    world: World,
-    sample: int,
-    times: Float | None,
-    options: RenderOptions,
-    rows: int | None = None,
-) -> View:
-    """Hits and surfaces of pixels of a camera in one sample of the exposure; parameters as of `_traced`."""
-    row, direction, seen, time, hits = _traced(
-        camera, pixels, poses=poses, world=world, sample=sample, times=times, options=options, rows=rows
-    )
-    return View(poses.position, row, direction, seen, time, hits, world.lookup(hits))
+class _Traced(NamedTuple):
+    """Rays in the scene and what they hit, as in `View`, whose surfaces are not looked up."""
+
+    origin: Float
+    row: NDArray[np.int32]
+    direction: Float
+    seen: NDArray[np.bool_]
+    time: Float | None
+    hits: Hits
+
+    def view(self, world: World) -> View:
+        """These, and the surfaces that are hit."""
+        return View(*self, world.lookup(self.hits))
 
 
 def _traced(
@@ -349,8 +345,8 @@ def _traced(
     options: RenderOptions,
     rows: int | None = None,
     normals: bool = True,
-) -> tuple[NDArray[np.int32], Float, NDArray[np.bool_], Float | None, Hits]:
-    """Row, direction, seen, time and hits, as in `View`, of pixels of a camera in one sample of the exposure.
+) -> _Traced:
+    """Rays and hits of pixels of a camera in one sample of the exposure.
 
     pixels  : numbers of pixels, row by row from the top
     rows    : rows of the shutter, where the camera is a finer one
@@ -382,7 +378,7 @@ def _traced(
     )
     if not seen.all():
         hits = _with_misses(hits, ~seen)
-    return row, direction, seen, time, hits
+    return _Traced(poses.position, row, direction, seen, time, hits)
 
 
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
@@ -621,7 +617,7 @@ def optical_flow(
         raise InputError(f"camera {camera.name}: optical flow needs {rows} poses of each frame")
     start = np.zeros(rows) if times is None else np.asarray(times, float)
     end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
-    view = _view(
+    view = _traced(
         camera,
         slice(0, camera.width * camera.height),
         poses=poses,
@@ -629,6 +625,7 @@ def optical_flow(
         sample=0,
         times=start,
         options=RenderOptions(),
+        normals=False,
     )
     hit = np.isfinite(view.hits.range)
     point = view.origin[view.row] + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction

@@ -289,6 +289,10 @@ def _facing(i: int, normal: Any, wall: Any, frame: Any) -> Any:
     return normal[i, 0], normal[i, 1], normal[i, 2]
 
 
+_PLACED = 10
+"""Numbers that `_placed` returns."""
+
+
 @inlined
 def _placed(i: int, view: Any, wall: Any, frame: Any, settings: Any) -> Any:
     """Direction (a unit vector), place, distance, cosine of incidence and widths of a pixel's hit.
@@ -562,7 +566,7 @@ def shade(
     found = klass, material, color, feature, wall
     frame = walls.tables.frame
     work = block_scratch()
-    at, places = np.empty((10, BLOCK)), np.empty((PLACES, BLOCK))
+    at, places = np.empty((BLOCK, _PLACED)), np.empty((PLACES, BLOCK))
     kind, factor = np.empty(BLOCK, np.int64), np.ones(BLOCK)
     for first in range(0, len(range_), BLOCK):
         n = min(BLOCK, len(range_) - first)
@@ -570,18 +574,8 @@ def shade(
             i, kind[j] = first + j, -1
             if range_[i] < np.inf:
                 here = _placed(i, view, wall, frame, settings)
-                (
-                    at[0, j],
-                    at[1, j],
-                    at[2, j],
-                    at[3, j],
-                    at[4, j],
-                    at[5, j],
-                    at[6, j],
-                    at[7, j],
-                    at[8, j],
-                    at[9, j],
-                ) = here
+                for c in range(_PLACED):
+                    at[j, c] = here[c]
                 if settings[3]:
                     _put(_texture(i, here, view, found, frame, tables), here, j, kind, places)
         if settings[3]:
@@ -591,21 +585,10 @@ def shade(
             if not range_[i] < np.inf:
                 _background(i, direction, light, scratch[0], out)
                 continue
-            here = (
-                at[0, j],
-                at[1, j],
-                at[2, j],
-                at[3, j],
-                at[4, j],
-                at[5, j],
-                at[6, j],
-                at[7, j],
-                at[8, j],
-                at[9, j],
-            )
+            p = at[j]
             _surface(
                 i,
-                here,
+                (p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9]),
                 factor[j],
                 view,
                 found,
