@@ -130,7 +130,7 @@ def _swept(low: Ints, high: Ints, owner: Ints, body: Ints) -> Ints:
                 continue
             if n == len(found):
                 found = np.concatenate((found, np.empty_like(found)))
-            found[n] = i, j
+            found[n, 0], found[n, 1] = i, j
             n += 1
     return found[:n]
 
@@ -155,18 +155,18 @@ def _meetings(corners: Ints, faces: Ints, pairs: Ints) -> NDArray[np.uint8]:
     for k in range(len(corners)):
         _find_planes(corners[k], planes[k])
     found = np.zeros(len(pairs), np.uint8)
-    same = np.empty((3, 3), np.bool_)
+    same, turned = np.empty((3, 3), np.bool_), np.empty((3, 3), np.bool_)
     for k in range(len(pairs)):
         a, b = pairs[k]
         one, two = corners[a], corners[b]
-        shared = 0
+        shared = np.int64(0)
         for i in range(3):
             for j in range(3):
-                same[i, j] = faces[a, i] == faces[b, j]
+                same[i, j] = turned[j, i] = faces[a, i] == faces[b, j]
                 shared += same[i, j]
-        if _separated(planes[a], two, same) or _separated(planes[b], one, same.T):
+        if _separated(planes[a], two, same) or _separated(planes[b], one, turned):
             continue
-        if _intersect(one, two, same, shared):
+        if _intersect(one, two, same, turned, shared):
             found[k] = _CROSSING
         elif _distance(one, two, same) < CLEARANCE:
             found[k] = _NEAR
@@ -278,9 +278,10 @@ def _difference(a: Ints, b: Ints) -> tuple[float, float, float]:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _intersect(first: Ints, second: Ints, same: Bools, shared: int) -> bool:
+def _intersect(first: Ints, second: Ints, same: Bools, turned: Bools, shared: int | np.int64) -> bool:
     """Whether two triangles intersect outside their common corners and edges.
 
+    turned : (3, 3), ``same`` with rows and columns exchanged
     shared : number of common corners
     """
     if shared == 3:
@@ -288,11 +289,11 @@ def _intersect(first: Ints, second: Ints, same: Bools, shared: int) -> bool:
     own, others = np.empty(3, np.int64), np.empty(3, np.int64)
     for k in range(3):
         own[k], others[k] = _side(second, first[k]), _side(first, second[k])
-    if _one_side(own, same) or _one_side(others, same.T):
+    if _one_side(own, same) or _one_side(others, turned):
         return False
     if shared == 2:
         return _folded(first, second, same)
-    return _edges_pierce(first, second, own, same) or _edges_pierce(second, first, others, same.T)
+    return _edges_pierce(first, second, own, same) or _edges_pierce(second, first, others, turned)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

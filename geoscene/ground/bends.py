@@ -10,7 +10,7 @@ from geoscene.compiled import njit
 from geoscene.typing import Bools, Float, Ints
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def without_bends(
     points: Float, a: Ints, b: Ints, other: Ints, ring: Ints, largest: float
 ) -> tuple[Ints, Ints]:
@@ -95,7 +95,7 @@ def without_bends(
     return vertex[:size], offset
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _meetings(count: int, a: Ints, other: Ints, ring: Ints) -> Bools:
     """Which of the points are on more than two rings, or where a ring reaches or leaves the outside."""
     rings, node = np.zeros(count, np.int64), np.zeros(count, np.bool_)
@@ -110,7 +110,7 @@ def _meetings(count: int, a: Ints, other: Ints, ring: Ints) -> Bools:
     return node
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _twins(count: int, a: Ints, b: Ints) -> Ints:
     """The half-edge the other way of each, -1 where there is none."""
     latest, before = np.full(count, -1, np.int64), np.empty(len(a), np.int64)
@@ -126,16 +126,17 @@ def _twins(count: int, a: Ints, b: Ints) -> Ints:
     return twin
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _kept(
     points: Float, node: Bools, line: Ints, first: Ints, closed: Bools, inner: Bools, largest: float
 ) -> Bools:
     """Which vertices of borders remain; borders are ``line[first[k]:first[k + 1]]``."""
     alive = np.zeros(len(points), np.bool_)
-    alive[line] = True
+    for p in line:
+        alive[p] = True
     grid, offset, found = _cells_of_points(points, alive)
     kept = np.ones(len(line), np.bool_)
-    size = np.diff(first)
+    size = first[1:] - first[:-1]
     latest, earlier = np.full(len(points), -1, np.int64), np.empty(len(size), np.int64)
     for e in range(len(size)):
         v = min(line[first[e]], line[first[e + 1] - 1])
@@ -184,14 +185,14 @@ def _kept(
     return kept
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _area(points: Float, p: int, v: int, q: int) -> float:
     x, y = points[p]
     area: float = abs((points[q, 0] - x) * (points[v, 1] - y) - (points[v, 0] - x) * (points[q, 1] - y)) / 2.0
     return area
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cells_of_points(points: Float, chosen: Bools) -> tuple[Float, Ints, Ints]:
     """Square cells (west, south, side, columns, rows), and the chosen points by cell: offsets and numbers."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
@@ -217,7 +218,7 @@ def _cells_of_points(points: Float, chosen: Bools) -> tuple[Float, Ints, Ints]:
     return np.array([low[0], low[1], side, columns, rows]), offset, found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _holds_other(
     points: Float, p: int, v: int, q: int, alive: Bools, grid: Float, offset: Ints, found: Ints
 ) -> bool:

@@ -14,7 +14,7 @@ _DOUBT = 1e-15
 """Share of its two products to which the sign of a determinant of doubles is sure."""
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cells_of_segments(start: Ints, end: Ints, cells: Ints) -> tuple[Ints, Ints]:
     """Segments by cell, in compressed rows (offset, segment); those of a cell ascend.
 
@@ -53,12 +53,13 @@ def cells_of_segments(start: Ints, end: Ints, cells: Ints) -> tuple[Ints, Ints]:
         if not fill:
             offset = np.cumsum(offset)
             found = np.empty(offset[-1], np.int64)
-    offset[1:] = offset[:-1].copy()
+    for cell in range(len(offset) - 1, 0, -1):
+        offset[cell] = offset[cell - 1]
     offset[0] = 0
     return offset, found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def crossings(start: Ints, end: Ints, cells: Ints, offset: Ints, found: Ints) -> Ints:
     """The grid points (m, 2) nearest to where two segments cross between their ends; halves are rounded up.
 
@@ -93,12 +94,12 @@ def crossings(start: Ints, end: Ints, cells: Ints, offset: Ints, found: Ints) ->
                     continue  # another cell has the same two
                 if count == len(points):
                     points = np.concatenate((points, np.empty_like(points)))
-                points[count] = x, y
+                points[count, 0], points[count, 1] = x, y
                 count += 1
     return points[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def pieces(
     start: Ints,
     end: Ints,
@@ -154,7 +155,7 @@ def pieces(
     return _once(ends, _ranks(begins), len(points))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def rings(
     points: Float, ends: Ints, rank: Ints, box: Float
 ) -> tuple[Ints, Ints, Ints, Ints, Ints, Ints, float]:
@@ -169,7 +170,7 @@ def rings(
         x, y = points[ends[0, k]] + points[ends[1, k]]
         chosen[k] = two[0] <= x <= two[2] and two[1] <= y <= two[3]
     while True:
-        ends, rank = ends[:, chosen], rank[:, chosen]
+        ends, rank = _columns(ends, chosen), _columns(rank, chosen)
         m = ends.shape[1]
         start = np.concatenate((ends[0], ends[1]))
         stop = np.concatenate((ends[1], ends[0]))
@@ -180,8 +181,11 @@ def rings(
                 after = k + 1 if k + 1 < offset[v + 1] else offset[v]
                 following[_twin(star[k], m)] = star[after]
         ring = _cycles(following)
-        chosen = ring[:m] != ring[m:]
-        if chosen.all():
+        chosen, bridges = np.empty(m, np.bool_), 0
+        for k in range(m):
+            chosen[k] = ring[k] != ring[m + k]
+            bridges += not chosen[k]
+        if not bridges:
             break
     _split_touching(following, ring, star, offset)
     order, offset = _in_rings(following, np.concatenate((rank[0], rank[1])))
@@ -213,7 +217,8 @@ def rings(
         r = chosen_rings[k]
         covered -= area[r]
         ring_offset[k + 1] = ring_offset[k] + offset[r + 1] - offset[r]
-        face_of[order[offset[r] : offset[r + 1]]] = face_of_ring[r]
+        for h in order[offset[r] : offset[r + 1]]:
+            face_of[h] = face_of_ring[r]
     a, b = np.empty(ring_offset[-1], np.int64), np.empty(ring_offset[-1], np.int64)
     cell, other = np.empty_like(a), np.empty_like(a)
     for k in range(len(chosen_rings)):
@@ -225,12 +230,12 @@ def rings(
     return a, b, cell, other, ring_offset, face_offset, covered
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _step(value: int, low: int, side: int, count: int) -> int:
     return min(max((value - low) // side, 0), count - 1)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _nearest(direction: int, part: int, whole: int) -> int:
     """The integer nearest to ``direction * part / whole``."""
     near = int(np.rint(direction * (part / whole)))  # off by one at most
@@ -239,7 +244,7 @@ def _nearest(direction: int, part: int, whole: int) -> int:
     return near + rest // (2 * whole)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _passes(start: Ints, end: Ints, x: int, y: int) -> bool:
     """Whether a segment passes the hot pixel of a point in its bounding box."""
     (ax, ay), (bx, by) = start, end
@@ -256,7 +261,7 @@ def _passes(start: Ints, end: Ints, x: int, y: int) -> bool:
     return passes
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sort_along(chosen: Ints, points: Ints, direction: Ints) -> None:
     """Sort numbers of points on a segment, in place: by the longer axis, then by the other."""
     axis = 0 if abs(direction[0]) >= abs(direction[1]) else 1
@@ -274,7 +279,7 @@ def _sort_along(chosen: Ints, points: Ints, direction: Ints) -> None:
         chosen[k] = p
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ranks(begins: Bools) -> Ints:
     """Ranks (2, n) of the half-edges of pieces in runs: of each run forth, then back."""
     rank = np.empty((2, len(begins)), np.int64)
@@ -289,7 +294,7 @@ def _ranks(begins: Bools) -> Ints:
     return rank
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _once(ends: Ints, rank: Ints, count: int) -> tuple[Ints, Ints]:
     """The first of pieces with the same two ends."""
     latest, before = np.full(count, -1, np.int64), np.empty(ends.shape[1], np.int64)
@@ -302,16 +307,41 @@ def _once(ends: Ints, rank: Ints, count: int) -> tuple[Ints, Ints]:
         if like < 0:
             before[k], latest[low] = latest[low], k
             keep[k] = True
-    return ends[:, keep], rank[:, keep]
+    return _columns(ends, keep), _columns(rank, keep)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy")
+def _columns(table: Ints, chosen: Bools) -> Ints:
+    """The chosen columns of a table of two rows."""
+    found = np.empty((2, chosen.sum()), np.int64)
+    n = 0
+    for k in range(len(chosen)):
+        if chosen[k]:
+            found[0, n], found[1, n] = table[0, k], table[1, k]
+            n += 1
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _first_from(values: Float, low: float) -> int:
+    """The number of the first of ascending values that is not below one."""
+    first, last = 0, len(values)
+    while first < last:
+        middle = (first + last) // 2
+        if values[middle] < low:
+            first = middle + 1
+        else:
+            last = middle
+    return first
+
+
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _twin(half: int, count: int) -> int:
     """The half-edge the other way."""
     return half - count if half >= count else half + count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _stars(points: Float, start: Ints, stop: Ints) -> tuple[Ints, Ints]:
     """Half-edges by start, then counter-clockwise, and offsets (k + 1,) of the points in them."""
     count = np.zeros(len(points) + 1, np.int64)
@@ -336,7 +366,7 @@ def _stars(points: Float, start: Ints, stop: Ints) -> tuple[Ints, Ints]:
     return star, offset
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, inline="always", error_model="numpy")
 def _quarter(dx: float, dy: float) -> int:
     """Which comes first counter-clockwise from west: directions to the south, east, the north, west."""
     if dy == 0.0:
@@ -344,7 +374,7 @@ def _quarter(dx: float, dy: float) -> int:
     return 0 if dy < 0.0 else 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _cycles(following: Ints) -> Ints:
     """The number of the cycle that each half-edge is in."""
     number, count = np.full(len(following), -1, np.int64), 0
@@ -358,7 +388,7 @@ def _cycles(following: Ints) -> Ints:
     return number
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _split_touching(following: Ints, ring: Ints, star: Ints, offset: Ints) -> None:
     """Divide, in place, rings that pass a point more than once there."""
     m = len(ring) // 2
@@ -385,11 +415,14 @@ def _split_touching(following: Ints, ring: Ints, star: Ints, offset: Ints) -> No
                 following[arriving] = first
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _in_rings(following: Ints, rank: Ints) -> tuple[Ints, Ints]:
     """Half-edges ring by ring, each from its least rank on, rings by that rank; and where rings begin."""
     n = len(following)
-    by_rank = np.full(rank.max() + 1 if n else 0, -1, np.int64)
+    greatest = -1
+    for h in range(n):
+        greatest = max(greatest, int(rank[h]))
+    by_rank: Ints = np.full(greatest + 1, -1, np.int64)
     for h in range(n):
         by_rank[rank[h]] = h
     order, offset, count, k = np.empty(n, np.int64), np.empty(n + 1, np.int64), 0, 0
@@ -409,7 +442,7 @@ def _in_rings(following: Ints, rank: Ints) -> tuple[Ints, Ints]:
     return order, offset[: count + 1]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _owners(
     points: Float, start: Ints, stop: Ints, order: Ints, offset: Ints, box: Float
 ) -> tuple[Float, Ints]:
@@ -429,7 +462,7 @@ def _owners(
             (ax, ay), (bx, by) = points[start[h]], points[stop[h]]
             area[r] += 0.5 * ((ax - x0) * (by - y0) - (ay - y0) * (bx - x0))
             west, south, east, north = min(west, ax), min(south, ay), max(east, ax), max(north, ay)
-        bounds[r] = west, south, east, north
+        bounds[r, 0], bounds[r, 1], bounds[r, 2], bounds[r, 3] = west, south, east, north
         if area[r] > 0.0:
             holes[hole_count] = r
             hole_count += 1
@@ -450,7 +483,7 @@ def _owners(
     return area, owner
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _holds(points: Float, start: Ints, stop: Ints, ring: Ints, x: float, y: float) -> bool:
     """Whether a point, exact on half the grid, is within a ring and not on it."""
     inside = False
@@ -466,7 +499,7 @@ def _holds(points: Float, start: Ints, stop: Ints, ring: Ints, x: float, y: floa
     return inside
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[Ints, Ints, Ints]:
     """The last of the polygons (n,) around each point, -1 for none; and points and polygons left in doubt.
 
@@ -478,7 +511,9 @@ def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[I
     polygon : (r,) int64, the polygon that each ring is of, ascending
     """
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
-    west = x.min()
+    west = x[0]
+    for p in range(1, len(x)):
+        west = min(west, x[p])
     best = np.full(len(x), -1, np.int64)
     state = np.zeros(len(x), np.uint8)  # bit 0: inside, bit 1: in doubt
     point, of, count = np.empty(16, np.int64), np.empty(16, np.int64), 0
@@ -490,7 +525,7 @@ def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[I
             left, right = min(ax, bx), max(ax, bx)
             if right < west or high < y[0] or low > y[-1]:
                 continue
-            begin = np.searchsorted(y, low)
+            begin = _first_from(y, low)
             for p in range(begin, len(y)):
                 if y[p] > high:
                     last = max(last, p)
@@ -527,7 +562,7 @@ def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[I
     return best, point[:count], of[:count]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def inner_points(points: Float, a: Ints, ring: Ints, face: Ints) -> Float:
     """A point (n, 2) within each face: amid the widest section at half its height, between two vertices.
 
@@ -554,22 +589,30 @@ def inner_points(points: Float, a: Ints, ring: Ints, face: Ints) -> Float:
                 if (p[1] > y) != (q[1] > y):
                     if count == len(cuts):
                         cuts = np.concatenate((cuts, cuts))
-                    cuts[count] = p[0] + (y - p[1]) * (q[0] - p[0]) / (q[1] - p[1])
+                    x, at = p[0] + (y - p[1]) * (q[0] - p[0]) / (q[1] - p[1]), count
+                    while at > 0 and cuts[at - 1] > x:
+                        cuts[at] = cuts[at - 1]
+                        at -= 1
+                    cuts[at] = x
                     count += 1
-        across = np.sort(cuts[:count])
-        widest = 2 * np.argmax(across[1::2] - across[::2])
-        found[f] = 0.5 * (across[widest] + across[widest + 1]), y
+        widest = 0
+        for k in range(0, count, 2):
+            if cuts[k + 1] - cuts[k] > cuts[widest + 1] - cuts[widest]:
+                widest = k
+        found[f, 0], found[f, 1] = 0.5 * (cuts[widest] + cuts[widest + 1]), y
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def in_boxes(xy: Float, boxes: Float) -> tuple[Ints, Ints]:
     """Points and boxes (k,) that hold them; points (n, 2) float64 sorted by y, boxes (m, 4) float64."""
     x, y = xy[:, 0].copy(), xy[:, 1].copy()
     point, box, count = np.empty(64, np.int64), np.empty(64, np.int64), 0
     for b in range(len(boxes)):
         west, south, east, north = boxes[b]
-        for p in range(np.searchsorted(y, south), np.searchsorted(y, north, "right")):
+        for p in range(_first_from(y, south), len(y)):
+            if y[p] > north:
+                break
             if west <= x[p] <= east:
                 if count == len(point):
                     point, box = np.concatenate((point, point)), np.concatenate((box, box))
