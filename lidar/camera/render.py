@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -111,7 +111,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class _Traced:
     """Rays in the scene and what they hit.
 
     origin    : (k, 3) scene metres
@@ -120,7 +120,6 @@ class View:
     seen      : (n,) False for a pixel outside the lens's field of view
     time      : (n,) ray times, or None
     hits      : what the rays hit
-    surfaces  : surfaces at these hits
     """
 
     origin: Float
@@ -129,6 +128,20 @@ class View:
     seen: NDArray[np.bool_]
     time: Float | None
     hits: Hits
+
+    def view(self, world: World) -> View:
+        """These, and the surfaces that are hit."""
+        found = world.lookup(self.hits)
+        return View(self.origin, self.row, self.direction, self.seen, self.time, self.hits, found)
+
+
+@dataclass(frozen=True, slots=True)
+class View(_Traced):
+    """Rays in the scene and what they hit, as in `_Traced`.
+
+    surfaces : surfaces at the hits
+    """
+
     surfaces: Surfaces
 
 
@@ -317,21 +330,6 @@ def _finer_pixels(pixels: NDArray[np.int64], k: int, *, width: int) -> NDArray[n
     rows = (row * k)[:, None, None] + part[:, None]
     columns = (column * k)[:, None, None] + part
     return (rows * (width * k) + columns).reshape(-1)
-
-
-class _Traced(NamedTuple):
-    """Rays in the scene and what they hit, as in `View`, whose surfaces are not looked up."""
-
-    origin: Float
-    row: NDArray[np.int32]
-    direction: Float
-    seen: NDArray[np.bool_]
-    time: Float | None
-    hits: Hits
-
-    def view(self, world: World) -> View:
-        """These, and the surfaces that are hit."""
-        return View(*self, world.lookup(self.hits))
 
 
 def _traced(
