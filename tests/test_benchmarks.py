@@ -307,7 +307,7 @@ def test_a_peer_gets_the_same_scene_and_pulses_and_must_do_the_same_work(share, 
     assert "HELIOS++ is Stand-in 1.0" in document["notes"]
     assert document["seconds"]["helios"] > 0
     (case,) = document["cases"]
-    assert set(case["sides"]) == {"lidar", "HELIOS++"}
+    assert set(case["sides"]) == {"lidar", "lidar, relief", "HELIOS++"}
     assert case["sides"]["HELIOS++"]["ratio"] is not None
 
 

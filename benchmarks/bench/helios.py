@@ -35,9 +35,10 @@ _ALIKE = 0.2
 """Greatest difference between the numbers of points, relative: more is other work."""
 
 _NOTE = (
-    "whole processes on two threads, from the scene's files to LAS, with loading; the same scene (as OBJ for"
-    " HELIOS++) and as near as it can the same pulses. HELIOS++: level scanner, other azimuth of the first"
-    " pulse, copies instead of instances, no CRS"
+    "whole processes on two threads, from the scene's files to LAS, with loading; the same surfaces (--relief"
+    " off; as OBJ for HELIOS++) and as near as it can the same pulses; relief: with the windows, doors and"
+    " rough ground that drives have by default and HELIOS++ has not. HELIOS++: level scanner, other azimuth"
+    " of the first pulse, copies instead of instances, no CRS"
 )
 _LOOP_NOTE = (
     "spans of time: a longer drive less a shorter one, both whole processes: without start and loading"
@@ -59,15 +60,13 @@ def peer(setup: Setup) -> Iterator[Case]:
     for rays, seconds in ((1, 2.0),) if setup.quick else _WHOLE:
         drive = _Drive(setup, rays, seconds)
         drive.write()
-        yield _case(drive, f"{seconds:g} s", {"lidar": drive.ours, "HELIOS++": drive.theirs}, note=_NOTE)
+        yield _case(drive, f"{seconds:g} s", dict(drive.sides()), note=_NOTE)
     for rays, short, long in () if setup.quick else _LOOPS:
         less, more = _Drive(setup, rays, short), _Drive(setup, rays, long)
         less.write()
         more.write()
-        sides = {
-            "lidar": partial(difference, less.ours, more.ours),
-            "HELIOS++": partial(difference, less.theirs, more.theirs),
-        }
+        pairs = zip(less.sides(), more.sides(), strict=True)
+        sides = {side: partial(difference, shorter, longer) for (side, shorter), (_, longer) in pairs}
         yield _case(more, f"{short:g} to {long:g} s", sides, note=_LOOP_NOTE, less=less)
 
 
@@ -126,13 +125,20 @@ class _Drive:
         """Write what HELIOS++ reads beside the scene as OBJ."""
         write_survey(self.plan, self.setup.folder / "helios.obj", rays=self.rays, folder=self.folder)
 
-    def ours(self) -> Spent:
+    def sides(self) -> Iterator[tuple[str, Callable[[], Spent]]]:
+        """The programs by name."""
+        yield "lidar", self.ours
+        yield "lidar, relief", partial(self.ours, relief="scene")
+        yield "HELIOS++", self.theirs
+
+    def ours(self, *, relief: str = "off") -> Spent:
         """Cost of this program."""
         setup = self.setup
         words = [sys.executable, "-m", "lidar", "drive", str(setup.scene.path), "--route", "random"]
         words += ["--seed", "2", "--rig", str(rig_file("VLP-16", setup.folder))]
         words += ["--duration", str(self.seconds), "--format", "las", "--set", f"rays={self.rays}"]
-        words += ["--workers", "2", "--out", str(self.folder / "ours"), "--overwrite", "--quiet"]
+        words += ["--relief", relief, "--workers", "2", "--out", str(self.folder / f"ours_{relief}")]
+        words += ["--overwrite", "--quiet"]
         return command(words)
 
     def theirs(self) -> Spent:
@@ -152,7 +158,7 @@ class _Drive:
                 said.seek(0)
                 tail = " ".join(said.read().decode(errors="replace").split())[-300:]
                 raise BenchError(f"{program} ended with {error.returncode}: {tail}") from error
-        ours, theirs = points(self.folder / "ours"), points(out)
+        ours, theirs = points(self.folder / "ours_off"), points(out)
         if abs(theirs - ours) > _ALIKE * ours:
             raise BenchError(
                 f"{program} wrote {theirs} points, lidar {ours}: not the same work; see the program's log"
