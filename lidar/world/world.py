@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +31,7 @@ from lidar.relief import (
 )
 from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings, check_relief
+from lidar.world.shared import Shared
 from lidar.world.shelter import CELL, Shelter, shelter_of
 from lidar.world.surfaces import (
     GLASS,
@@ -60,16 +62,20 @@ _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, weakref_slot=True)
 class _Tile:
     """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
 
+    Worlds share it, and change none of its arrays.
+
+    scene    : it is of
     surfaces : of the faces of the mesh, then of those that ``walls`` adds
     walls    : openings of its walls
     ground   : roughness of its ground, None for none
     centre   : (m, 3) of the faces of the mesh, scene metres; then zeros
     """
 
+    scene: Scene
     parts: Mapping[int, Geometry]
     surfaces: Surfaces
     walls: WallTables
@@ -78,6 +84,9 @@ class _Tile:
     transform: Float
     feature: NDArray[np.int32]
     centre: Float
+
+
+_TILES: Shared[_Tile] = Shared()
 
 
 def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Caster:
@@ -212,7 +221,8 @@ class World:
             self.region = region
             return
         old, kept = self._tiles, self._tiles.keys() & set(ranks)
-        self._tiles = {rank: old[rank] if rank in kept else self._read(rank) for rank in ranks}
+        self._tiles = {rank: old[rank] if rank in kept else self._tile(rank) for rank in ranks}
+        _TILES.keep(self._tiles.values())
         self.region = region
         self._concatenate_tables()
         self.caster.update(
@@ -316,6 +326,11 @@ class World:
             refiners.append(GroundRefiner(joined_ground(rough, count=count)))
         return refiners
 
+    def _tile(self, rank: int) -> _Tile:
+        # a tile holds its scene, so no other scene has the same number
+        key = id(self.scene), rank, self.settings, *self.caster.origin.tolist()
+        return _TILES.get(key, partial(self._read, rank))
+
     def _read(self, rank: int) -> _Tile:
         tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._named)
         mesh, copies = tile.mesh, tile.instances
@@ -332,6 +347,7 @@ class World:
             surfaces = Surfaces.concatenate([surfaces, added])
             centre = np.concatenate([centre, np.zeros((len(added), 3))])
         return _Tile(
+            self.scene,
             {_PARTS * rank + k: part for k, part in enumerate(parts)},
             surfaces,
             walls,
