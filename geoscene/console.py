@@ -28,9 +28,9 @@ from geoscene.storage import url_of
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: success, failure, unusable input or options."""
 
-_COLLECTED = (100_000, 50, 50)
+_COLLECTED = (500_000, 50, 50)
 """Thresholds of Python's search for cyclic garbage: with its defaults it takes a tenth of a build, whose many
-objects are kept."""
+objects are kept. The first is more than what programs import and short drives make."""
 
 _THREADS = "OPENBLAS_NUM_THREADS"
 """Environment variable of NumPy and SciPy, which are imported later: threads of their linear algebra wait
