@@ -160,6 +160,18 @@ def test_following_keeps_only_the_tiles_around(scene):
         assert world.caster.cast([x, 50, 3], DOWN).range == pytest.approx(3)
 
 
+def test_worlds_read_the_tiles_of_an_open_scene_once(scene, monkeypatch):
+    read, ranks = World._read, []
+    monkeypatch.setattr(World, "_read", lambda self, rank: ranks.append(rank) or read(self, rank))
+    opened = open_scene(scene.path)
+    for x in (110.0, 150.0, 180.0):
+        World.load(opened, region=(x, 50, x, 60))
+    assert len(ranks) == len(set(ranks)) > 1
+    World.load(opened, region=(110, 50, 110, 60), settings=WorldSettings(trees=False))
+    World.load(open_scene(scene.path), region=(110, 50, 110, 60))  # which may be another by now
+    assert len(ranks) > len(set(ranks))
+
+
 @pytest.mark.parametrize(("settings", "x"), [({}, 40960.0), ({"origin": "scene"}, 0.0)])
 def test_ranges_stay_exact_over_long_drives(tmp_path, settings, x):
     files = SceneFiles(tmp_path)
