@@ -7,8 +7,7 @@ import shapely
 
 from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.mesh import Mesh
-from geoscene.structures.bodies import body, swept, upright
+from geoscene.structures.bodies import Bodies, between_rings, swept, uprights
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.lining import (
     GAP,
@@ -26,7 +25,6 @@ from geoscene.structures.tubes import (
     mouths,
     place_in_tunnel,
     random_shares,
-    rectangle,
     stations_every,
 )
 from geoscene.typing import Bools, Float
@@ -51,23 +49,20 @@ _TRAY, _TRAY_DOWN, _TRAY_STEP, _TRAY_LEAST = (0.3, 0.08), 1.0, 2.0, 3
 the least number of its bends and ends."""
 
 
-def lamps(table: Structures, k: int) -> list[Mesh]:
+def lamps(table: Structures, k: int) -> Bodies:
     """A row of lamps over the middle of the carriageway."""
     if slopes_across(table, k):
-        return []
+        return Bodies.empty()
     length, width, tall = _LAMP
     stations, _ = stations_every(table, k, spacing=between(_LAMPS, random_shares(table, k, count=5)[4]))
     stations = np.clip(stations, length, max(polylines.length(table.line[k]) - length, length))
     walls = Walls.of(table, k, stations=stations)
     clear = _clear_of_ribs(table, k, stations=stations, reach=length / 2)
-    out = []
-    for row in np.flatnonzero(np.isfinite(walls.metres).all(axis=1) & clear).tolist():
-        foot = shapely.get_coordinates(
-            rectangle(walls, row, side=0, along=(-length / 2, length / 2), across=(-width / 2, width / 2))
-        )[:4]
-        top = float(table.rise[k]) - UNDER
-        out.append(upright(table, k, foot=foot, low=top - tall, top=top, klass=Class.POLE, material="metal"))
-    return out
+    rows = np.flatnonzero(np.isfinite(walls.metres).all(axis=1) & clear)
+    across = (np.array(-width / 2), np.array(width / 2))
+    feet = walls.rectangles(rows=rows, side=0, along=(-length / 2, length / 2), across=across)
+    top = float(table.rise[k]) - UNDER
+    return uprights(table, k, feet=feet, low=top - tall, top=top, klass=Class.POLE, material="metal")
 
 
 def _clear_of_ribs(table: Structures, k: int, *, stations: Float, reach: float) -> Bools:
@@ -79,51 +74,37 @@ def _clear_of_ribs(table: Structures, k: int, *, stations: Float, reach: float) 
     return clear
 
 
-def signs(table: Structures, k: int) -> list[Mesh]:
+def signs(table: Structures, k: int) -> Bodies:
     """Signs of escape routes on both walls, and one across over each niche."""
     stations, _ = stations_every(table, k, spacing=_SIGNS)
     niche_at, niche_side = niche_stations(table, k)
-    signs = [(float(s), side, _SIGN, 1.0, True) for s in stations for side in (0, 1)]
-    signs += [
-        (float(s), int(side), _SOS, NICHE + 0.3, False) for s, side in zip(niche_at, niche_side, strict=True)
-    ]
-    if not signs:
-        return []
-    at = np.array([sign[0] for sign in signs])
+    escape = np.repeat([True, False], [2 * len(stations), len(niche_at)])
+    at = np.concatenate([np.repeat(stations, 2), niche_at])
+    side = np.concatenate([np.tile([0, 1], len(stations)), niche_side])
     walls = Walls.of(table, k, stations=at)
-    clear = _clear_of_ribs(table, k, stations=at, reach=0.3) & np.isfinite(
-        walls.metres[np.arange(len(at)), [sign[1] for sign in signs]]
-    )
-    clear &= (np.abs(at[:, None] - niche_at) > NICHE_WIDTH).all(axis=1) | (
-        np.arange(len(at)) >= 2 * len(stations)
-    )
+    away = walls.metres[np.arange(len(at)), side] - GAP
+    clear = _clear_of_ribs(table, k, stations=at, reach=0.3) & np.isfinite(away)
+    clear &= (np.abs(at[:, None] - niche_at) > NICHE_WIDTH).all(axis=1) | ~escape
     room = table.inner[k].buffer(-GAP / 2, join_style="mitre")
-    out = []
-    for row in np.flatnonzero(clear).tolist():
-        _, side, (thick, wide, tall), low, flat = signs[row]
-        away = walls.metres[row, side] - GAP
+    shapely.prepare(room)
+    made = []
+    for flat, (thick, wide, tall), low in ((True, _SIGN, 1.0), (False, _SOS, NICHE + 0.3)):
+        rows = np.flatnonzero(clear & (escape == flat))
         along, across = (wide / 2, thick) if flat else (thick / 2, wide)
-        foot = rectangle(walls, row, side=side, along=(-along, along), across=(away - across, away))
-        if room.contains(foot):
-            corners = shapely.get_coordinates(foot)[:4]
-            out.append(
-                upright(
-                    table,
-                    k,
-                    foot=corners,
-                    low=low,
-                    top=low + tall,
-                    klass=Class.TRAFFIC_SIGN,
-                    material="metal",
-                )
-            )
-    return out
+        feet = walls.rectangles(
+            rows=rows, side=side[rows], along=(-along, along), across=(away[rows] - across, away[rows])
+        )
+        feet = feet[room.contains(shapely.polygons(feet))]
+        made.append(
+            uprights(table, k, feet=feet, low=low, top=low + tall, klass=Class.TRAFFIC_SIGN, material="metal")
+        )
+    return Bodies.joined(made)
 
 
-def fans(table: Structures, k: int) -> list[Mesh]:
+def fans(table: Structures, k: int) -> Bodies:
     """Pairs of jet fans under the ceiling, over the walkways of long tunnels."""
     if place_in_tunnel(table, k)[1] < _FAN_FROM or slopes_across(table, k):
-        return []
+        return Bodies.empty()
     stations, _ = stations_every(table, k, spacing=_FANS)
     clear = _clear_of_ribs(table, k, stations=stations, reach=_FAN_LENGTH / 2)
     spacing = rib_form(table, k).spacing
@@ -132,39 +113,28 @@ def fans(table: Structures, k: int) -> list[Mesh]:
     inside = (stations > _FAN_LENGTH) & (stations < polylines.length(table.line[k]) - _FAN_LENGTH)
     stations = stations[inside & _clear_of_ribs(table, k, stations=stations, reach=_FAN_LENGTH / 2)]
     walls = Walls.of(table, k, stations=stations)
-    around = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    caps = np.array([[0, j, j + 1] for j in range(1, 11)])
+    middle = walls.metres - GAP - _FAN / 2 - 0.05
+    rows, side = np.nonzero(np.isfinite(middle))
+    middle, half = middle[rows, side], _FAN_LENGTH / 2
+    plans = walls.rectangles(
+        rows=rows, side=side, along=(-half, half), across=(middle - _FAN / 2, middle + _FAN / 2)
+    )
     room = table.inner[k].buffer(-GAP / 2, join_style="mitre")
-    out = []
-    for row in range(len(stations)):
-        for side, sign in ((0, 1.0), (1, -1.0)):
-            middle = walls.metres[row, side] - GAP - _FAN / 2 - 0.05
-            if np.isnan(middle):
-                continue
-            half = _FAN_LENGTH / 2
-            plan = rectangle(
-                walls, row, side=side, along=(-half, half), across=(middle - _FAN / 2, middle + _FAN / 2)
-            )
-            if not room.contains(plan):
-                continue
-            rings = []
-            for ahead in (-half, half):
-                centre = walls.at[row] + ahead * walls.along[row] + sign * middle * walls.left(row)
-                z = (
-                    float(surface_heights(table, k, xy=centre[None])[0])
-                    + table.rise[k]
-                    - _FAN_DOWN
-                    - _FAN / 2
-                )
-                left = walls.left(row) * _FAN / 2
-                rings.append(
-                    np.column_stack([centre + np.cos(around)[:, None] * left, z + np.sin(around) * _FAN / 2])
-                )
-            out.append(body(table, k, rings=rings, caps=caps, material="metal"))
-    return out
+    fits = room.contains(shapely.polygons(plans))
+    rows, side, middle = rows[fits], side[fits], middle[fits]
+    ahead = np.array([-half, half])[:, None] * walls.along[rows, None]
+    centre = walls.at[rows, None] + ahead + (middle[:, None] * walls.outwards[rows, side])[:, None]
+    z = surface_heights(table, k, xy=centre.reshape(-1, 2)).reshape(-1, 2, 1)
+    z = z + table.rise[k] - _FAN_DOWN - _FAN / 2
+    around = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    left = walls.outwards[rows, None, None, 0] * _FAN / 2
+    xy = centre[:, :, None] + np.cos(around)[:, None] * left
+    rings = np.concatenate([xy, (z + np.sin(around) * _FAN / 2)[..., None]], axis=-1)
+    caps = np.array([[0, j, j + 1] for j in range(1, 11)])
+    return between_rings(table, k, rings=rings, caps=caps, material="metal")
 
 
-def trays(table: Structures, k: int) -> list[Mesh]:
+def trays(table: Structures, k: int) -> Bodies:
     """Cable trays along the right wall, between the ribs' insides and the carriageway's clearance."""
     length = polylines.length(table.line[k])
     deep = rib_form(table, k).depth
@@ -174,7 +144,7 @@ def trays(table: Structures, k: int) -> list[Mesh]:
     away = walls.metres[:, 1] - deep - 3 * GAP
     rings = []
     for low, across in ((-tall, 0.0), (0.0, 0.0), (0.0, width), (-tall, width)):
-        xy = walls.at - (away - across)[:, None] * walls.left()
+        xy = walls.at - (away - across)[:, None] * walls.outwards[:, 0]
         z = surface_heights(table, k, xy=np.nan_to_num(xy)) + table.rise[k] - deep - _TRAY_DOWN + low
         rings.append(np.column_stack([xy, z]))
     corners = np.stack(rings, axis=1)  # (stops, 4, 3)
@@ -183,11 +153,11 @@ def trays(table: Structures, k: int) -> list[Mesh]:
     joined = whole[:-1] & whole[1:] & (np.abs(np.diff(away)) < width)
     runs = np.split(np.arange(len(stops)), np.flatnonzero(~joined) + 1)
     room = table.inner[k].buffer(-GAP / 2, join_style="mitre")
-    out = []
+    out = [Bodies.empty()]
     for run in runs:
         if len(run) < _TRAY_LEAST:
             continue
         plan = shapely.Polygon(np.concatenate([corners[run, 1, :2], corners[run[::-1], 2, :2]]))
         if plan.is_valid and room.contains(plan):
             out.append(swept(table, k, rings=corners[run]))
-    return out
+    return Bodies.joined(out)

@@ -5,18 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 
 from geoscene.intersections import close_faces
 from geoscene.mesh import Mesh, concatenate
+from geoscene.structures.bodies import Bodies
 from geoscene.structures.equipment import fans, lamps, signs, trays
 from geoscene.structures.lining import portals, ribs
 from geoscene.structures.table import Structures
 from geoscene.structures.tubes import has_walkway
 from geoscene.typing import Bools
 from geoscene.watertight import grid_cells, weld
-
-_LINING = {"portals": portals, "ribs": ribs}
-"""Makers of the bodies that tunnels have without equipment, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,37 +32,38 @@ class Fittings:
     counts: dict[str, int]
 
 
-def tunnel_fittings(table: Structures, k: int, *, tube: Mesh, equipment: bool) -> Fittings:
+def tunnel_fittings(
+    table: Structures, k: int, *, tube: Mesh, driven: shapely.Geometry, equipment: bool
+) -> Fittings:
     """Ribs and portals of tunnel piece ``k``, with ``equipment`` also lamps, signs, jet fans and cable trays.
 
-    tube : the piece's own solid; what would cross it, or something before it in this order, is left out
+    tube   : the piece's own solid; what would cross it, or something before it in this order, is left out
+    driven : area that vehicles drive on
     """
-    makers = dict(_LINING)
+    made = {"portals": portals(table, k, driven=driven), "ribs": ribs(table, k, driven=driven)}
+    lining = len(made)
     if equipment and has_walkway(table, k):
-        makers |= {"lamps": lamps, "signs": signs, "fans": fans, "cable_trays": trays}
-    bodies, kinds = list[Mesh](), list[str]()
-    for kind, make in makers.items():
-        made = make(table, k)
-        bodies += made
-        kinds += [kind] * len(made)
+        made |= {"lamps": lamps(table, k), "signs": signs(table, k)}
+        made |= {"fans": fans(table, k), "cable_trays": trays(table, k)}
+    bodies = Bodies.joined(list(made.values()))
+    kind = np.repeat(np.arange(len(made)), [len(some) for some in made.values()])
     clear = _clear(tube, bodies)
-    kept = [row for row, free in enumerate(clear.tolist()) if free]
-    kinds = [kinds[row] for row in kept]
-    sizes = [len(bodies[row]) for row in kept]
+    bodies, kind = bodies.take(clear), kind[clear]
+    counts = zip(made, np.bincount(kind, minlength=len(made)).tolist(), strict=True)
     return Fittings(
-        concatenate([bodies[row] for row in kept]),
-        np.repeat([kind not in _LINING for kind in kinds], sizes).astype(np.bool_),
-        {kind: kinds.count(kind) for kind in makers if kind in kinds},
+        bodies.mesh,
+        np.repeat(kind >= lining, bodies.size),
+        {name: count for name, count in counts if count},
     )
 
 
-def _clear(tube: Mesh, bodies: list[Mesh]) -> Bools:
+def _clear(tube: Mesh, bodies: Bodies) -> Bools:
     """Whether each of the bodies crosses neither the tube nor a body before it that is clear itself."""
     clear = np.ones(len(bodies), np.bool_)
-    if not bodies:
+    if not len(bodies):
         return clear
-    body = np.repeat(np.arange(-1, len(bodies)), [len(tube), *(len(mesh) for mesh in bodies)])
-    mesh = concatenate([tube, *bodies])
+    body = np.repeat(np.arange(-1, len(bodies)), [len(tube), *bodies.size])
+    mesh = concatenate([tube, bodies.mesh])
     corners = mesh.vertices[mesh.faces].reshape(-1, 3)
     ids, first = weld(corners, np.zeros(len(corners), np.int64))
     pairs, _ = close_faces(

@@ -6,15 +6,13 @@ which of them a tunnel has depends on its OSM id alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 
 from geoscene import polylines
-from geoscene.mesh import Mesh
-from geoscene.structures.bodies import body, upright
+from geoscene.structures.bodies import Bodies, between_rings, uprights
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.table import Structures
 from geoscene.structures.tubes import (
@@ -24,7 +22,6 @@ from geoscene.structures.tubes import (
     has_walkway,
     mouths,
     random_shares,
-    rectangle,
     stations_every,
 )
 from geoscene.typing import Float, Ints
@@ -63,33 +60,37 @@ class Lining:
 
     walkway : area within the walls beside carriageways
     niches  : areas cut into the walls
+    driven  : area that vehicles drive on, empty in pedestrian tunnels
     """
 
     walkway: shapely.Geometry
     niches: shapely.Geometry
+    driven: shapely.Geometry
 
 
 def read_lining(table: Structures, k: int) -> Lining:
     """Walkways and niches of tunnel piece ``k``; pedestrian tunnels have none."""
     if not has_walkway(table, k):
-        return Lining(shapely.Polygon(), shapely.Polygon())
-    walkway = table.inner[k].intersection(table.polygon[k]).difference(carriageway(table, k))
-    walkway = _tidy(walkway)
-    boxes = []
+        return Lining(shapely.Polygon(), shapely.Polygon(), shapely.Polygon())
+    driven = carriageway(table, k)
+    walkway = _tidy(table.inner[k].intersection(table.polygon[k]).difference(driven))
     stations, sides = niche_stations(table, k)
     walls = Walls.of(table, k, stations=stations)
+    away = walls.metres[np.arange(len(sides)), sides]
+    rows = np.flatnonzero(np.isfinite(away))
+    boxes = shapely.polygons(
+        walls.rectangles(
+            rows=rows,
+            side=sides[rows],
+            along=(-NICHE_WIDTH / 2, NICHE_WIDTH / 2),
+            across=(away[rows] - 0.3, away[rows] + _NICHE_DEPTH),
+        )
+    )
     solid = table.polygon[k].buffer(-_NICHE_WALL, join_style="mitre")
-    for row, side in enumerate(sides.tolist()):
-        away = walls.metres[row, side]
-        if np.isnan(away):
-            continue
-        box = rectangle(walls, row, side=side, along=(-NICHE_WIDTH / 2, NICHE_WIDTH / 2),
-                    across=(away - 0.3, away + _NICHE_DEPTH))  # fmt: skip
-        niche = box.intersection(solid).difference(table.inner[k])
-        whole = NICHE_WIDTH * _NICHE_DEPTH
-        if niche.area > 0.8 * whole and niche.geom_type == "Polygon":
-            boxes.append(niche)
-    return Lining(walkway, shapely.MultiPolygon(boxes))
+    niches = shapely.difference(shapely.intersection(boxes, solid), table.inner[k])
+    deep = shapely.area(niches) > 0.8 * NICHE_WIDTH * _NICHE_DEPTH
+    whole = shapely.get_type_id(niches) == shapely.GeometryType.POLYGON
+    return Lining(walkway, shapely.multipolygons(niches[deep & whole]), driven)
 
 
 def _tidy(shape: shapely.Geometry) -> shapely.Geometry:
@@ -123,7 +124,7 @@ def rib_form(table: Structures, k: int) -> RibForm:
     return RibForm(between(_RIBS, spacing), between(_RIB_WIDTH, width), out)
 
 
-def ribs(table: Structures, k: int) -> list[Mesh]:
+def ribs(table: Structures, k: int, *, driven: shapely.Geometry) -> Bodies:
     """Ribs along a piece, clear of its ends, its niches and its portals."""
     form = rib_form(table, k)
     stations, _ = stations_every(table, k, spacing=form.spacing)
@@ -131,13 +132,13 @@ def ribs(table: Structures, k: int) -> list[Mesh]:
     stations = stations[(stations > form.width) & (stations < length - form.width)]
     for others, room in ((mouths(table, k), 1.5), (_niches_along(table, k), NICHE_WIDTH / 2 + form.width)):
         stations = stations[(np.abs(stations[:, None] - others) > room).all(axis=1)]
-    return _frames(table, k, stations=stations, size=(form.width, form.depth))
+    return _frames(table, k, stations=stations, size=(form.width, form.depth), driven=driven)
 
 
-def portals(table: Structures, k: int) -> list[Mesh]:
+def portals(table: Structures, k: int, *, driven: shapely.Geometry) -> Bodies:
     """Frames at the mouths of a piece."""
     depth = _PORTAL_DEPTH if has_walkway(table, k) else _FOOT_DEPTH
-    return _frames(table, k, stations=mouths(table, k), size=(PORTAL_WIDTH, depth))
+    return _frames(table, k, stations=mouths(table, k), size=(PORTAL_WIDTH, depth), driven=driven)
 
 
 def _niches_along(table: Structures, k: int) -> Float:
@@ -150,7 +151,8 @@ def _frames(
     *,
     stations: Float,
     size: tuple[float, float],
-) -> list[Mesh]:
+    driven: shapely.Geometry,
+) -> Bodies:
     """A frame of two posts and a beam across the tunnel at each station.
 
     Posts alone where a wall is missing or the ceiling slopes across, none on the carriageway.
@@ -158,53 +160,51 @@ def _frames(
     size : metres along the tunnel, and from the wall
     """
     if not len(stations):
-        return []
+        return Bodies.empty()
     wide, deep = size
     walls = Walls.of(table, k, stations=stations)
-    ends = [walls.at + sign * wide / 2 * walls.along for sign in (-1.0, 1.0)]
-    reach = np.array([[walls.distance(table, k, points=end, side=side) for side in (0, 1)] for end in ends])
+    ahead = np.array([-wide / 2, wide / 2])
+    away = walls.beside(table, k, ahead=ahead)[..., None]
+    ends = (walls.at + ahead[:, None, None] * walls.along)[:, :, None]
+    outer = ends + (away - GAP) * walls.outwards
+    inner = outer - deep * walls.outwards
+    feet = np.stack([*outer, *inner[::-1]], axis=2)  # (stations, sides, 4, 2)
+    fits = np.isfinite(feet).all(axis=(2, 3))
+    areas = shapely.polygons(feet[fits])
     room = table.inner[k].buffer(-GAP / 2, join_style="mitre")
-    keep_out = carriageway(table, k) if has_walkway(table, k) else shapely.Polygon()
-    beams = not slopes_across(table, k)
-    out: list[Mesh] = []
-    for row in range(len(stations)):
-        feet: list[Float | None] = []
-        for side in (0, 1):
-            sign = 1.0 if side == 0 else -1.0
-            left = sign * walls.left(row)
-            outer = [
-                end[row] + (metres - GAP) * left
-                for end, metres in zip(ends, reach[:, side, row], strict=True)
-            ]
-            foot = np.array([*outer, *(p - deep * left for p in outer[::-1])])
-            fits = bool(np.isfinite(foot).all())
-            if fits:
-                area = shapely.Polygon(foot)
-                fits = bool(area.is_valid and room.contains(area) and not keep_out.intersects(area))
-            feet.append(foot if fits else None)
-        out += _frame(table, k, feet=feet, deep=deep, beams=beams)
-    return out
-
-
-def _frame(
-    table: Structures, k: int, *, feet: Sequence[Float | None], deep: float, beams: bool
-) -> list[Mesh]:
-    """A frame over the feet (4, 2) of its posts: outside at both ends, then inside at both, reversed."""
+    shapely.prepare([room, driven])
+    fits[fits] = shapely.is_valid(areas) & room.contains(areas) & ~driven.intersects(areas)
     low = WALKWAY + GAP if has_walkway(table, k) else GAP
-    left, right = feet
-    if left is not None and right is not None and beams:
-        sections = []
-        for end in (0, 1):
-            plan = np.array([left[end], left[end], right[end], right[end],
-                             right[3 - end], right[3 - end], left[3 - end], left[3 - end]])  # fmt: skip
-            floor = surface_heights(table, k, xy=plan)
-            top = table.rise[k] - UNDER
-            under = top - min(deep, _BEAM)
-            rise = np.array([low, top, top, low, low, under, under, low])
-            sections.append(np.column_stack([plan, floor + rise]))
-        return [body(table, k, rings=sections, caps=_ARCH)]
-    posts = [foot for foot in feet if foot is not None]
-    return [upright(table, k, foot=foot, low=low, top=float(table.rise[k]) - UNDER) for foot in posts]
+    top = float(table.rise[k]) - UNDER
+    arched = fits.all(axis=1) & (not slopes_across(table, k))
+    runs = np.split(np.arange(len(stations)), np.flatnonzero(np.diff(arched)) + 1)
+    return Bodies.joined(
+        [
+            _arches(table, k, feet=feet[run], levels=(low, top - min(deep, _BEAM), top))
+            if arched[run[0]]
+            else uprights(table, k, feet=feet[run][fits[run]], low=low, top=top)
+            for run in runs
+        ]
+    )
+
+
+def _arches(table: Structures, k: int, *, feet: Float, levels: tuple[float, float, float]) -> Bodies:
+    """Frames over the feet (n, 2, 4, 2) of their two posts: outside at both ends, then inside, reversed.
+
+    levels : metres above the carriageway of the posts' lower ends, the beam's underside and its top
+    """
+    low, under, top = levels
+    left, right = feet[:, 0], feet[:, 1]
+    sections = [
+        np.stack(
+            [left[:, end]] * 2 + [right[:, end]] * 2 + [right[:, 3 - end]] * 2 + [left[:, 3 - end]] * 2, 1
+        )
+        for end in (0, 1)
+    ]
+    plan = np.stack(sections, axis=1)
+    floor = surface_heights(table, k, xy=plan.reshape(-1, 2)).reshape(-1, 2, 8)
+    z = floor + np.array([low, top, top, low, low, under, under, low])
+    return between_rings(table, k, rings=np.concatenate([plan, z[..., None]], axis=-1), caps=_ARCH)
 
 
 _ARCH = np.array([[0, 1, 7], [1, 6, 7], [1, 2, 6], [2, 5, 6], [2, 3, 5], [3, 4, 5]])

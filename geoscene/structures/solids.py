@@ -112,7 +112,7 @@ def _solid(
     plain = np.zeros(len(body), np.bool_)
     if lining is None:
         return Built(body, plain, {})
-    fittings = tunnel_fittings(table, k, tube=body, equipment=options.equipment)
+    fittings = tunnel_fittings(table, k, tube=body, driven=lining.driven, equipment=options.equipment)
     areas = {"walkways": lining.walkway, "niches": lining.niches}
     parts = {name: 0 if area.is_empty else len(shapely.get_parts(area)) for name, area in areas.items()}
     guessed = {name: count for name, count in (parts | fittings.counts).items() if count}

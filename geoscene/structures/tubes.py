@@ -43,29 +43,56 @@ class Walls:
         along = polylines.unit(
             polylines.points_at(line, stations + 0.5) - polylines.points_at(line, stations - 0.5)
         )
-        walls = cls(at, along, np.full((len(at), 2), np.nan))
-        for side in (0, 1):
-            walls.metres[:, side] = walls.distance(table, k, points=at, side=side)
-        return walls
+        return cls(at, along, _metres_to_walls(table, k, points=at, along=along))
 
-    def left(self, row: int | slice = slice(None)) -> Float:
-        """Unit vectors to the left of the line."""
-        along = self.along[row]
-        return np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    @property
+    def outwards(self) -> Float:
+        """Unit vectors (n, 2, 2) to the left and to the right of the line."""
+        return _outwards(self.along)
 
-    def distance(self, table: Structures, k: int, *, points: Float, side: int) -> Float:
-        """Metres (n,) from points (n, 2) to the wall on a side of the line, NaN where there is none."""
-        reach = 2.0 * float(table.half[k]) + 2.0
-        far = points + (reach if side == 0 else -reach) * self.left()
-        rays = shapely.linestrings(np.stack([points, far], axis=1))
-        hits = shapely.intersection(rays, table.inner[k].boundary)
-        metres: Float = shapely.distance(shapely.points(points), hits)
-        hit = points + np.where(side == 0, metres, -metres)[:, None] * self.left()
-        missing = np.isnan(metres)
-        hit[missing] = 0.0
-        in_wall = shapely.dwithin(table.polygon[k], shapely.points(hit), 1e-6)
-        inside = shapely.intersects_xy(table.inner[k], *points.T)
-        return np.where(in_wall & inside & ~missing, metres, np.nan)
+    def beside(self, table: Structures, k: int, *, ahead: Float) -> Float:
+        """Metres (j, n, 2) to the walls of piece ``k`` from points so many metres (j,) ahead of each one."""
+        points = self.at + ahead[:, None, None] * self.along
+        return _metres_to_walls(table, k, points=points, along=self.along)
+
+    def rectangles(
+        self, *, rows: Ints, side: Ints | int, along: tuple[float, float], across: tuple[Float, Float]
+    ) -> Float:
+        """Corners (k, 4, 2) of rectangles beside points (k,): metres along the line, and from it to a side.
+
+        along  : both ends of all
+        across : both ends (k,) of each, or of all
+        """
+        outwards = self.outwards[rows, side]
+        return np.stack(
+            [
+                self.at[rows] + along[a] * self.along[rows] + np.reshape(across[b], (-1, 1)) * outwards
+                for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))
+            ],
+            axis=1,
+        )
+
+
+def _outwards(along: Float) -> Float:
+    """Unit vectors (n, 2, 2) to the left and to the right of unit vectors (n, 2)."""
+    left = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    return np.stack([left, -left], axis=1)
+
+
+def _metres_to_walls(table: Structures, k: int, *, points: Float, along: Float) -> Float:
+    """Metres (..., n, 2) from points (..., n, 2) to the walls at both sides, NaN where there is none.
+
+    along : (n, 2) unit vectors along the line
+    """
+    outwards = _outwards(along)
+    start = np.broadcast_to(points[..., None, :], (*points.shape[:-1], 2, 2))
+    rays = shapely.linestrings(np.stack([start, start + (2.0 * table.half[k] + 2.0) * outwards], axis=-2))
+    hits = shapely.intersection(rays, table.inner[k].boundary)
+    metres: Float = shapely.distance(shapely.points(start), hits)
+    hit = shapely.points(start + np.nan_to_num(metres)[..., None] * outwards)
+    in_wall = shapely.dwithin(table.polygon[k], hit, 1e-6)
+    inside = shapely.intersects_xy(table.inner[k], points[..., 0], points[..., 1])
+    return np.where(in_wall & inside[..., None], metres, np.nan)
 
 
 def has_walkway(table: Structures, k: int) -> bool:
@@ -124,13 +151,3 @@ def mouths(table: Structures, k: int) -> Float:
             if shapely.dwithin(approach, shapely.Point(end[:2]), 0.5) and length > 4 * MOUTH
         ]
     )
-
-
-def rectangle(
-    walls: Walls, row: int, *, side: int, along: tuple[float, float], across: tuple[float, float]
-) -> shapely.Polygon:
-    """A rectangle beside a station, metres along the line and from it to a side."""
-    sign = 1.0 if side == 0 else -1.0
-    ahead, left = walls.along[row], sign * walls.left(row)
-    corners = [(along[0], across[0]), (along[1], across[0]), (along[1], across[1]), (along[0], across[1])]
-    return shapely.Polygon([walls.at[row] + a * ahead + b * left for a, b in corners])
