@@ -60,31 +60,23 @@ def close_faces(
     if not len(faces):
         return np.empty((0, 2), np.int64), np.empty(0, np.bool_)
     corners = cells[faces]
-    pairs = _near_pairs(corners, owner, body=body)
-    state = _meetings(corners - corners[0, 0], np.ascontiguousarray(faces, np.int64), pairs)
-    close = state > _APART
-    return pairs[close], state[close] == _CROSSING
-
-
-def _near_pairs(corners: Ints, owner: NDArray[np.integer], *, body: Ints | None) -> Ints:
-    """Pairs (k, 2) of triangles (m, 3, 3) of one owner, and of two bodies if given, whose boxes overlap.
-
-    The first of a pair has the smaller number; the pairs are sorted by the second, then by the first.
-    """
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    owners, of = np.unique(owner, return_inverse=True)
-    bottom, top = np.empty((2, len(owners), 3), np.int64)
-    bottom[of], top[of] = low, high  # each owner's of any of its faces, then of all
-    np.minimum.at(bottom, of, low)
-    np.maximum.at(top, of, high)
-    # along the longest side of each owner's box the fewest faces lie side by side
-    axes = (np.argmax(top - bottom, axis=1)[of, None] + np.arange(3)) % 3
-    low, high = (np.take_along_axis(ends, axes, axis=1) for ends in (low, high))
-    order = np.lexsort((low[:, 0], of))
-    low, high = (np.ascontiguousarray(ends[order].T) for ends in (low, high))
-    several = np.arange(len(of)) if body is None else body
-    pairs = np.sort(order[_swept(low, high, of[order], several[order])], axis=1)
-    return np.asarray(pairs[np.lexsort(pairs.T)], np.int64)
+    solid: Ints = owner.astype(np.int64)
+    low, high = _turned_boxes(corners, solid)
+    apart = solid * (high[0].max() - low[0].min() + 1)
+    low[0] += apart
+    high[0] += apart
+    order = np.argsort(low[0])
+    low, high = low.take(order, axis=1), high.take(order, axis=1)
+    found = _met(
+        low,
+        high,
+        order,
+        np.arange(len(faces)) if body is None else body,
+        corners - corners[0, 0],
+        np.ascontiguousarray(faces, np.int64),
+    )
+    found = found[np.lexsort(found.T[:2])]
+    return found[:, :2], found[:, 2] == _CROSSING
 
 
 _APART, _NEAR, _CROSSING = 0, 1, 2
@@ -113,24 +105,69 @@ def plan_axes(triangles: Ints | Float) -> Ints:
 
 
 @njit(cache=True, nogil=True)
-def _swept(low: Ints, high: Ints, owner: Ints, body: Ints) -> Ints:
-    """Pairs (k, 2) of boxes of one owner that overlap, of different bodies.
+def _turned_boxes(corners: Ints, owner: Ints) -> tuple[Ints, Ints]:
+    """Low and high ends (3, m) of the boxes of triangles, the longest axis of the owner's box first.
 
-    low, high : (3, m) ends of the boxes, sorted by owner, then by their low ends on the first axis
+    Along that the fewest faces lie side by side.
     """
-    count = low.shape[1]
-    found = np.empty((max(4 * count, 64), 2), np.int64)
+    count = len(corners)
+    low, high = np.empty((3, count), np.int64), np.empty((3, count), np.int64)
+    owners = owner.max() + 1
+    bottom, top = np.empty((owners, 3), np.int64), np.empty((owners, 3), np.int64)
+    known = np.zeros(owners, np.bool_)
+    for k in range(count):
+        of = owner[k]
+        for axis in range(3):
+            a, b, c = corners[k, 0, axis], corners[k, 1, axis], corners[k, 2, axis]
+            low[axis, k], high[axis, k] = min(a, b, c), max(a, b, c)
+            if not known[of] or low[axis, k] < bottom[of, axis]:
+                bottom[of, axis] = low[axis, k]
+            if not known[of] or high[axis, k] > top[of, axis]:
+                top[of, axis] = high[axis, k]
+        known[of] = True
+    for k in range(count):
+        first = np.argmax(top[owner[k]] - bottom[owner[k]])
+        for ends in (low, high):
+            x, y, z = ends[first, k], ends[(first + 1) % 3, k], ends[(first + 2) % 3, k]
+            ends[0, k], ends[1, k], ends[2, k] = x, y, z
+    return low, high
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _met(low: Ints, high: Ints, order: Ints, body: Ints, corners: Ints, faces: Ints) -> Ints:
+    """Pairs of triangles of one owner and of different bodies that are not apart, and how they meet: (k, 3).
+
+    The first of a pair has the smaller number.
+
+    low, high : (3, m) ends of the triangles' boxes, sorted by their low ends on the first axis, on which the
+                owners are set apart
+    order     : (m,) the triangle of each box
+    corners   : (m, 3, 3) grid steps of the triangles' corners
+    faces     : (m, 3) vertices of the triangles
+    """
+    count = len(corners)
+    planes = np.empty((count, 4, 4))
+    for k in range(count):
+        _find_planes(corners[k], planes[k])
+    found = np.empty((64, 3), np.int64)
     n = 0
+    same, turned = np.empty((3, 3), np.bool_), np.empty((3, 3), np.bool_)
     for i in range(count):
         x1, y0, y1, z0, z1 = high[0, i], low[1, i], high[1, i], low[2, i], high[2, i]
         for j in range(i + 1, count):
-            if low[0, j] > x1 or owner[j] != owner[i]:
+            if low[0, j] > x1:
                 break
-            if low[1, j] > y1 or high[1, j] < y0 or low[2, j] > z1 or high[2, j] < z0 or body[i] == body[j]:
+            if low[1, j] > y1 or high[1, j] < y0 or low[2, j] > z1 or high[2, j] < z0:
+                continue
+            a, b = min(order[i], order[j]), max(order[i], order[j])
+            if body[a] == body[b]:
+                continue
+            state = _meeting(a, b, corners, faces, planes, same, turned)
+            if state == _APART:
                 continue
             if n == len(found):
                 found = np.concatenate((found, np.empty_like(found)))
-            found[n, 0], found[n, 1] = i, j
+            found[n, 0], found[n, 1], found[n, 2] = a, b, state
             n += 1
     return found[:n]
 
@@ -145,32 +182,23 @@ def _distances(first: Ints, second: Ints, same: Bools) -> Float:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _meetings(corners: Ints, faces: Ints, pairs: Ints) -> NDArray[np.uint8]:
-    """How each pair (k, 2) of triangles lies to each other.
+def _meeting(a: int, b: int, corners: Ints, faces: Ints, planes: Float, same: Bools, turned: Bools) -> int:
+    """How two triangles lie to each other.
 
-    corners : (m, 3, 3) grid steps of the triangles' corners
-    faces   : (m, 3) vertices of the triangles
+    planes       : (m, 4, 4) of all triangles, from `_find_planes`
+    same, turned : (3, 3) room for the common corners
     """
-    planes = np.empty((len(corners), 4, 4))
-    for k in range(len(corners)):
-        _find_planes(corners[k], planes[k])
-    found = np.zeros(len(pairs), np.uint8)
-    same, turned = np.empty((3, 3), np.bool_), np.empty((3, 3), np.bool_)
-    for k in range(len(pairs)):
-        a, b = pairs[k]
-        one, two = corners[a], corners[b]
-        shared = np.int64(0)
-        for i in range(3):
-            for j in range(3):
-                same[i, j] = turned[j, i] = faces[a, i] == faces[b, j]
-                shared += same[i, j]
-        if _separated(planes[a], two, same) or _separated(planes[b], one, turned):
-            continue
-        if _intersect(one, two, same, turned, shared):
-            found[k] = _CROSSING
-        elif _distance(one, two, same) < CLEARANCE:
-            found[k] = _NEAR
-    return found
+    one, two = corners[a], corners[b]
+    shared = np.int64(0)
+    for i in range(3):
+        for j in range(3):
+            same[i, j] = turned[j, i] = faces[a, i] == faces[b, j]
+            shared += same[i, j]
+    if _separated(planes[a], two, same) or _separated(planes[b], one, turned):
+        return _APART
+    if _intersect(one, two, same, turned, shared):
+        return _CROSSING
+    return _NEAR if _distance(one, two, same) < CLEARANCE else _APART
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.compiled import njit
 from geoscene.intersections import close_faces
 from geoscene.mesh import Mesh
 from geoscene.typing import Bools, Float, Ints
@@ -97,15 +98,6 @@ class Verdict(Findings):
         return next((slug for slug, passed in checks if not passed), "")
 
 
-def _pair_ids(a: Ints, b: Ints) -> tuple[Ints, Ints]:
-    """Numbers 0..k-1 of the distinct pairs (a, b), and the first index of each."""
-    # a and b are ids or grid numbers, so the product stays below 2**63
-    low = b.min(initial=0)
-    key = a * (b.max(initial=0) - low + 1) + (b - low)
-    _, first, ids = np.unique(key, return_index=True, return_inverse=True)
-    return ids.astype(np.int64), first
-
-
 def weld(points: Float, owner: NDArray[np.integer], *, grid: float = GRID) -> tuple[Ints, Ints]:
     """Id (n,) of each point, equal for points of one owner in one grid cell, and the first point of each id.
 
@@ -132,9 +124,10 @@ def edge_uses(corners: Ints) -> tuple[Ints, Ints, Ints]:
               corner k + 1; the balance counts half-edges of one direction as +1, those of the other as -1.
     """
     start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    edge, first = _pair_ids(np.minimum(start, stop), np.maximum(start, stop))
-    uses = np.bincount(edge, minlength=len(first))
-    balance = np.bincount(edge, weights=np.sign(stop - start), minlength=len(first)).astype(np.int64)
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    # of ids, so the product stays below 2**63
+    _, edge, uses = np.unique(low * (high.max(initial=0) + 1) + high, return_inverse=True, return_counts=True)
+    balance = np.bincount(edge, weights=np.sign(stop - start), minlength=len(uses)).astype(np.int64)
     return edge, uses, balance
 
 
@@ -151,21 +144,44 @@ def corner_fans(corners: Ints) -> Ints:
 
     corners : (m, 3) welded vertex ids
     """
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+    return _fans(corners.ravel(), edge_uses(corners)[0])
 
-    edge, _, _ = edge_uses(corners)
+
+@njit(cache=True, nogil=True)
+def _fans(vertex: Ints, edge: Ints) -> Ints:
+    """The fans of corners (3 m,), given their vertices and the edges of their half-edges."""
     size = len(edge)
-    # the corners at the lower and at the upper end of each half-edge
-    start, stop = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    ends = np.stack([np.arange(size), np.arange(size).reshape(-1, 3)[:, [1, 2, 0]].ravel()])
-    ends = np.where(start < stop, ends, ends[::-1])
-    # an edge joins its faces at both ends
-    order = np.argsort(edge, kind="stable")
-    same = np.diff(edge[order]) == 0
-    a, b = ends[:, order[:-1][same]].ravel(), ends[:, order[1:][same]].ravel()
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(size, size))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    parent, first = np.arange(size), np.full(size, -1)
+    for half in range(size):
+        one = first[edge[half]]
+        if one < 0:
+            first[edge[half]] = half
+            continue
+        # an edge joins its faces at both ends
+        after, beyond = half - 2 if half % 3 == 2 else half + 1, one - 2 if one % 3 == 2 else one + 1
+        same = vertex[half] == vertex[one]
+        for a, b in ((half, one if same else beyond), (after, beyond if same else one)):
+            roots = _root(parent, a), _root(parent, b)
+            parent[max(roots)] = min(roots)
+    fan = np.empty(size, np.int64)
+    count = 0
+    for corner in range(size):
+        root = _root(parent, corner)
+        if root == corner:  # the first of its fan
+            fan[corner] = count
+            count += 1
+        else:
+            fan[corner] = fan[root]
+    return fan
+
+
+@njit(cache=True, nogil=True)
+def _root(parent: Ints, k: int) -> int:
+    """The root of a row in a forest; paths to it become shorter."""
+    while parent[k] != k:
+        parent[k] = parent[parent[k]]
+        k = parent[k]
+    return k
 
 
 def vertex_fans(corners: Ints) -> Ints:
