@@ -85,9 +85,11 @@ class Mesh:
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> Mesh:
         """The selected faces in the given order, and the vertices they use in their original order."""
         faces = self.faces[keep]
-        used, renumbered = np.unique(faces, return_inverse=True)
+        used = np.zeros(len(self.vertices), np.bool_)
+        used[faces] = True
+        number = np.cumsum(used, dtype=np.int32) - np.int32(1)
         columns = {name: getattr(self, name)[keep] for name in _COLUMNS}
-        return Mesh(self.vertices[used], renumbered.reshape(-1, 3).astype(np.int32), **columns)
+        return Mesh(self.vertices[used], number[faces], **columns)
 
     def shifted(self, offset: Sequence[float] | Float) -> Mesh:
         """The mesh with every vertex moved by ``offset`` (3,), metres."""

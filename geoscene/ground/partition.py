@@ -290,7 +290,10 @@ def _last_around(polygons: NDArray[np.object_], xy: Float) -> Ints:
         return last
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
-    parts, polygon = shapely.get_parts(polygons, return_index=True)
+    polygon = np.repeat(np.arange(len(polygons)), shapely.get_num_geometries(polygons))
+    several = shapely.get_type_id(polygons) == shapely.GeometryType.MULTIPOLYGON
+    parts = polygons[polygon]
+    parts[several[polygon]] = shapely.get_parts(polygons[several])  # copies, which few need
     rings, part = shapely.get_rings(parts, return_index=True)
     corners, ring = shapely.get_coordinates(rings, return_index=True)
     by_y = np.argsort(xy[:, 1])
@@ -489,10 +492,8 @@ def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
         use = todo[edges.cell] & (edges.other >= 0) & ~todo[edges.other]
         if not use.any():
             break
-        pair, nth = np.unique(
-            np.stack([edges.cell[use], edges.other[use]], axis=1), axis=0, return_inverse=True
-        )
-        shared = np.bincount(nth.reshape(-1), weights=length[use])
+        pair, nth = distinct_places(np.stack([edges.cell[use], edges.other[use]], axis=1))
+        shared = np.bincount(nth, weights=length[use])
         order = np.lexsort((-pair[:, 1], shared, pair[:, 0]))
         last = np.append(pair[order[1:], 0] != pair[order[:-1], 0], True)  # the longest border of each
         chosen = pair[order[last]]

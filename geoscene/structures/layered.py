@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.ground.snapping import distinct_places
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9
@@ -70,11 +71,8 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     cells = cells[shapely.contains_xy(area, inside[:, 0], inside[:, 1])]
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(cells))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    grid, faces = np.unique(
-        np.rint(corners.reshape(-1, 2) / PRECISION).astype(np.int64), axis=0, return_inverse=True
-    )
-    faces = faces.reshape(-1, 3)
-    plan = Plan(grid * PRECISION, faces.astype(np.int64))
+    grid, faces = distinct_places(np.rint(corners.reshape(-1, 2) / PRECISION).astype(np.int64))
+    plan = Plan(np.asarray(grid * PRECISION, float), faces.reshape(-1, 3))
     twice = _twice_areas(plan)  # of multiples of the grid, so it is exact
     faces = np.where((twice < 0)[:, None], plan.faces[:, ::-1], plan.faces)
     return without_slivers(Plan(plan.xy, faces[twice != 0]))

@@ -75,10 +75,16 @@ def make_openings(chosen: Chosen, styles: Styles, *, wall: Ints) -> tuple[Openin
     some = np.flatnonzero(chosen.kind != BLANK)
     rows = _openings(chosen.take(some), styles.take(wall[some]))
     whole = np.column_stack([_whole(getattr(rows, f.name)) for f in fields(Openings)])
-    _, first, which = np.unique(whole, axis=0, return_index=True, return_inverse=True)
+    # Few differ, of which only the first are sorted.
+    of_row: dict[bytes, int] = {}
+    same = np.array([of_row.setdefault(row.tobytes(), k) for k, row in enumerate(whole)], np.int64)
+    first = np.fromiter(of_row.values(), np.int64)
+    order = np.lexsort(whole[first].T[::-1])
+    place = np.empty(len(some), np.int64)
+    place[first[order]] = np.arange(len(first))
     index = np.full(len(wall), -1, np.int64)
-    index[some] = which.ravel()
-    return rows.take(first), index
+    index[some] = place[same]
+    return rows.take(first[order]), index
 
 
 def _whole(column: Float) -> Ints:
