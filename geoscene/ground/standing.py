@@ -10,6 +10,7 @@ import shapely
 from geoscene.classes import Class
 from geoscene.ground.kerbs import KERB
 from geoscene.ground.layers import SIDEWALKS
+from geoscene.ground.nearby import points_in_boxes
 from geoscene.ground.partition import GroundPlan, rows_at, values_at
 from geoscene.mesh import Mesh
 from geoscene.typing import Float, Height
@@ -30,17 +31,19 @@ def standing_height(plan: GroundPlan, height: Height | None, *, ground: Mesh | N
         return height
 
     @functools.cache
-    def floor() -> tuple[Float, shapely.STRtree]:
-        """Corners (m, 3, 3) of the faces to stand on, and a tree of them; few tiles need them."""
-        faces = None if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
-        corners = np.empty((0, 3, 3)) if faces is None else faces.vertices[faces.faces]
-        return corners, shapely.STRtree(shapely.polygons(corners[..., :2]) if len(corners) else [])
+    def floor() -> tuple[Float, Float]:
+        """Corners (m, 3, 3) of the faces to stand on, and their boxes (m, 4) in plan; few tiles need them."""
+        faces = Mesh.empty() if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
+        corners = faces.vertices[faces.faces]
+        return corners, np.hstack([corners[..., :2].min(axis=1), corners[..., :2].max(axis=1)])
 
     def standing(x: Float, y: Float) -> Float:
         xy = np.column_stack([x, y])
         z = np.zeros(len(xy)) if height is None else np.array(height(x, y), float)
-        corners, tree = floor()
-        point, face = tree.query(shapely.points(xy), predicate="intersects")
+        corners, boxes = floor()
+        point, face = points_in_boxes(xy, boxes, wider=0.0)
+        on = shapely.intersects_xy(shapely.polygons(corners[face][..., :2]), xy[point, 0], xy[point, 1])
+        point, face = point[on], face[on]
         beyond = np.setdiff1d(np.arange(len(xy)), point)
         priority = values_at(plan.layers.priority, rows_at(plan, xy[beyond]), base=-1.0)
         z[beyond] += np.where(priority == SIDEWALKS, KERB, 0.0)
