@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import shapely
@@ -106,43 +105,38 @@ def outlines(xy: Float, face: Ints, *, body: Ints, count: int) -> list[Polygons 
     edge, uses, _ = edge_uses(ids.reshape(-1, 3))
     open_ = np.flatnonzero(uses[edge] == 1)
     row, k = open_ // 3, open_ % 3
-    start, stop = ids[open_].tolist(), ids[3 * row + (k + 1) % 3].tolist()
-    onward = list(zip(stop, xy[row, k].tolist(), face[row].tolist(), strict=True))
-    ends = _ends(body[row], count).tolist()
-    return [_joined(start[a:b], onward[a:b]) for a, b in pairwise([0, *ends])]
+    ends = np.stack([ids[open_], ids[3 * row + (k + 1) % 3]], axis=1)
+    points, face = xy[row, k], face[row]
+    spans = pairwise([0, *_ends(body[row], count).tolist()])
+    return [_joined(ends[a:b], points[a:b], face=face[a:b]) for a, b in spans]
 
 
-def _joined(start: list[int], edges: list[tuple[int, list[float], int]]) -> Polygons | None:
-    """Polygons of edges from vertices, each with its other end, first point and face; None if invalid."""
-    onward = dict(zip(start, edges, strict=True))
-    if len(onward) < len(start):
+def _joined(ends: Ints, points: Float, *, face: Ints) -> Polygons | None:
+    """Polygons of edges between vertices (n, 2), each with its first point and face; None if invalid."""
+    onward = {start: (stop, edge) for edge, (start, stop) in enumerate(ends.tolist())}
+    if len(onward) < len(ends):
         return None
-    shells: list[Any] = []
-    holes: list[tuple[int, Any]] = []
-    owners: list[int] = []
+    rings: list[list[int]] = []
     while onward:
         first = at = next(iter(onward))
         ring = []
         while at in onward:
-            following, point, number = onward.pop(at)
-            ring.append(point)
-            at = following
+            at, edge = onward.pop(at)
+            ring.append(edge)
         if at != first or len(ring) < 3:
             return None
-        whole = shapely.Polygon(ring)
-        if shapely.is_ccw(whole.exterior):
-            shells.append(whole)
-            owners.append(number)
-        else:
-            holes.append((number, whole))
-    for number, hole in holes:
+        rings.append(ring)
+    whole = polygons_of(points, rings)
+    outer = shapely.is_ccw(shapely.get_exterior_ring(whole))
+    of = face[[ring[-1] for ring in rings]]
+    shells, owners = whole[outer], of[outer].tolist()
+    for number, hole in zip(of[~outer].tolist(), whole[~outer], strict=True):
         inside = [k for k, o in enumerate(owners) if o == number and shells[k].covers(hole)]
         if len(inside) != 1:
             return None
         k = inside[0]
         shells[k] = shapely.Polygon(shells[k].exterior, [*shells[k].interiors, hole.exterior.coords[::-1]])
-    polygons = np.array(shells, dtype=object)
-    return shapely.orient_polygons(polygons) if shapely.is_valid(polygons).all() else None
+    return shapely.orient_polygons(shells) if shapely.is_valid(shells).all() else None
 
 
 def filled(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:

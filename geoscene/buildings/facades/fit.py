@@ -158,15 +158,18 @@ def _enter(triangles: Float, *, low: Float, high: Float) -> Bools:
 
     Separating axes of a triangle and a box: Akenine-Moeller, "Fast 3D triangle-box overlap testing" (2001).
     """
-    corners = triangles - ((low + high) / 2)[:, None]
+    corners, half = triangles - ((low + high) / 2)[:, None], (high - low) / 2
+    beside = (corners.min(axis=1) > half) | (corners.max(axis=1) < -half)
+    enter: Bools = ~beside.any(axis=1)  # no axis of the box separates them
+    corners, half = corners[enter], half[enter]
     sides = np.roll(corners, -1, axis=1) - corners
     across = np.cross(sides[:, :, None], np.eye(3)).reshape(-1, 9, 3)
-    normal = np.cross(sides[:, :1], sides[:, 1:2])
-    axes = np.concatenate([np.broadcast_to(np.eye(3), (len(corners), 3, 3)), across, normal], axis=1)
-    reach = np.einsum("nij,nj->ni", np.abs(axes), (high - low) / 2)
+    axes = np.concatenate([across, np.cross(sides[:, :1], sides[:, 1:2])], axis=1)
+    reach = np.einsum("nij,nj->ni", np.abs(axes), half)
     along = np.einsum("nij,nkj->nik", axes, corners)
     apart = (along.min(axis=2) > reach) | (along.max(axis=2) < -reach)
-    return np.asarray(~apart.any(axis=1), np.bool_)
+    enter[enter] = ~apart.any(axis=1)
+    return enter
 
 
 class Sheet:
