@@ -25,6 +25,7 @@ _XMLNS = "http://graphml.graphdrawing.org/xmlns"
 _FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}
 _WKT_BLOCK = 256  # lines that are read at once: GEOS needs 20 kB for each meanwhile
 _UNPRINTABLE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ufffe\uffff]")
+_UNSAFE = re.compile(f"[&<>]|{_UNPRINTABLE.pattern}")
 
 
 def write_graphml(graph: RoadGraph, frame: Frame, *, path: Path) -> None:
@@ -73,10 +74,13 @@ def _with_keys(rows: Iterator[dict[str, str]]) -> tuple[list[str], Iterator[dict
 
 def _data(domain: str, row: Mapping[str, str], *, keys: Mapping[tuple[str, str], str]) -> str:
     return "".join(
-        f'<data key="{keys[domain, name]}">{escape(_UNPRINTABLE.sub("", value))}</data>'
-        for name, value in row.items()
-        if value
+        f'<data key="{keys[domain, name]}">{_text(value)}</data>' for name, value in row.items() if value
     )
+
+
+def _text(value: str) -> str:
+    """A value as text of an element; most have nothing to escape."""
+    return escape(_UNPRINTABLE.sub("", value)) if _UNSAFE.search(value) else value
 
 
 def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[str, str]]:
