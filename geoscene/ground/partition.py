@@ -18,6 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
+from geoscene.columns import row_blocks
 from geoscene.errors import InputError
 from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.faces import Faces, faces
@@ -45,6 +46,10 @@ They are what noding leaves on straight borders that hidden outlines cross; tile
 _AT_ONCE = 20_000
 """Polygons in which points are looked up at once."""
 
+_POLYGONS, _SEGMENTS = 4096, 65536
+"""Polygons whose outlines are read at once, and segments that are put into tiles at once: the copies that
+this takes would be most of the memory of a plan."""
+
 _FEW = 4
 """Points for which polygons are not taken apart."""
 
@@ -66,8 +71,8 @@ class GroundPlan:
     tree      : STRtree over their polygons
     base      : (class, material code) where no polygon lies
     start, end : (m, 2) float64 segments of all outlines, on the grid
-    string    : (m,) int64: segments of one outline that follow each other have the same number
-    order, offset : segments by square: those of square (i, j) are
+    string    : (m,) int32: segments of one outline that follow each other have the same number
+    order, offset : segments by square, (k,) int32 and (t + 1,) int64: those of square (i, j) are
                 ``order[offset[k]:offset[k + 1]]``, k its place in `tiles`
     tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
                 `geoscene.ground.joined` has joined it to others
@@ -87,8 +92,8 @@ class GroundPlan:
     base: tuple[int, int]
     start: Float
     end: Float
-    string: Ints
-    order: Ints
+    string: NDArray[np.int32]
+    order: NDArray[np.int32]
     offset: Ints
     tiles: Ints
     span: Ints
@@ -290,15 +295,11 @@ def _last_around(polygons: NDArray[np.object_], xy: Float) -> Ints:
         return last
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
-    polygon = np.repeat(np.arange(len(polygons)), shapely.get_num_geometries(polygons))
-    several = shapely.get_type_id(polygons) == shapely.GeometryType.MULTIPOLYGON
-    parts = polygons[polygon]
-    parts[several[polygon]] = shapely.get_parts(polygons[several])  # copies, which few need
-    rings, part = shapely.get_rings(parts, return_index=True)
+    rings, polygon = _rings(polygons)
     corners, ring = shapely.get_coordinates(rings, return_index=True)
     by_y = np.argsort(xy[:, 1])
     offset = np.searchsorted(ring, np.arange(len(rings) + 1))
-    best, point, of = kernels.last_around(xy[by_y], corners, offset, polygon[part])
+    best, point, of = kernels.last_around(xy[by_y], corners, offset, polygon)
     around = shapely.contains_xy(polygons[of], *xy[by_y[point]].T)
     np.maximum.at(best, point[around], of[around])
     last = np.empty_like(best)
@@ -324,36 +325,58 @@ def _snap(values: Float) -> Float:
     return np.round(values / PRECISION) * PRECISION
 
 
-def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, Ints]:
+def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, NDArray[np.int32]]:
     """Start and end (m, 2) of the outlines' segments near the box, on the grid, and their strings (m,)."""
-    rings = shapely.get_rings(shapely.get_parts(polygons))
-    coords, ring = shapely.get_coordinates(rings, return_index=True)
-    coords = _snap(coords)
-    start, end = coords[:-1], coords[1:]
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    keep = (
-        (ring[:-1] == ring[1:])
-        & (start != end).any(axis=1)
-        & (low <= box[2:] + _REACH).all(axis=1)
-        & (high >= box[:2] - _REACH).all(axis=1)
-    )
-    return start[keep], end[keep], ring[:-1][keep].astype(np.int64)
+    found, count = [], 0
+    for block in row_blocks(len(polygons), _POLYGONS):
+        rings, _ = _rings(polygons[block])
+        coords, ring = shapely.get_coordinates(rings, return_index=True)
+        coords = _snap(coords)
+        start, end = coords[:-1], coords[1:]
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        keep = (
+            (ring[:-1] == ring[1:])
+            & (start != end).any(axis=1)
+            & (low <= box[2:] + _REACH).all(axis=1)
+            & (high >= box[:2] - _REACH).all(axis=1)
+        )
+        found.append((start[keep], end[keep], (ring[:-1][keep] + count).astype(np.int32)))
+        count += len(rings)
+    start, end, string = (np.concatenate(column) for column in zip(*found, strict=True))
+    return start, end, string
 
 
-def _by_tile(start: Float, end: Float, *, low: Ints, count: Ints, tile_size: float) -> tuple[Ints, Ints]:
+def _rings(polygons: NDArray[np.object_]) -> tuple[NDArray[np.object_], Ints]:
+    """The rings of polygons, and the polygon of each; parts are copies, which single polygons do not need."""
+    polygon = np.repeat(np.arange(len(polygons)), shapely.get_num_geometries(polygons))
+    several = shapely.get_type_id(polygons) == shapely.GeometryType.MULTIPOLYGON
+    parts = polygons[polygon]
+    parts[several[polygon]] = shapely.get_parts(polygons[several])
+    rings, part = shapely.get_rings(parts, return_index=True)
+    return rings, polygon[part]
+
+
+def _by_tile(
+    start: Float, end: Float, *, low: Ints, count: Ints, tile_size: float
+) -> tuple[NDArray[np.int32], Ints]:
     """Segments by tile, in compressed rows: (order, offset)."""
-    first = np.floor((np.minimum(start, end) - _REACH) / tile_size).astype(np.int64) - low
-    last = np.floor((np.maximum(start, end) + _REACH) / tile_size).astype(np.int64) - low
-    first, last = np.clip(first, 0, count - 1), np.clip(last, 0, count - 1)
-    span = last - first + 1
-    copies = span[:, 0] * span[:, 1]
-    segment = np.repeat(np.arange(len(start)), copies)
-    nth = np.arange(len(segment)) - np.repeat(np.cumsum(copies) - copies, copies)
-    down, across = np.divmod(nth, span[segment, 0])
-    tile = (first[segment, 1] + down) * count[0] + first[segment, 0] + across
+    segments, tiles = [], []
+    for block in row_blocks(len(start), _SEGMENTS):
+        a, b = start[block], end[block]
+        first = np.floor((np.minimum(a, b) - _REACH) / tile_size).astype(np.int64) - low
+        last = np.floor((np.maximum(a, b) + _REACH) / tile_size).astype(np.int64) - low
+        first, last = np.clip(first, 0, count - 1), np.clip(last, 0, count - 1)
+        span = last - first + 1
+        copies = span[:, 0] * span[:, 1]
+        own = np.repeat(np.arange(len(a)), copies)
+        nth = np.arange(len(own)) - np.repeat(np.cumsum(copies) - copies, copies)
+        down, across = np.divmod(nth, span[own, 0])
+        segments.append((block.start + own).astype(np.int32))
+        tiles.append((first[own, 1] + down) * count[0] + first[own, 0] + across)
+    tile = np.concatenate(tiles)
     order = np.argsort(tile, kind="stable")
     offset = np.searchsorted(tile[order], np.arange(count[0] * count[1] + 1))
-    return segment[order], offset
+    return np.concatenate(segments)[order], offset
 
 
 def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
@@ -445,7 +468,7 @@ def _stops(
 
 
 def _cells(
-    plan: GroundPlan, outlines: Ints, *, ruling: list[Float], tile: tuple[int, int]
+    plan: GroundPlan, outlines: NDArray[np.int32], *, ruling: list[Float], tile: tuple[int, int]
 ) -> tuple[NDArray[np.object_], Ints, int]:
     """The cells of a tile: polygons, the row that each is of, and how many slivers joined a neighbour."""
     i, j = tile
@@ -459,7 +482,11 @@ def _cells(
 
 
 def _noded_faces(
-    plan: GroundPlan, outlines: Ints, *, ruling: list[Float], box: tuple[float, float, float, float]
+    plan: GroundPlan,
+    outlines: NDArray[np.int32],
+    *,
+    ruling: list[Float],
+    box: tuple[float, float, float, float],
 ) -> Faces:
     """The cells of a tile between segments of the outlines, its sides and the terrain's lines."""
     start = np.concatenate([plan.start[outlines], *(line[:-1] for line in ruling)])
