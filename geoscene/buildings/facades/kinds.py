@@ -77,7 +77,8 @@ def make_openings(chosen: Chosen, styles: Styles, *, wall: Ints) -> tuple[Openin
     whole = np.column_stack([_whole(getattr(rows, f.name)) for f in fields(Openings)])
     # Few differ, of which only the first are sorted.
     of_row: dict[bytes, int] = {}
-    same = np.array([of_row.setdefault(row.tobytes(), k) for k, row in enumerate(whole)], np.int64)
+    keys = whole.view(f"V{whole.itemsize * whole.shape[1]}").ravel().tolist()
+    same = np.array([of_row.setdefault(key, k) for k, key in enumerate(keys)], np.int64)
     first = np.fromiter(of_row.values(), np.int64)
     order = np.lexsort(whole[first].T[::-1])
     place = np.empty(len(some), np.int64)
