@@ -14,6 +14,8 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
+# Tests and benchmarks start many processes, each of which would compile the packages to bytecode.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test test-fast test-gpu fuzz bench bench-quick lint docs wheel-test clean
 
