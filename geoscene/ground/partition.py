@@ -349,7 +349,7 @@ def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, 
 def _rings(polygons: NDArray[np.object_]) -> tuple[NDArray[np.object_], Ints]:
     """The rings of polygons, and the polygon of each; parts are copies, which single polygons do not need."""
     polygon = np.repeat(np.arange(len(polygons)), shapely.get_num_geometries(polygons))
-    several = shapely.get_type_id(polygons) == shapely.GeometryType.MULTIPOLYGON
+    several = shapely.get_type_id(polygons) != shapely.GeometryType.POLYGON
     parts = polygons[polygon]
     parts[several[polygon]] = shapely.get_parts(polygons[several])
     rings, part = shapely.get_rings(parts, return_index=True)
