@@ -2,8 +2,8 @@
 
 They run one after the other in a folder with the files that they name, each once, unless a later one needs
 what it writes. Those for map servers, and those that serve or open a window, are only parsed. The bundled map
-is replaced by a part of it, drives end after 0.2 s and have no relief unless they ask for it, and surveys
-record 20 frames.
+is replaced by a part of it, drives end after 0.2 s and have no relief unless they ask for it, surveys record
+20 frames, and cameras have a sixteenth of their pixels. Sweeps have drives of 0.1 s with one seed.
 """
 
 import re
@@ -25,8 +25,12 @@ import geoscene.sources
 import geoscene.tradeoff.engine
 import lidar.cli
 import lidar.pipeline
+import lidar.rig.specs
 import lidar.simulation
+import lidar.tradeoff.accuracy
+import lidar.tradeoff.costs
 import lidar.tradeoff.engine
+import lidar.tradeoff.profile
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
@@ -98,8 +102,8 @@ def in_help(name):
 
 
 PAGES = [str(path.relative_to(ROOT)) for path in sorted([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])]
-SUCCEEDED: set[tuple[str, ...]] = set()
-"""Commands that were run; repeated only where a later one needs what they write."""
+SUCCEEDED: set[str] = set()
+"""Commands that were run, with all options; repeated only where a later one needs what they write."""
 SOURCES = [page for page in PAGES if in_page(page)] + ["geoscene --help", "lidar --help"]
 
 
@@ -117,17 +121,15 @@ def inputs(tmp_path_factory):
     write_overture(folder / "buildings.parquet", rows)
     write_slope(folder / "heights.tif", BOX, rise=0.3)
     write_survey(folder / "survey.laz", BOX)
-    stages = (ROOT / "docs" / "stages.md").read_text("utf-8").split("```toml")[1].split("```")[0]
-    sweep = (ROOT / "docs" / "sweeps.md").read_text("utf-8").split("```toml")[1].split("```")[0]
-    sweep = sweep.replace("duration = 20", "duration = 0.1").replace("seed = [1, 2, 3]", "seed = [1]")
-    matrix = (ROOT / "docs" / "security.md").read_text("utf-8").split("```toml")[1].split("```")[0]
-    matrix = matrix.replace("duration = 5", "duration = 0.1").replace("seed = [1, 2]", "seed = [1]")
+    pages = [(ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("stages", "sweeps", "security")]
+    stages, sweep, matrix = (page.split("```toml")[1].split("```")[0] for page in pages)
     texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
-    texts |= {"sweep.toml": sweep, "matrix.toml": matrix}
+    texts |= {"sweep.toml": brief(sweep), "matrix.toml": brief(matrix)}
     texts |= {"secret.key": "00" * 32, "private.pem": PRIVATE_KEY, "public.pem": PUBLIC_KEY}
+    shutil.copytree(ROOT / "examples", folder / "examples")
+    texts["examples/redteam.toml"] = brief((folder / "examples" / "redteam.toml").read_text("utf-8"))
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
-    shutil.copytree(ROOT / "examples", folder / "examples")
     for name in ("scene", "city"):
         scene = build(osm, folder / name)
     options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
@@ -146,6 +148,7 @@ def folder(inputs, tmp_path, monkeypatch):
     """A folder with copies of the input files; drives that are run here are short."""
     folder = tmp_path / "work"
     shutil.copytree(inputs, folder)
+    monkeypatch.chdir(folder)
     monkeypatch.setattr(geoscene.sources, "demo_path", lambda: folder / "city.osm.pbf")
     drive, record_all = lidar.pipeline.drive, lidar.pipeline.record_all
 
@@ -169,11 +172,55 @@ def folder(inputs, tmp_path, monkeypatch):
         "tradeoff",
         lambda *args, **more: builds(*args, **more | {"settings": ("lod",)}),
     )
+    plan, peaks = lidar.tradeoff.accuracy.plan_drive, lidar.tradeoff.costs.peaks
+    camera = lidar.rig.specs._camera
+    monkeypatch.setattr(
+        lidar.tradeoff.accuracy,
+        "plan_drive",
+        lambda scene, options, **more: plan(scene, replace(options, duration=0.2), **more),
+    )
+    monkeypatch.setattr(lidar.tradeoff.profile, "RAYS", (1, 7, 19, 127))
+    # each takes a process: one stands for all
+    monkeypatch.setattr(lidar.tradeoff.costs, "peaks", lambda tasks: peaks(tasks[:1]) * len(tasks))
+    monkeypatch.setattr(lidar.rig.specs, "_camera", lambda table: smaller(camera(table)))
     measure_little(monkeypatch, folder=tmp_path / "profiles")
     monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
     monkeypatch.setattr(lidar.pipeline, "drive", short)
     monkeypatch.setattr(lidar.pipeline, "record_all", first)
     return folder
+
+
+def is_only_parsed(words):
+    return bool(ONLY_PARSED & set(words) or re.search("sumo|s3://", " ".join(words)))
+
+
+def read_by(command):
+    """Files and folders of the current folder that a command may read."""
+    _, _, *words = command
+    written = words.index("-o") + 1 if "-o" in words else None
+    words = [word for k, word in enumerate(words) if k != written]
+    return [] if is_only_parsed(words) else [word.split("/")[0] for word in words]
+
+
+def brief(grid):
+    """A file of a sweep or a matrix with drives of 0.1 s and one seed."""
+    grid, durations = re.subn(r"duration = \d+", "duration = 0.1", grid)
+    grid, seeds = re.subn(r"seed = \[.*\]", "seed = [1]", grid)
+    assert durations == seeds == 1
+    return grid
+
+
+def smaller(camera):
+    """A camera with a sixteenth of the pixels and the same field of view."""
+    return replace(
+        camera,
+        width=camera.width // 4,
+        height=camera.height // 4,
+        fx=camera.fx / 4,
+        fy=camera.fy / 4,
+        cx=(camera.cx + 0.5) / 4 - 0.5,
+        cy=(camera.cy + 0.5) / 4 - 0.5,
+    )
 
 
 def inside(box, node):
@@ -184,13 +231,14 @@ def inside(box, node):
 def test_documented_commands_succeed(source, folder):
     found = in_help(source.split()[0]) if source.endswith("--help") else in_page(source)
     for number, (program, *words) in enumerate(found):
-        named = (program, *words)
-        later = [word for command in found[number + 1 :] for word in command]
-        out = words[words.index("-o") + 1] if "-o" in words else ""
-        if named in SUCCEEDED and not (out and any(word.startswith(out) for word in later)):
+        _, bound, _ = APPS[program].parse_args(words, exit_on_error=False, print_error=False)
+        if is_only_parsed(words):
             continue
-        if ONLY_PARSED & set(words) or re.search("sumo|s3://", " ".join(words)):
-            APPS[program].parse_args(words, exit_on_error=False, print_error=False)
+        bound.apply_defaults()
+        named = f"{program} {words[0]} {bound}"
+        out = words[words.index("-o") + 1] if "-o" in words else ""
+        later = [word for command in found[number + 1 :] for word in read_by(command)]
+        if named in SUCCEEDED and out not in later:
             continue
         if words[0] in ("build", "drive"):
             shutil.rmtree(folder / words[words.index("-o") + 1], ignore_errors=True)
@@ -199,8 +247,8 @@ def test_documented_commands_succeed(source, folder):
         if words[0] == "build" and "--demo" in words:  # runs in another process
             words += ["--bbox", ",".join(map(str, BOX))]
         (folder / "map.laz").unlink(missing_ok=True)
-        # builds fork workers: from a process of their own, as users run them, not one with others' threads
-        run = run_process if words[0] == "build" else run_program
+        # they fork workers: from a process of their own, as users run them, not one with others' threads
+        run = run_process if words[0] in ("build", "redteam", "sweep") else run_program
         done = run(program, *words, cwd=folder)
         assert done.returncode == 0, (program, words, done.stderr)
         SUCCEEDED.add(named)
@@ -213,7 +261,6 @@ def test_examples_in_python_succeed(page, folder, monkeypatch):
     assert examples
     for name in ("scene", "drive"):  # the examples write them
         shutil.rmtree(folder / name)
-    monkeypatch.chdir(folder)
     monkeypatch.setattr(geoscene, "demo_path", geoscene.sources.demo_path)
     monkeypatch.setattr(lidar, "drive", lidar.pipeline.drive)
     simulate = lidar.simulation.simulate
