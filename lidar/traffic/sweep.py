@@ -108,21 +108,24 @@ def _cover(xy: Any, heading: Any, half: Any, level: Any, most: int) -> Any:
     n = len(xy)
     cell = np.empty(most + 64 * n, np.int64)
     first, last = np.empty(len(cell), np.int32), np.empty(len(cell), np.int32)
-    under = np.empty(most, np.int64)
-    seen = {np.int64(-1): 0}  # row of each cell last seen
-    count = 0
+    under, before = np.empty(most, np.int64), np.empty(most, np.int64)  # ascending, as `cells_under` goes
+    row, row_before = np.empty(most, np.int64), np.empty(most, np.int64)
+    count = known = 0
     for k in range(n):
         found = cells_under(xy[k, 0], xy[k, 1], heading[k], half, level[k], under)
         if count + found > len(cell):
             cell = np.concatenate((cell, np.empty_like(cell)))
             first, last = np.concatenate((first, first)), np.concatenate((last, last))
+        b = 0
         for m in range(found):
             p = under[m]
-            row = seen[p] if p in seen else -1  # noqa: SIM401  (numba's would be optional)
-            if row >= 0 and last[row] == k - 1:
-                last[row] = k
+            while b < known and before[b] < p:
+                b += 1
+            if b < known and before[b] == p:
+                row[m] = row_before[b]
             else:
-                cell[count], first[count], last[count] = p, k, k
-                seen[p] = count
+                cell[count], first[count], row[m] = p, k, count
                 count += 1
+            last[row[m]] = k
+        under, before, row, row_before, known = before, under, row_before, row, found
     return cell, first, last, count
