@@ -13,7 +13,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
-PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile
+# Files start in the order of tests/conftest.py, the slow ones first.
+PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 # Tests and benchmarks start many processes, each of which would compile the packages to bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 

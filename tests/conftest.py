@@ -47,10 +47,14 @@ SLOW = frozenset(
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark slow tests, and multiply the examples of property tests under ``--hypothesis-profile=fuzz``."""
+    """Mark slow tests, multiply the examples of property tests under ``--hypothesis-profile=fuzz``.
+
+    Slow modules come first, so that no worker is left with one while the others have nothing to do.
+    """
     for item in items:
         if item.path.stem in SLOW:
             item.add_marker("slow")
+    items.sort(key=lambda item: item.path.stem not in SLOW)
     if config.getoption("--hypothesis-profile") == "fuzz":
         attribute = "_hypothesis_internal_use_settings"  # there is no public way to the settings of a test
         functions = (item.obj for item in items if isinstance(item, pytest.Function))
