@@ -4,7 +4,7 @@
 # make test-gpu    the kernels of CUDA on the CPU; installs the extra gpu
 # make fuzz        property tests with fresh random seeds and ten times the examples; 20,000 damaged files
 # make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
-# make bench-quick the same on a part of the demo, about a minute
+# make bench-quick the same on a part of the demo, a few minutes
 # make lint        style, types, layer contract
 # make docs        the documentation as a site, in build/site; broken links are errors
 # make wheel-test  build sdist and wheel, and run the installed wheel away from the repository

@@ -1,7 +1,7 @@
 """Runs the benchmark: building, reading, casting, driving, writing, mapping and growth.
 
-    make bench [ARGS="--only casting writing --repetitions 9"]     whole run, a quarter of an hour
-    make bench-quick                                               the demo, about a minute
+    make bench [ARGS="--only casting writing --repetitions 9"]     whole run, over half an hour
+    make bench-quick                                               the demo, a few minutes
     PYTHONPATH=benchmarks python -m bench compare A.json B.json    two runs on one machine
 
 Each case is the same work by several sides that take turns in one process: ours and a reference. Writes

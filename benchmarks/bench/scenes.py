@@ -41,7 +41,7 @@ rate_hz = 10.0
 class Setup:
     """Extent of a run.
 
-    quick       : the demo and small sizes, about a minute
+    quick       : the demo and small sizes, a few minutes
     repetitions : of each measurement
     folder      : for files of the run
     helios      : the HELIOS++ program; None if none was given
