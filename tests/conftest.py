@@ -47,9 +47,9 @@ SLOW = frozenset(
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark slow tests, multiply the examples of property tests under ``--hypothesis-profile=fuzz``.
+    """Mark slow tests, and multiply the examples of property tests under ``--hypothesis-profile=fuzz``.
 
-    Slow modules come first, so that no worker is left with one while the others have nothing to do.
+    Modules of slow tests come first, so that no worker is left with one while the others have nothing to do.
     """
     for item in items:
         if item.path.stem in SLOW:

@@ -34,6 +34,7 @@ import lidar.tradeoff.profile
 from geoscene.pipeline import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
+from lidar.tradeoff.images import coarse
 from lidar.traffic.populate import TrafficOptions
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -182,7 +183,7 @@ def folder(inputs, tmp_path, monkeypatch):
     monkeypatch.setattr(lidar.tradeoff.profile, "RAYS", (1, 7, 19, 127))
     # each takes a process: one stands for all
     monkeypatch.setattr(lidar.tradeoff.costs, "peaks", lambda tasks: peaks(tasks[:1]) * len(tasks))
-    monkeypatch.setattr(lidar.rig.specs, "_camera", lambda table: smaller(camera(table)))
+    monkeypatch.setattr(lidar.rig.specs, "_camera", lambda table: coarse(camera(table), 4))
     measure_little(monkeypatch, folder=tmp_path / "profiles")
     monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
     monkeypatch.setattr(lidar.pipeline, "drive", short)
@@ -208,19 +209,6 @@ def brief(grid):
     grid, seeds = re.subn(r"seed = \[.*\]", "seed = [1]", grid)
     assert durations == seeds == 1
     return grid
-
-
-def smaller(camera):
-    """A camera with a sixteenth of the pixels and the same field of view."""
-    return replace(
-        camera,
-        width=camera.width // 4,
-        height=camera.height // 4,
-        fx=camera.fx / 4,
-        fy=camera.fy / 4,
-        cx=(camera.cx + 0.5) / 4 - 0.5,
-        cy=(camera.cy + 0.5) / 4 - 0.5,
-    )
 
 
 def inside(box, node):
