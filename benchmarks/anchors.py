@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.physics.fresnel import WATER, fresnel
 from lidar.rig.imu_grades import PRESETS
 from lidar.rig.scanner import firings, load_sensor

@@ -29,7 +29,7 @@ from pathlib import Path
 import forked
 from kills import Case, cases, contents, looks_whole
 
-from geoscene.files import exclusive
+from geoscene.support.files import exclusive
 
 _NEWNS, _NEWUSER = 0x20000, 0x10000000
 _READ_ONLY, _REMOUNT, _PRIVATE = 1, 32, 0x44000

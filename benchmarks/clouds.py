@@ -33,11 +33,11 @@ from scipy.spatial import cKDTree
 from geoscene.clouds.survey import with_clouds
 from geoscene.ground.terrain import base_heights
 from geoscene.options import BuildOptions, CloudOptions
-from geoscene.pipeline import build
-from geoscene.plan import Plan, make_plan
-from geoscene.progress import silent
+from geoscene.pipeline.build import build
+from geoscene.pipeline.plan import Plan, make_plan
 from geoscene.sources import OsmData, read_osm
 from geoscene.sources.data import Tags
+from geoscene.support.progress import silent
 
 WITHHELD = ("height", "building:height", "est_height", "building:levels", "roof:")
 SHIFT = (0.6, -0.4)

@@ -20,7 +20,15 @@ Work = Sequence[object] | Callable[[], object]
 """Words of a command, of which the first is the program, or a function."""
 
 _MODULES = (
-    *("geoscene.cli", "geoscene.pipeline", "geoscene.export", "geoscene.view", "rasterio", "laspy", "lazrs"),
+    *(
+        "geoscene.cli",
+        "geoscene.pipeline.build",
+        "geoscene.export",
+        "geoscene.view",
+        "rasterio",
+        "laspy",
+        "lazrs",
+    ),
     *("lidar.cli", "lidar.pipeline", "lidar.apply", "lidar.sign", "lidar.verify", "lidar.maps.aggregate"),
     *("lidar.view", "lidar.sweep", "lidar.denoise.denoise", "lidar.dataset.export.nuscenes"),
 )

@@ -19,7 +19,7 @@ import shapely
 
 from geoscene.buildings import read_buildings
 from geoscene.buildings.heights import infer_heights
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.sources import read_osm
 
 HIDDEN = (0.05, 0.2, 0.5, 0.9, 1.0)

@@ -23,8 +23,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from geoscene.files import write_atomically
 from geoscene.scene import open_scene
+from geoscene.support.files import write_atomically
 
 _TRAFFIC = "vehicles=20,parked=0.5,pedestrians=10,cyclists=3"
 _RAIN = "rain=10mm/h"

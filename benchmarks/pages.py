@@ -76,7 +76,7 @@ def opened(page: Path, *, frames: int, limit_s: float) -> dict[str, float]:
             window.js(f"{script} geoscene.redraw()")
             settled(window, time.monotonic(), limit_s=limit_s)
             out[f"{view} frame ms"] = window.js("return geoscene.benchmark(arguments[0])", frames)
-            out[f"{view} triangles"] = sum(n for _, n in window.js("return geoscene.tiles()"))
+            out[f"{view} triangles"] = sum(n for _, n in window.js("return geoscene.pipeline.tiles()"))
             out[f"{view} graphics MB"] = window.js("return geoscene.bytes()") / 1e6
             out[f"{view} MB"] = memory_mb()
     return out

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from damaged_inputs import PLACE
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import read_graphml
 from geoscene.scene.geopackage import read_layer
 from geoscene.scene.layout import SceneFiles, open_scene

@@ -40,11 +40,11 @@ from damaged_inputs import KINDS, Inputs, Words
 from mutations import mutate
 from readers import readable, reader_of
 
-from geoscene.console import main as main_of
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
-from geoscene.files import digest_of
-from geoscene.memory import peak_memory
+from geoscene.support.console import main as main_of
+from geoscene.support.files import digest_of
+from geoscene.support.memory import peak_memory
 from lidar.errors import InputError, LidarError
 
 _SHARES = {"maps": 2, "scenes": 3, "datasets": 6, "configurations": 5}

@@ -24,7 +24,7 @@ from typing import Any
 
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from geoscene.progress import silent
+from geoscene.support.progress import silent
 from lidar.dataset.export import ros2
 from lidar.dataset.export.ros_drive import RosDrive, Topic
 from lidar.dataset.export.ros_messages import encoded, typestore

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.classes import Class, class_codes
-from geoscene.console import progress_bar
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
+from geoscene.support.console import progress_bar
 from geoscene.view import view_scene
 from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset.formats import read_table

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geoscene.lazy import lazily
+from geoscene.support.lazy import lazily
 
 if TYPE_CHECKING:
     from geoscene.export import export_scene as export_scene
     from geoscene.options import BuildOptions as BuildOptions
     from geoscene.options import ExportOptions as ExportOptions
     from geoscene.options import ViewOptions as ViewOptions
-    from geoscene.pipeline import build as build
+    from geoscene.pipeline.build import build as build
     from geoscene.scene import Scene as Scene
     from geoscene.scene import open_scene as open_scene
     from geoscene.sources import demo_path as demo_path
@@ -25,7 +25,7 @@ _HOMES = {
     "ExportOptions": "options",
     "Scene": "scene",
     "ViewOptions": "options",
-    "build": "pipeline",
+    "build": "pipeline.build",
     "demo_path": "sources",
     "export_scene": "export",
     "open_scene": "scene",

@@ -13,7 +13,9 @@ from typing import Annotated, Any
 from cyclopts import App, Group, Parameter, validators
 
 from geoscene import __version__
-from geoscene.console import (
+from geoscene.errors import GeosceneError, InputError
+from geoscene.options import BuildOptions, CloudOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
+from geoscene.support.console import (
     DEFAULTS,
     FAILURE,
     SEVERAL,
@@ -26,10 +28,8 @@ from geoscene.console import (
     whole,
     with_flags,
 )
-from geoscene.console import main as run
-from geoscene.errors import GeosceneError, InputError
-from geoscene.options import BuildOptions, CloudOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
-from geoscene.progress import Progress
+from geoscene.support.console import main as run
+from geoscene.support.progress import Progress
 from geoscene.uses import USES
 
 app = App(
@@ -135,11 +135,11 @@ def build(
         Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers build the tiles instead;
         they need the output folder under the same path.
     """
-    from geoscene.cluster import connected  # noqa: PLC0415
-    from geoscene.pipeline import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.pipeline.build import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
     from geoscene.scene.writer import check_target  # noqa: PLC0415
-    from geoscene.storage import published, shown, url_of  # noqa: PLC0415
+    from geoscene.support.cluster import connected  # noqa: PLC0415
+    from geoscene.support.storage import published, shown, url_of  # noqa: PLC0415
 
     started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
@@ -189,7 +189,7 @@ def build(
 
 
 def _cache_of(source: MapSource) -> Path:
-    from geoscene.storage import cache_folder  # noqa: PLC0415
+    from geoscene.support.storage import cache_folder  # noqa: PLC0415
 
     return source.cache or cache_folder()
 
@@ -314,7 +314,7 @@ def info(
         Print as JSON.
     """
     from geoscene.scene.layout import open_scene  # noqa: PLC0415
-    from geoscene.storage import shown  # noqa: PLC0415
+    from geoscene.support.storage import shown  # noqa: PLC0415
 
     opened = open_scene(scene)
     report = opened.manifest | {"path": shown(scene), "extent": _extent(opened.manifest)}

@@ -1,7 +1,7 @@
 """Exceptions of geoscene.
 
 Messages name parameters in backquotes (`tile_size`); the command line shows them as flags (--tile-size), see
-`geoscene.console.with_flags`.
+`geoscene.support.console.with_flags`.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.console import SEVERAL, WORDS, degrees, whole
 from geoscene.errors import InputError
+from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.uses import USES
 
 RELIEFS = ("off", "plain", "full")

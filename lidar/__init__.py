@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from geoscene import __version__ as __version__
-from geoscene.lazy import lazily
+from geoscene.support.lazy import lazily
 
 if TYPE_CHECKING:
     from lidar.conversion import convert as convert

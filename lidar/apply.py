@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.files import write_json
-from geoscene.progress import Progress, silent
+from geoscene.support.files import write_json
+from geoscene.support.progress import Progress, silent
 from lidar.attacks.attacker import Attacker
 from lidar.attacks.sight import Seen, check_sight
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png, write_png

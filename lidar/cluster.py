@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geoscene.cluster import Cluster
-from geoscene.files import write_atomically
-from geoscene.progress import Progress, silent
+from geoscene.support.cluster import Cluster
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.journal import Journal
 from lidar.dataset.record import record_frame
 from lidar.plan import DrivePlan, Job

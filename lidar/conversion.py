@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from geoscene.console import command_line
-from geoscene.files import write_json
-from geoscene.progress import Progress, silent
+from geoscene.support.console import command_line
+from geoscene.support.files import write_json
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.reach import RoadMap
+from geoscene.pipeline.reach import RoadMap
 from geoscene.typing import Float
 from lidar.frame_loop import CHUNK
 from lidar.navigation.satellite_visibility import BLOCK_M, REACH

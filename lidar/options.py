@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from cyclopts import Group, Parameter, Token
 
 from geoscene.classes import Class
-from geoscene.console import SEVERAL, WORDS, degrees, whole
 from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
+from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.errors import InputError
 from lidar.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
-    from geoscene.reach import RoadMap
+    from geoscene.pipeline.reach import RoadMap
     from geoscene.scene import Scene
     from lidar.dataset.recording import Contents
     from lidar.planning.road_conditions import RoadConditions

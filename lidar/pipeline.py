@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
-from geoscene.cluster import Cluster, connected
 from geoscene.errors import GeosceneError
-from geoscene.files import exclusive, json_bytes, write_json
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.cluster import Cluster, connected
+from geoscene.support.files import exclusive, json_bytes, write_json
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.boxes import merge_box_files, merge_signal_files
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal

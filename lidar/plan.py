@@ -13,10 +13,10 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.limits import Limit, height_limit
-from geoscene.progress import Progress, silent
-from geoscene.reach import OFFSET
+from geoscene.pipeline.limits import Limit, height_limit
+from geoscene.pipeline.reach import OFFSET
 from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float, Ints
 from lidar import __version__
 from lidar.attacks.placed_object import with_objects

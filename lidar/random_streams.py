@@ -7,7 +7,7 @@ import hashlib
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.splitmix import GOLDEN, mix
+from geoscene.support.splitmix import GOLDEN, mix
 from geoscene.typing import Float
 
 

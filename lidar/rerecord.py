@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import write_columns
+from geoscene.support.csv_tables import write_columns
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, table_cloud

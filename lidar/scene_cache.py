@@ -28,15 +28,15 @@ import shapely
 from geoscene.clouds.survey import with_clouds
 from geoscene.errors import FrameError, NetworkError, SceneFormatError
 from geoscene.errors import InputError as SceneInputError
-from geoscene.files import digest, digest_of, exclusive, sources_digest, write_atomically
 from geoscene.options import BuildOptions, CloudOptions
-from geoscene.pipeline import build, elevation_digests
-from geoscene.progress import Progress, silent
-from geoscene.reach import RoadMap
+from geoscene.pipeline.build import build, elevation_digests
+from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
-from geoscene.storage import cache_folder
+from geoscene.support.files import digest, digest_of, exclusive, sources_digest, write_atomically
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import cache_folder
 from lidar.course import needed_area
 from lidar.errors import InputError, LidarError
 from lidar.gpu.device import check_device

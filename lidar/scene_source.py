@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geoscene.options import CloudOptions
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
-from geoscene.storage import url_of
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import url_of
 from lidar.errors import InputError
 from lidar.options import DriveOptions, PlaceOptions
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
-from geoscene.progress import Progress, silent
+from geoscene.support.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset

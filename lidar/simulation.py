@@ -11,9 +11,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from geoscene.previews import card
-from geoscene.progress import Progress, silent
+from geoscene.drawing.previews import card
 from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.camera.render import Frame as Image
 from lidar.dataset.measured import Columns, MeasuredCloud, MeasuredImages

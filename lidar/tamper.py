@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import write_columns
+from geoscene.support.csv_tables import write_columns
 from lidar.camera.png import read_png
 from lidar.dataset.derived import check_target, complete_folder, copy_folder
 from lidar.dataset.formats import FORMATS, LABELS, read_table

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import need
-from geoscene.processes import run_tasks
-from geoscene.progress import Progress, silent
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float, Ints
 from lidar import __version__
 from lidar.dataset.layout import Dataset, open_dataset

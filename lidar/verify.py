@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.files import digest
-from geoscene.progress import Progress, silent
 from geoscene.scene.layout import SceneFiles
-from geoscene.storage import Stored, cache_folder, shown, url_of
+from geoscene.support.files import digest
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import Stored, cache_folder, shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
 from lidar.dataset.layout import Paths, open_dataset, reading_file

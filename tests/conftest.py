@@ -13,7 +13,7 @@ from helpers import DEMO_BOX
 from hypothesis import HealthCheck, settings
 
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
 

@@ -10,10 +10,10 @@ import re
 import shlex
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import osmium
 import pytest
+from helpers import ROOT
 from helpers.clouds import write_survey
 from helpers.overture import overture_row, write_overture
 from helpers.profiles import measure_little
@@ -31,13 +31,12 @@ import lidar.tradeoff.accuracy
 import lidar.tradeoff.costs
 import lidar.tradeoff.engine
 import lidar.tradeoff.profile
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
 from lidar.tradeoff.images import coarse
 from lidar.traffic.populate import TrafficOptions
 
-ROOT = Path(__file__).resolve().parents[1]
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
 ONLY_PARSED = {
     "--place",

@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rasterio
+from helpers import ROOT
 from helpers.programs import ENVIRONMENT
 
 import geoscene
 from lidar.camera.png import read_png
 
-FOLDER = Path(__file__).resolve().parents[1] / "examples" / "python"
+FOLDER = ROOT / "examples" / "python"
 
 
 @pytest.fixture

@@ -4,16 +4,14 @@ import re
 import subprocess
 import sys
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 from helpers.programs import ENVIRONMENT
 
 import geoscene.cli
 import lidar.cli
 from lidar.rig.catalog import rig_names, sensor_names
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from packaging.metadata import Metadata
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from geoscene import compiled
+from geoscene.support import compiled
 
 ROOT = Path(__file__).resolve().parents[1]
 BACKEND = "import setuptools.build_meta as b; print(b.build_{kind}({folder!r}, {settings!r}))"

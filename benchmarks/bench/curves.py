@@ -20,7 +20,7 @@ from bench.measure import MOST_PROCESSES, Spent, alone, measured
 from bench.measure import Case as Work
 from bench.scenes import Setup, boxes_on_hills
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.physics.settings import ScannerSettings
 from lidar.pipeline import drive

@@ -19,9 +19,9 @@ from embreex.rtcore_scene import EmbreeScene
 from bench.measure import Case, Spent, alone, command
 from bench.scenes import QUICK_BOX, Setup
 from geoscene.buildings import build_solids, read_buildings
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
-from geoscene.plan import take_buildings
+from geoscene.pipeline.plan import take_buildings
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import OsmData, read_osm
 from lidar.world.world import World

@@ -17,7 +17,7 @@ from rich.table import Table as Grid
 
 from bench.growth import Curve
 from bench.measure import Result, Summary
-from geoscene.files import write_atomically, write_json
+from geoscene.support.files import write_atomically, write_json
 
 _INK, _GREY, _LINE, _DOT = (30, 32, 38), (205, 208, 214), (200, 60, 40), (60, 110, 180)
 

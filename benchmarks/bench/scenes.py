@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.typing import Float, Ints

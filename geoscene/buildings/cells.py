@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import distinct_corners, lift, triangulate
 from geoscene.buildings.skeleton import Skeleton, loops, polygons_of
-from geoscene.columns import Columns
+from geoscene.geometry.watertight import edge_uses, weld
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from geoscene.watertight import edge_uses, weld
 
 ON_LINE = 1e-3
 """Corners closer to a contour line than this count as on it, which avoids slivers; metres of the field."""

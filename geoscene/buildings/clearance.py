@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 
 from geoscene.buildings.footprints import to_grid
-from geoscene.intersections import close_faces, common_corners, distances
+from geoscene.geometry.intersections import close_faces, common_corners, distances
+from geoscene.geometry.watertight import GRID, grid_cells, weld
 from geoscene.typing import Float, Ints
-from geoscene.watertight import GRID, grid_cells, weld
 
 _MOVES = np.array([move for move in itertools.product((-1, 0, 1), repeat=3) if any(move)])
 """Grid steps by which a vertex can move at once."""

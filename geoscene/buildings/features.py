@@ -18,9 +18,9 @@ from geoscene.buildings.resolve import Heights, Row, resolve_heights, texts
 from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.stacks import with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
-from geoscene.frames import Frame
-from geoscene.report import Problem, described, make_without_failures, unexpected
+from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags
+from geoscene.support.report import Problem, described, make_without_failures, unexpected
 from geoscene.tags import first_value
 from geoscene.typing import Ints
 

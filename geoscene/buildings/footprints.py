@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from shapely.errors import GEOSException
 
 from geoscene.buildings.table import GRID
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Bools, Float, Ints
 
 Polygons = NDArray[Any]

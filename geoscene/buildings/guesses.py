@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
-from geoscene.frames import wrapped
-from geoscene.splitmix import uniform_at
+from geoscene.geometry.frames import wrapped
+from geoscene.support.columns import Columns
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
 Names = NDArray[np.object_]

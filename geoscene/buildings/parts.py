@@ -11,8 +11,8 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
-from geoscene.report import Problem, unexpected
 from geoscene.sources.data import Relation
+from geoscene.support.report import Problem, unexpected
 from geoscene.typing import Bools, Float, Ints
 
 Rows = Ints

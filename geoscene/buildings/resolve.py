@@ -13,8 +13,8 @@ from geoscene.buildings.appearance import Appearance
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, THINNEST, Tagged, infer_heights
 from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
-from geoscene.report import Problem
 from geoscene.sources.data import Tags
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Ints
 
 _HALLS = (

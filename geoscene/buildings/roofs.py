@@ -23,7 +23,7 @@ from geoscene.buildings.cells import (
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms
 from geoscene.buildings.skeleton import straight_skeleton
-from geoscene.mesh import FLOOR, ROOF
+from geoscene.geometry.mesh import FLOOR, ROOF
 from geoscene.typing import Float
 
 Profile = tuple[tuple[float, float], ...]

@@ -12,10 +12,10 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.table import GRID
-from geoscene.columns import Columns
-from geoscene.mesh import FLOOR, ROOF, WALL
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL
+from geoscene.geometry.watertight import edge_uses, weld
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import edge_uses, weld
 
 PARAPET = 0.25
 """Metres, thickness of a parapet: a brick and coping."""
@@ -27,7 +27,7 @@ class Triangles(Columns):
 
     corners : (m, 3, 3) metres, counter-clockwise seen from outside
     piece   : (m,) int64
-    surface : (m,) uint8, codes of `geoscene.mesh`
+    surface : (m,) uint8, codes of `geoscene.geometry.mesh`
     """
 
     corners: Float

@@ -15,12 +15,12 @@ from geoscene.buildings.shells import Triangles, parapets, prisms
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class
-from geoscene.columns import Columns
 from geoscene.errors import InputError
-from geoscene.mesh import FLOOR, ROOF, Mesh
-from geoscene.report import Problem, described, make_without_failures
+from geoscene.geometry.mesh import FLOOR, ROOF, Mesh
+from geoscene.geometry.watertight import check_solids, weld
+from geoscene.support.columns import Columns
+from geoscene.support.report import Problem, described, make_without_failures
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import check_solids, weld
 
 _ALIGNED = 0.02
 """Metres, grid on which the pieces of a building are put together if they do not unite as they are."""

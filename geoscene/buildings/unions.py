@@ -13,10 +13,9 @@ import shapely
 from geoscene.buildings.clearance import parted
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import Triangles
-from geoscene.intersections import intersecting_faces, plan_axes
-from geoscene.mesh import WALL
-from geoscene.typing import Float, Ints
-from geoscene.watertight import (
+from geoscene.geometry.intersections import intersecting_faces, plan_axes
+from geoscene.geometry.mesh import WALL
+from geoscene.geometry.watertight import (
     check_solids,
     degenerate_faces,
     edge_uses,
@@ -25,6 +24,7 @@ from geoscene.watertight import (
     vertex_fans,
     weld,
 )
+from geoscene.typing import Float, Ints
 
 SEAMS = (1e-2, 1e-2, 3e-2)
 """Sizes of the beads that join bodies of a building which only touch each other, metres, one attempt after

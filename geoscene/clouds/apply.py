@@ -17,10 +17,10 @@ from geoscene.clouds.levels import Body
 from geoscene.clouds.measure import Measured
 from geoscene.clouds.roofs import Roof
 from geoscene.errors import InputError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.objects.vegetation import CLOUD_TREE
-from geoscene.report import Problem
 from geoscene.sources.data import Area, OsmData, Point, Tags
+from geoscene.support.report import Problem
 from geoscene.typing import Float, Ints
 
 _DISAGREES = 2.0  # metres between a tagged and a measured height that are reported

@@ -18,10 +18,10 @@ from geoscene.clouds.levels import Body, split_bodies
 from geoscene.clouds.read import GROUND, VEGETATION
 from geoscene.clouds.roofs import FEWEST, block_of, fit_roof, roof_points
 from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
-from geoscene.processes import run_tasks
-from geoscene.progress import Progress
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress
 from geoscene.typing import Bools, Float
 
 T = TypeVar("T")

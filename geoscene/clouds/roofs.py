@@ -12,7 +12,7 @@ import shapely
 from shapely.errors import GEOSException
 
 from geoscene.buildings.roofs import SECTIONS, RoofSpec, roof_shell
-from geoscene.mesh import ROOF
+from geoscene.geometry.mesh import ROOF
 from geoscene.typing import Bools, Float
 
 FEWEST = 15

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
 from geoscene.clouds.read import GROUND, NOISE, VEGETATION, CloudFile
-from geoscene.columns import Columns
 from geoscene.errors import InputError
-from geoscene.frames import Frame
-from geoscene.progress import Progress, silent
+from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float
 
 SIDE = 128.0

@@ -19,13 +19,13 @@ from geoscene.clouds.read import CloudFile, open_cloud
 from geoscene.clouds.shift import best_shift
 from geoscene.clouds.spool import SIDE, Spool, spool_clouds
 from geoscene.errors import InputError
-from geoscene.files import atomic_path, digest_of, temporary_folder
-from geoscene.frames import Frame, extent_of, wrapped
+from geoscene.geometry.frames import Frame, extent_of, wrapped
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
-from geoscene.progress import Progress, silent
-from geoscene.report import Problem
 from geoscene.sources.data import Credit, OsmData
+from geoscene.support.files import atomic_path, digest_of, temporary_folder
+from geoscene.support.progress import Progress, silent
+from geoscene.support.report import Problem
 
 _FAR = 100.0  # metres from a ground return beyond which the ground is not known
 _MOST_CELLS = 36_000_000  # of the raster of the ground

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geoscene.clouds.ground import Grid
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 CELL = 0.5

@@ -27,11 +27,11 @@ from geoscene.export.objects import (
 from geoscene.export.shells import bodies, manifold_patches, shell_numbers
 from geoscene.export.tables import target_crs
 from geoscene.export.vertices import Vertices
-from geoscene.files import append, atomic_file, spool
-from geoscene.frames import Frame, utm_crs
-from geoscene.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Instances, Mesh
-from geoscene.progress import Progress, silent
+from geoscene.geometry.frames import Frame, utm_crs
+from geoscene.geometry.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Instances, Mesh
 from geoscene.scene import Scene
+from geoscene.support.files import append, atomic_file, spool
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float, Ints
 
 STEP = 1e-5

@@ -11,9 +11,9 @@ import numpy as np
 from geoscene.export.files import Summary
 from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
 from geoscene.export.objects import Features, Part, attribution, klass_name, parts, pieces, read_features
-from geoscene.files import atomic_file
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_file
+from geoscene.support.progress import Progress, silent
 
 
 def write_glb(

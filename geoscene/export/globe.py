@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import Transformer
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 
 

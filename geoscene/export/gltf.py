@@ -16,8 +16,8 @@ from geoscene.classes import materials
 from geoscene.errors import InputError
 from geoscene.export.files import compact_json
 from geoscene.export.objects import Features, table_columns
-from geoscene.files import append, spool
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.support.files import append, spool
 from geoscene.typing import Float
 
 _COMPONENTS = {"u2": 5123, "u4": 5125, "f4": 5126}

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from geoscene.errors import InputError
 from geoscene.export.files import Summary
-from geoscene.files import exclusive
 from geoscene.options import ExportOptions
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.files import exclusive
+from geoscene.support.progress import Progress, silent
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 from geoscene.errors import SceneFormatError, need
 from geoscene.export.objects import klass_name
 from geoscene.export.triangles import meshes_of
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.scene import Scene
 
 

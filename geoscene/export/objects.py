@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.export.files import plain
-from geoscene.mesh import Instances, Mesh, concatenate
-from geoscene.progress import Progress, silent
+from geoscene.geometry.mesh import Instances, Mesh, concatenate
 from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float, Ints
 
 BARE = "terrain"

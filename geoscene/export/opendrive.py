@@ -13,10 +13,10 @@ import numpy as np
 from geoscene.export.files import Summary
 from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
-from geoscene.files import atomic_file
-from geoscene.progress import Progress, silent
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_file
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
 _TYPES = {

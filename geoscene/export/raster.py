@@ -15,10 +15,10 @@ from geoscene.errors import InputError
 from geoscene.export.files import Summary
 from geoscene.export.objects import attribution, expand, parts
 from geoscene.export.zbuffer import draw_triangles
-from geoscene.files import atomic_path, naming, not_written, temporary_folder
-from geoscene.mesh import Mesh, concatenate
-from geoscene.progress import Progress, silent
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_path, naming, not_written, temporary_folder
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
 Model = Literal["surface", "terrain", "classes"]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.export.planview import Curve, PlanView, connecting_curve, plan_view
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_table

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.geometry.watertight import corner_fans, edge_uses
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import corner_fans, edge_uses
 
 
 def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:

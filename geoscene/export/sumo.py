@@ -9,9 +9,9 @@ from pathlib import Path
 from geoscene.errors import GeosceneError, need
 from geoscene.export.files import Summary
 from geoscene.export.opendrive import write_opendrive
-from geoscene.files import atomic_file, temporary_folder
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_file, temporary_folder
+from geoscene.support.progress import Progress, silent
 
 _STAMP = re.compile(rb"<!--.*?-->\s*", re.DOTALL)
 _VALUES = re.compile(r"'[^']*'|\b(start|end)\b|-?\d+(\.\d+)?")  # what differs between warnings of a kind

@@ -13,10 +13,10 @@ from pyproj.exceptions import CRSError
 
 from geoscene.classes import Class
 from geoscene.errors import InputError
+from geoscene.geometry.watertight import volumes
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from geoscene.typing import Float
-from geoscene.watertight import volumes
 
 SOLIDS = "building_solids"
 """Name of the table of the solids of buildings in GeoPackages."""

@@ -13,10 +13,10 @@ from geoscene.export.files import Summary, compact_json
 from geoscene.export.globe import Globe
 from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
 from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
-from geoscene.files import atomic_file, atomic_folder, write_atomically
-from geoscene.mesh import Mesh
-from geoscene.progress import Progress, silent
+from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_file, atomic_folder, write_atomically
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
 _NAMES = r"tileset\.json|content/-?\d+_-?\d+(_copies)?\.glb"

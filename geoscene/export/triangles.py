@@ -14,11 +14,11 @@ from geoscene.classes import materials
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, size_of
 from geoscene.export.objects import attribution, expand, klass_name, parts, pieces, read_features
-from geoscene.files import append, atomic_file, spool
-from geoscene.mesh import Mesh, concatenate
-from geoscene.progress import Progress, silent
+from geoscene.geometry.mesh import Mesh, concatenate
+from geoscene.geometry.watertight import degenerate_faces, validate_mesh
 from geoscene.scene import Scene
-from geoscene.watertight import degenerate_faces, validate_mesh
+from geoscene.support.files import append, atomic_file, spool
+from geoscene.support.progress import Progress, silent
 
 
 def meshes_of(

@@ -24,10 +24,10 @@ from geoscene.export.tables import (
     solids,
     target_crs,
 )
-from geoscene.files import atomic_file
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer, open_geopackage
+from geoscene.support.files import atomic_file
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
 

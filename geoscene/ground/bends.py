@@ -6,7 +6,7 @@ import heapq
 
 import numpy as np
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Ints
 
 

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import materials
-from geoscene.frames import Frame
+from geoscene.geometry import polylines
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
 from geoscene.ground.kerbs import AROUND, Beside, has_kerbs, kerb_heights, rows_beside
 from geoscene.ground.layers import Layers
 from geoscene.ground.partition import (
@@ -25,7 +26,6 @@ from geoscene.ground.partition import (
     values_at,
 )
 from geoscene.ground.triangulate import Triangles, triangulate, triangulate_relief
-from geoscene.mesh import Mesh
 from geoscene.sources.data import Way
 from geoscene.typing import Bools, Float, Height
 

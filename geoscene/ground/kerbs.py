@@ -10,7 +10,6 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
 from geoscene.ground.camber import Kerbs
 from geoscene.ground.layers import (
     COVERS,
@@ -29,6 +28,7 @@ from geoscene.ground.layers import (
 from geoscene.ground.nearby import points_in_boxes, shapes_near
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
 from geoscene.ground.triangulate import Triangles
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 KERB, KERB_LOWERED = 0.12, 0.03

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Ints
 
 _NEAR = 2

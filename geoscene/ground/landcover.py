@@ -10,12 +10,12 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.coast import sea
 from geoscene.ground.kinds import SEA, SURFACES, Kind, area_kind, line_kind
 from geoscene.ground.layers import Layers
-from geoscene.report import Problem
 from geoscene.sources.data import Area, OsmData, Tags, Way
+from geoscene.support.report import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Float
 

@@ -10,8 +10,8 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.columns import Columns
 from geoscene.errors import InputError
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 
 LANDCOVER, ROADS, PADS = 0.0, 100.0, 200.0

@@ -18,13 +18,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.columns import row_blocks
 from geoscene.errors import InputError
 from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.faces import Faces, faces
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.ground.snapping import distinct_places, snap_rounded
+from geoscene.support.columns import row_blocks
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9

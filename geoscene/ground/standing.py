@@ -8,11 +8,11 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class
+from geoscene.geometry.mesh import Mesh
 from geoscene.ground.kerbs import KERB
 from geoscene.ground.layers import SIDEWALKS
 from geoscene.ground.nearby import points_in_boxes
 from geoscene.ground.partition import GroundPlan, rows_at, values_at
-from geoscene.mesh import Mesh
 from geoscene.typing import Float, Height
 
 _NO_FLOOR = (Class.WATER, Class.TUNNEL)

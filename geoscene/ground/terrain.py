@@ -17,8 +17,8 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
 from geoscene.errors import InputError, SourceNotFoundError, reading
-from geoscene.frames import Frame, beside
-from geoscene.report import Problem
+from geoscene.geometry.frames import Frame, beside
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]

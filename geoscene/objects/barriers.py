@@ -11,13 +11,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.columns import Columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import PRECISION, GroundPlan
-from geoscene.mesh import Mesh, concatenate
-from geoscene.report import Problem
 from geoscene.sources.data import OsmData, Tags
+from geoscene.support.columns import Columns
+from geoscene.support.report import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Height
 

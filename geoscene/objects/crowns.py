@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.objects.solids import Body, lathe, solid
-from geoscene.splitmix import uniform_at
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Float
 
 Profile = tuple[tuple[float, float], ...]

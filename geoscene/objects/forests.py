@@ -10,9 +10,9 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Instances, Mesh
 from geoscene.objects.vegetation import CROWN, HEIGHT, TRUNK, Trees, tree_instances
-from geoscene.splitmix import uniform_at
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
 if TYPE_CHECKING:

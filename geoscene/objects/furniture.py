@@ -10,19 +10,19 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Instances
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
-from geoscene.mesh import Instances
 from geoscene.objects.shapes import place, shapes
 from geoscene.objects.signs import directed, sign_face, sign_shape
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import stands as bicycle_stands
 from geoscene.objects.street import street_shape
-from geoscene.report import Problem
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, Point, Tags
+from geoscene.support.columns import Columns
+from geoscene.support.report import Problem
 from geoscene.tags import parse_direction, parse_length
 from geoscene.typing import Bools, Float, Height, Ints
 

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.objects.solids import Body, box, circle, lathe, prism, rectangle, solid
 from geoscene.typing import Float
 

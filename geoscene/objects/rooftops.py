@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from geoscene.buildings import Buildings
 from geoscene.buildings.footprints import groups
 from geoscene.buildings.guesses import guess_looks, region_at, seeds
-from geoscene.columns import Columns
-from geoscene.mesh import FLOOR, ROOF, Instances, Mesh
+from geoscene.geometry.mesh import FLOOR, ROOF, Instances, Mesh
 from geoscene.objects.roof_shapes import DORMER_DEPTH
 from geoscene.objects.shapes import place
-from geoscene.splitmix import uniform_at
+from geoscene.support.columns import Columns
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
 _CHIMNEYS = {"north_america": 0.5, "mediterranean": 0.5, "oceania": 0.3, "east_asia": 0.05}

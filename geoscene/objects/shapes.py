@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Instances, Mesh, concatenate
+from geoscene.geometry.mesh import Instances, Mesh, concatenate
 from geoscene.objects.crowns import leaf_area_densities, tree_shapes
 from geoscene.objects.roof_shapes import roof_shapes
 from geoscene.objects.solids import circle, lathe, prism, rectangle, solid

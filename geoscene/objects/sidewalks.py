@@ -9,7 +9,7 @@ import numpy as np
 from geoscene.objects.furniture import Furniture, usual_height
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import Guesses, Taken, site_guesses, usable
-from geoscene.splitmix import number_of, uniform_at
+from geoscene.support.splitmix import number_of, uniform_at
 
 _SHELTER_BACK = 0.8
 """Metres from the place of a bus stop, beside the kerb, to the middle of its shelter."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.typing import Float
 
 Body = tuple[Float, NDArray[np.int32]]

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.guesses import region_at
 from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.objects.siting import UNUSABLE, Sites
 from geoscene.sources.data import OsmData, Tags
-from geoscene.splitmix import number_of, uniform_at
+from geoscene.support.columns import Columns
+from geoscene.support.splitmix import number_of, uniform_at
 from geoscene.tags import parse_number
 from geoscene.typing import Bools, Float, Ints
 

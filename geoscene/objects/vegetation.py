@@ -10,13 +10,13 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.frames import Frame
-from geoscene.mesh import Instances
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Instances
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
-from geoscene.report import Problem
-from geoscene.splitmix import uniform_at
+from geoscene.support.columns import Columns
+from geoscene.support.report import Problem
+from geoscene.support.splitmix import uniform_at
 from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float, Height
 

@@ -9,12 +9,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
-from geoscene.frames import Frame
-from geoscene.mesh import Instances
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Instances
 from geoscene.objects.shapes import shapes
 from geoscene.roadgraph.tags import is_tunnel
 from geoscene.sources.data import OsmData, Way
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Height
 
 _CABLES = ((-0.35, 8.6), (0.0, 8.75), (0.35, 8.6))

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.ballast import FADE, SLOPE, Beds
 from geoscene.ground.layers import Layers
 from geoscene.roadgraph.carriageways import place_of, surface_material

@@ -8,8 +8,7 @@ from itertools import groupby
 
 import numpy as np
 
-from geoscene.frames import Frame
-from geoscene.report import Problem
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.chains import Chain, Runs, chains_of, link_chains
 from geoscene.roadgraph.controls import add_controls
 from geoscene.roadgraph.graph import RoadGraph
@@ -17,6 +16,7 @@ from geoscene.roadgraph.lane_uses import read_lane_uses
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Way
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Ints
 
 

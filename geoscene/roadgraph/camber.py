@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class
+from geoscene.geometry import polylines
 from geoscene.ground.camber import CAMBER, Camber
 from geoscene.ground.layers import Layers
 from geoscene.roadgraph.carriageways import PAVED, Carriageways

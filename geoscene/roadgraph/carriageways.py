@@ -9,14 +9,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.kinds import SURFACES
-from geoscene.report import Problem
 from geoscene.roadgraph.build import read_runs
 from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
 from geoscene.roadgraph.tags import CLASSES, Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
+from geoscene.support.report import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Ints
 

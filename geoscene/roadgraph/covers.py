@@ -6,15 +6,15 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry import polylines
+from geoscene.geometry.frames import Frame
 from geoscene.ground.layers import COVERS, GULLIES, PATCHES
 from geoscene.roadgraph.carriageways import PAVED, Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.sources.data import OsmData, Tags
-from geoscene.splitmix import number_of, uniform_at
+from geoscene.support.splitmix import number_of, uniform_at
 from geoscene.typing import Float, Ints
 
 _RADIUS = 0.31

@@ -10,14 +10,14 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.frames import Frame
-from geoscene.polylines import directions
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.polylines import directions
 from geoscene.roadgraph.carriageways import Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.sources.data import OsmData, Point, Tags, Way
+from geoscene.support.columns import Columns
 from geoscene.tags import parse_length
 from geoscene.typing import Float, Ints
 

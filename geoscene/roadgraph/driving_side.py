@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Literal, cast
 
-from geoscene.frames import wrapped
+from geoscene.geometry.frames import wrapped
 from geoscene.sources.data import OsmData
 
 Side = Literal["left", "right"]

@@ -10,14 +10,14 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.carriageways import place_of
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Tags
+from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Height, Ints
 
 _SHARP = 0.05

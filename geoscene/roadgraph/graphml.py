@@ -15,11 +15,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.columns import row_blocks
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
-from geoscene.files import write_atomically
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.support.columns import row_blocks
+from geoscene.support.files import write_atomically
 
 _XMLNS = "http://graphml.graphdrawing.org/xmlns"
 _FLAGS = {"signals": "traffic_signals", "stop": "stop", "give_way": "give_way"}

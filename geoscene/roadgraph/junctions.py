@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.roadgraph.carriageways import KERB, Carriageways
 from geoscene.typing import Bools, Float, Ints
 

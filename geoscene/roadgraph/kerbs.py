@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.frames import Frame
+from geoscene.geometry import polylines
+from geoscene.geometry.frames import Frame
 from geoscene.ground.kerbs import MappedKerbs
 from geoscene.roadgraph.carriageways import KERB, Carriageways
 from geoscene.sources.data import OsmData

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class
+from geoscene.geometry import polylines
 from geoscene.roadgraph.carriageways import Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.lane_uses import CycleLane, LaneUses

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geoscene.columns import Columns
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 WIDEST_LANE = 4.5

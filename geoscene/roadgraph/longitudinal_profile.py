@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point

@@ -8,9 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.columns import Columns
+from geoscene.geometry import polylines
 from geoscene.roadgraph.carriageways import MINOR, PAVED, Carriageways
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import junction_reach
@@ -18,6 +17,7 @@ from geoscene.roadgraph.lane_uses import LaneUses
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes, lane_layout
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 PRIORITY = 170.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from geoscene.polylines import directions, unit
+from geoscene.geometry.polylines import directions, unit
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.stations import Stations

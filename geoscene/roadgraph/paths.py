@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.carriageways import PAVED, place_of, surface_material
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from geoscene.report import Problem
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources.data import Relation, Tags
+from geoscene.support.report import Problem
 
 # Vehicle classes that include a car, the most specific first: for restrictions and exemptions.
 _CAR = ("motorcar", "motor_vehicle", "vehicle")

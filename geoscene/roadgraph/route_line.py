@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from geoscene.errors import InputError, SourceNotFoundError, reading
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge, path_line, shortest_path
 from geoscene.sources.tracks import read_track

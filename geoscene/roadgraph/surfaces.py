@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
 from geoscene.roadgraph.covers import cover_rows

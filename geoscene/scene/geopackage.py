@@ -15,8 +15,8 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
-from geoscene.files import atomic_path, not_written
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.files import atomic_path, not_written
 
 _TYPES: Mapping[str, Any] = {
     "BOOLEAN": np.bool_,

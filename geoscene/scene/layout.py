@@ -15,14 +15,14 @@ import numpy as np
 import shapely
 
 from geoscene.errors import BUILD_AGAIN, GeosceneError, InputError, SceneFormatError, reading
-from geoscene.files import digest, digest_of, write_atomically
-from geoscene.frames import Frame
-from geoscene.mesh import Mesh
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
 from geoscene.objects.forests import Forests
 from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
-from geoscene.storage import Stored, cache_folder, url_of
+from geoscene.support.files import digest, digest_of, write_atomically
+from geoscene.support.storage import Stored, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from geoscene.previews import PAPER, Color, Plan, card
+from geoscene.drawing.previews import PAPER, Color, Plan, card
 
 if TYPE_CHECKING:
     from geoscene.scene.layout import Scene

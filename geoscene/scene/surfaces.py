@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.geometry.watertight import NEAR, degenerate_faces, edge_uses, grid_cells, near_vertices, weld
 from geoscene.typing import Ints
-from geoscene.watertight import NEAR, degenerate_faces, edge_uses, grid_cells, near_vertices, weld
 
 _STEP = 1e-5
 """Metres: the finest step of the formats with whole coordinates."""

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from geoscene.buildings.facades import Facades, Openings, WallRelief
 from geoscene.classes import Class
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
-from geoscene.files import digest, write_atomically
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Instances, Mesh
 from geoscene.objects.forests import Forests, forest_instances
+from geoscene.support.files import digest, write_atomically
+from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float
-from geoscene.untrusted import read_arrays
 
 
 @dataclass(frozen=True, slots=True)

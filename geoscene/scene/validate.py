@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from geoscene.classes import Class
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.scene.layout import Scene
 from geoscene.scene.surfaces import check_surfaces
-from geoscene.watertight import validate_mesh
 
 
 def check_scene(scene: Scene) -> dict[str, Any]:

@@ -15,16 +15,16 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class, materials
-from geoscene.csv_tables import write_columns
 from geoscene.errors import SceneFormatError, WorkersLostError
-from geoscene.files import digest_of, exclusive, write_json
-from geoscene.frames import Frame
-from geoscene.mesh import Mesh
-from geoscene.report import Problem
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
 from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
 from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import digest_of, exclusive, write_json
+from geoscene.support.report import Problem
 from geoscene.typing import Ints
 from geoscene.uses import USES, Needed, Use
 

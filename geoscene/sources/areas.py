@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.report import Problem
 from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
 from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of, tangled
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
+from geoscene.support.report import Problem
 from geoscene.typing import Float, Ints
 
 _NO_NODES: Ints = np.empty(0, np.int64)

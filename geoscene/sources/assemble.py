@@ -6,12 +6,12 @@ import numpy as np
 import shapely
 
 from geoscene.errors import SourceNotFoundError
-from geoscene.report import Action, Problem
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.extent import checked_bounds, located, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
+from geoscene.support.report import Action, Problem
 from geoscene.typing import Bools, Ints
 
 _KINDS = ("road", "railway", "waterway", "barrier")

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError
-from geoscene.files import write_atomically
-from geoscene.frames import Frame, beside, rim_of, wrapped
+from geoscene.geometry.frames import Frame, beside, rim_of, wrapped
 from geoscene.options import BuildOptions
-from geoscene.progress import Progress, silent
 from geoscene.sources.data import Bounds, OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.registry import SOURCES
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
 DATUM = "the geoids of the tiles' sources, mixed (EGM96, EGM2008, NAVD88, national)"
@@ -109,7 +109,7 @@ def fetch_elevation(
     set to 0, the height of the water; land below sea level behind a dike keeps its heights.
 
     cache_dir : folder for the tiles and the GeoTIFF; each tile is requested once
-    crs       : of the scene, as in `geoscene.frames.Frame.at`; the GeoTIFF covers the scene's rectangle
+    crs       : of the scene, as in `Frame.at`; the GeoTIFF covers the scene's rectangle
     server    : the public tiles if None
     zoom      : of the tiles; by default the smallest with pixels of at most 10 m (5 to 10 m)
 

@@ -9,11 +9,11 @@ import numpy as np
 import shapely
 
 from geoscene.errors import InputError
-from geoscene.frames import beside
-from geoscene.report import Problem
+from geoscene.geometry.frames import beside
 from geoscene.sources.data import METRES_PER_DEGREE, Area, Bounds
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.tags import is_building, kind_of
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float
 
 _WIDE = 25_000.0

@@ -19,13 +19,13 @@ import numpy as np
 
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
-from geoscene.files import write_atomically
 from geoscene.sources.assemble import features
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds, OsmData, Progress
 from geoscene.sources.elements import Collector
 from geoscene.sources.extent import checked_bounds
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
 from geoscene.sources.overpass import collect_answer, query_for
+from geoscene.support.files import write_atomically
 
 _SMALLEST = 400.0  # metres: smallest side of the box of a place
 _NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one per second

@@ -14,12 +14,12 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from geoscene.errors import InputError, SourceNotFoundError, need
-from geoscene.frames import beside
-from geoscene.report import Problem
+from geoscene.geometry.frames import beside
 from geoscene.sources.data import Area, Bounds, OsmData, Progress, Tags
 from geoscene.sources.extent import checked_bounds, close_together
 from geoscene.sources.registry import SOURCES
 from geoscene.sources.rings import polygons_of
+from geoscene.support.report import Problem
 
 _TAGS = {
     "name": "name",

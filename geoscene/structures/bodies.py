@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import Structures
 from geoscene.typing import Bools, Float, Ints

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from geoscene import polylines
 from geoscene.classes import Class
+from geoscene.geometry import polylines
 from geoscene.structures.bodies import Bodies, between_rings, swept, uprights
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.lining import (

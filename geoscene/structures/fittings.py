@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from geoscene.intersections import close_faces
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.intersections import close_faces
+from geoscene.geometry.mesh import Mesh, concatenate
+from geoscene.geometry.watertight import grid_cells, weld
 from geoscene.structures.bodies import Bodies
 from geoscene.structures.equipment import fans, lamps, signs, trays
 from geoscene.structures.lining import portals, ribs
 from geoscene.structures.table import Structures
 from geoscene.structures.tubes import has_walkway
 from geoscene.typing import Bools
-from geoscene.watertight import grid_cells, weld
 
 
 @dataclass(frozen=True, slots=True)

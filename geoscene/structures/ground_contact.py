@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class, materials
+from geoscene.geometry import polylines
 from geoscene.ground.layers import PADS, Layers
 from geoscene.roadgraph.surface_rows import in_reach
 from geoscene.structures.heights import surface_heights

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from geoscene.compiled import njit
 from geoscene.structures.table import Structures
+from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float
 
 _FADE = 1.5

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.structures.bodies import Bodies, between_rings, uprights
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.table import Structures

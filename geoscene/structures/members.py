@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surface_rows import SurfaceRows
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 _APPROACH = 6.0

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings
 from geoscene.buildings.table import GRID
-from geoscene.report import Problem
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import StructureOptions, Structures
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Ints
 
 _SCANT = 1.0

@@ -10,9 +10,8 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
-from geoscene.polylines import unit
-from geoscene.report import Problem
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.polylines import unit
 from geoscene.roadgraph import find_obstacles
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.paths import way_lines
@@ -23,6 +22,7 @@ from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
+from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Height, Ints
 
 _STATION = 5.0

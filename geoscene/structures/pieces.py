@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class
+from geoscene.geometry import polylines
 from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.structures.layered import PRECISION

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from geoscene.frames import Frame
-from geoscene.report import Problem
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.surface_rows import in_reach
 from geoscene.roadgraph.surfaces import RoadSurfaces
@@ -16,6 +15,7 @@ from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import NEAR, cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
+from geoscene.support.report import Problem
 from geoscene.typing import Height
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
 from geoscene.typing import Bools, Float
 

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
 from geoscene.classes import Class, materials
-from geoscene.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
+from geoscene.geometry import polylines
+from geoscene.geometry.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
 from geoscene.structures.fittings import tunnel_fittings
 from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from geoscene import polylines
 from geoscene.classes import Class
-from geoscene.splitmix import uniform_at
+from geoscene.geometry import polylines
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.table import Structures
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Float, Ints
 
 _ROOM = 3.0

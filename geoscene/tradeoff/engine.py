@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.export.objects import expand, parts
 from geoscene.export.raster import Grid, draw, grid_of
-from geoscene.memory import peak_memory
-from geoscene.mesh import concatenate
+from geoscene.geometry.mesh import concatenate
+from geoscene.geometry.watertight import volumes
 from geoscene.options import BuildOptions
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import OsmData
+from geoscene.support.memory import peak_memory
+from geoscene.support.progress import Progress, silent
 from geoscene.tradeoff.variants import Variant, coarse_elevation, full, variants
-from geoscene.watertight import volumes
 
 MOST_CELLS = 16_000_000
 """Cells of the surface models that are compared; larger scenes have larger cells."""
@@ -147,7 +147,7 @@ def _measured(read: Callable[[], OsmData], variant: Variant, *, folder: Path) ->
 
 def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> Cost:
     """Build a scene in this process and return all that it cost."""
-    from geoscene.pipeline import build  # noqa: PLC0415 - part of the cost
+    from geoscene.pipeline.build import build  # noqa: PLC0415 - part of the cost
 
     build(read(), out, options=options, overwrite=out.exists())
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from geoscene.charts import (
+from geoscene.drawing.charts import (
     Axes,
     Point,
     html_page,
@@ -17,8 +17,8 @@ from geoscene.charts import (
     print_table,
     scatter,
 )
-from geoscene.figures import metres, share, size
-from geoscene.files import write_atomically, write_json
+from geoscene.drawing.figures import metres, share, size
+from geoscene.support.files import write_atomically, write_json
 from geoscene.tradeoff.engine import Row, Tradeoff
 
 TARGETS = (0.01, 0.1, 1.0)

@@ -12,7 +12,7 @@ from string import Template
 from typing import IO
 
 from geoscene.errors import InputError
-from geoscene.files import append
+from geoscene.support.files import append
 
 _COPYRIGHT = "https://www.openstreetmap.org/copyright"
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.mesh import FLOOR, Instances, Mesh
-from geoscene.splitmix import uniform_at
+from geoscene.geometry.mesh import FLOOR, Instances, Mesh
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
 _ON_EDGE = 1e-6

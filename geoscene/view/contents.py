@@ -12,7 +12,7 @@ from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
 from geoscene.export.files import compact_json
 from geoscene.export.objects import read_features
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.options import Degrees
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile

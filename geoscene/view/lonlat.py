@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 
 ACCURACY = 0.01

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.guesses import WINDOWS, Guesses, guess_looks, region_at
 from geoscene.classes import Class, materials
-from geoscene.columns import Columns
 from geoscene.export.objects import Features
-from geoscene.mesh import ROOF, WALL, Mesh
+from geoscene.geometry.mesh import ROOF, WALL, Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 GUESSED = 4

@@ -12,10 +12,10 @@ import numpy as np
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import attribution
-from geoscene.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.options import ViewOptions
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
 from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
 from geoscene.view.contents import Contents, tiles_within

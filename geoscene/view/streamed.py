@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from geoscene.export.files import compact_json
-from geoscene.files import write_atomically
-from geoscene.mesh import Instances, concatenate
-from geoscene.progress import Progress
+from geoscene.geometry.mesh import Instances, concatenate
 from geoscene.scene.tile_files import Tile
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from geoscene.view.coarse import coarser_mesh, fewer_instances
 from geoscene.view.contents import Contents

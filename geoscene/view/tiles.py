@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints

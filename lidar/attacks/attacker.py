@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses

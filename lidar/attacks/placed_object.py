@@ -11,7 +11,7 @@ import numpy as np
 
 from geoscene.classes import Class, materials
 from geoscene.errors import need
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.attacks.attacker import file_digest

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from lidar.raycast import Hits
 from lidar.raycast.memory import inlined
 from lidar.relief import FRAME, INFILL, ROOM, SILL, WallTables, march

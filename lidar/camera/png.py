@@ -11,7 +11,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 from PIL import Image
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.errors import FormatError
 
 DEPTH_SCALE = 256.0

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.camera import ground_texture, texture
 from lidar.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, Facades, facade

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from geoscene.splitmix import uniform_at
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Float
 
 SIDE = 1.5

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import numpy as np
 from numpy.typing import ArrayLike
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
 

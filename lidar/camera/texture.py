@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 
 _CONTRACT = {"contract", "arcp", "nsz"}
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}

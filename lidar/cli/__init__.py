@@ -1,8 +1,8 @@
 """The `lidar` program: drive through scenes, and make maps of what was recorded."""
 
-from geoscene.console import main as run
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
+from geoscene.support.console import main as run
 from lidar.cli.data import apply, convert, denoise, map_, odometry
 from lidar.cli.drives import drive, redteam, sweep, tradeoff
 from lidar.cli.evaluation import detect, evaluate

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from geoscene.console import (
+from geoscene.options import CloudOptions
+from geoscene.support.console import (
     FAILURE,
     SEVERAL,
     Report,
@@ -21,7 +22,6 @@ from geoscene.console import (
     progress_bar,
     whole,
 )
-from geoscene.options import CloudOptions
 from lidar.cli.program import Out, Reporting, print_effects
 from lidar.errors import InputError, LidarError
 from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
@@ -79,7 +79,7 @@ def drive(
         or write them to FILE.rrd for it.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
-    from geoscene.storage import published, shown, url_of  # noqa: PLC0415
+    from geoscene.support.storage import published, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
     from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.console import Report, command_line, note_new_folder, print_json, progress_bar
+from geoscene.support.console import Report, command_line, note_new_folder, print_json, progress_bar
 from lidar.cli.program import Out, Reporting
 from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions

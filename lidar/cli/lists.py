@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
-from geoscene.console import FAILURE, WORDS, print_json, progress_bar
+from geoscene.support.console import FAILURE, WORDS, print_json, progress_bar
 from lidar.cli.program import JsonFlag, QuietFlag
 
 

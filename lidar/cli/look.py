@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from geoscene.console import Report, note_new_folder, print_json, progress_bar, with_flags
+from geoscene.support.console import Report, note_new_folder, print_json, progress_bar, with_flags
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app
 from lidar.errors import InputError
 from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
@@ -199,7 +199,7 @@ def plot(
 
 def _plot_weather(options: PlotOptions, out: Path, *, report: Report) -> int:
     """Plot models of weather against published values."""
-    from geoscene.files import write_atomically  # noqa: PLC0415
+    from geoscene.support.files import write_atomically  # noqa: PLC0415
     from lidar.plots import check_out  # noqa: PLC0415
     from lidar.rig.scanner import load_sensor  # noqa: PLC0415
     from lidar.weather.figures import weather_figure  # noqa: PLC0415

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from geoscene.console import DEFAULTS, Report
+from geoscene.support.console import DEFAULTS, Report
 from lidar import __version__
 from lidar.options import OUTPUT
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.console import (
+from geoscene.support.console import (
     FAILURE,
     SEVERAL,
     Report,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
-from geoscene.files import atomic_path
+from geoscene.support.files import atomic_path
 from geoscene.typing import Float, Ints
 from lidar.camera.outline import outline
 from lidar.dataset.layout import Paths, frame_numbers, read_rows, read_sensors, reading_file

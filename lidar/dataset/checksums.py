@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from geoscene.files import write_atomically
-from geoscene.progress import Progress, silent
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
 
 CHECKSUMS = "checksums.sha256"
 """Name of the file."""

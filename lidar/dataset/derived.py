@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from geoscene.errors import NotWrittenError
-from geoscene.files import replaced_folder
+from geoscene.support.files import replaced_folder
 from lidar.dataset.layout import Paths, own_files
 from lidar.errors import DatasetError, InputError
 

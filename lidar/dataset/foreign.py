@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.files import write_json
+from geoscene.support.files import write_json
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import reading_file

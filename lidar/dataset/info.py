@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.progress import Progress, silent
 from geoscene.scene.layout import SceneFiles
-from geoscene.storage import shown, url_of
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
 from lidar.dataset.foreign import foreign_clouds, read_foreign_stages

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
-from geoscene.csv_tables import table_blocks, write_blocks
-from geoscene.files import naming
+from geoscene.support.columns import Columns
+from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.files import naming
 from geoscene.typing import Ints
 from lidar.dataset.checksums import file_digest
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, Mount

@@ -33,9 +33,9 @@ import numpy as np
 from pyproj import CRS
 
 from geoscene.errors import reading
-from geoscene.files import delete_leftovers, digest, write_json
-from geoscene.frames import Frame
-from geoscene.storage import Stored, cache_folder, url_of
+from geoscene.geometry.frames import Frame
+from geoscene.support.files import delete_leftovers, digest, write_json
+from geoscene.support.storage import Stored, cache_folder, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import Format

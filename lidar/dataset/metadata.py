@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import table_blocks, write_blocks
-from geoscene.files import write_json
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
+from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.files import write_json
 from lidar.dataset.kitti_sequence import write_sequence
 from lidar.dataset.layout import Paths
 from lidar.dataset.navigation_files import heights_of, observed_fixes, record_fixes, record_samples

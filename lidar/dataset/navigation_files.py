@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import BLOCK_ROWS, table_blocks, write_blocks, write_columns
-from geoscene.files import atomic_path
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
+from geoscene.support.csv_tables import BLOCK_ROWS, table_blocks, write_blocks, write_columns
+from geoscene.support.files import atomic_path
 from geoscene.typing import Float
 from lidar.dataset.layout import Paths, opened_rows, read_rows, reading_file
 from lidar.geometry.poses import Trajectory
@@ -38,7 +38,7 @@ from lidar.world.world import World
 class Heights:
     """What the heights of fixes are above.
 
-    vertical   : as in `geoscene.frames.Frame`
+    vertical   : as in `geoscene.geometry.frames.Frame`
     separation : (n,) metres, geoid above the ellipsoid at each fix; None if unknown
     geoid      : its name, or empty
     """

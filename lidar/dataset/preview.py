@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.previews import DARK, Plan, around, card
+from geoscene.drawing.previews import DARK, Plan, around, card
 from geoscene.typing import Float
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds

@@ -9,8 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from geoscene.files import write_json
 from geoscene.scene import Scene
+from geoscene.support.files import write_json
 from lidar.dataset.checksums import folder_digest
 from lidar.dataset.layout import Dataset, reading_file
 

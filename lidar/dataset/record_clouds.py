@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import write_columns
+from geoscene.support.csv_tables import write_columns
 from geoscene.typing import Float
 from lidar.dataset.boxes import box_rows, count_points
 from lidar.dataset.deskew import MOMENTS, deskewed

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.csv_tables import write_columns
+from geoscene.support.csv_tables import write_columns
 from lidar.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.camera.render import Frame as Image
 from lidar.camera.render import exposure_times, optical_flow, render

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.camera.settings import PLAIN as PLAIN_CAMERA
 from lidar.camera.settings import CameraSettings
 from lidar.dataset.deskew import MOMENTS

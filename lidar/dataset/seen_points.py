@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 from lidar.camera.png import counts_to_depth, read_png
 from lidar.camera.render import exposure_times

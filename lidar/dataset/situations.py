@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.camera.light import Light

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from geoscene.untrusted import read_arrays
+from geoscene.support.untrusted import read_arrays
 from lidar.dataset.layout import reading_file
 from lidar.sensors.cloud import Cloud
 from lidar.signal.past import Past, past_of

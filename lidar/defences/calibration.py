@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.support.untrusted import read_toml
 from geoscene.typing import Float
-from geoscene.untrusted import read_toml
 from lidar.defences.scores import FALSE_ALARMS, Samples, threshold_at
 from lidar.detection import RULES, Detector
 from lidar.errors import InputError

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import write_columns
-from geoscene.files import atomic_folder, write_atomically, write_json
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import atomic_folder, write_atomically, write_json
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.camera.png import write_png
 from lidar.dataset.derived import check_target

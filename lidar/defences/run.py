@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from geoscene.storage import url_of
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import url_of
 from lidar.defences.observation import Observation
 from lidar.defences.reading import Scans
 from lidar.defences.registry import NamedDefence

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Float
-from geoscene.untrusted import read_arrays
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
 from lidar.physics.echoes import Origin

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_json
-from geoscene.progress import Progress, silent
+from geoscene.support.files import write_json
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.boxes import merge_box_files
 from lidar.dataset.checksums import write_checksums

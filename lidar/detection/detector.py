@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 from lidar.detection.boxes import Rectangle
 

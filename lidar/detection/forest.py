@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
+from geoscene.support.untrusted import DAMAGED_ARCHIVE, read_arrays
 from geoscene.typing import Float
-from geoscene.untrusted import DAMAGED_ARCHIVE, read_arrays
 from lidar.errors import FormatError
 
 KIND = "geoscene random forest"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import atomic_folder, write_atomically, write_json
-from geoscene.progress import Progress, silent
+from geoscene.support.files import atomic_folder, write_atomically, write_json
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.export.kitti import OBJECTS
 from lidar.dataset.export.kitti_drive import KittiDrive, read_drive
 from lidar.dataset.export.kitti_objects import CORNERS, outline

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from geoscene.canvas import Canvas
-from geoscene.charts import COLORS, Axes
+from geoscene.drawing.canvas import Canvas
+from geoscene.drawing.charts import COLORS, Axes
+from geoscene.drawing.panels import Band, Panel, Raster, Series, figure
 from geoscene.errors import GeosceneError
-from geoscene.panels import Band, Panel, Raster, Series, figure
 from geoscene.scene import open_scene
 from geoscene.typing import Float
 from lidar.evaluation.pose_errors import absolute, by_axis

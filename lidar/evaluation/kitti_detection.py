@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 from lidar.errors import FormatError
 from lidar.evaluation.overlap import area_overlap, flat_overlap, footprints, volume_overlap

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
-from geoscene.columns import Columns
 from geoscene.errors import reading
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.export.nuscenes import (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.evaluation.matching import Pairs
 from lidar.geometry.attitude import quat_from_matrix

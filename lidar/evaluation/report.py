@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.charts import html_page, html_picture, html_table
-from geoscene.csv_tables import write_columns
-from geoscene.files import atomic_folder, write_atomically, write_json
+from geoscene.drawing.charts import html_page, html_picture, html_table
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import atomic_folder, write_atomically, write_json
 from lidar import __version__
 from lidar.errors import InputError
 from lidar.evaluation.figures import figures_of

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.columns import Columns
 from geoscene.errors import reading
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.recorded import mount_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geoscene.progress import Progress, silent
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.evaluation.intervals import Statistics, Value, statistics

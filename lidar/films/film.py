@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from geoscene.files import atomic_path
-from geoscene.progress import Progress, silent
+from geoscene.support.files import atomic_path
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Images, Stream, frames_within, images_of, scanner_clouds

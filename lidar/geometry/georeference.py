@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pyproj import CRS, Transformer
 
-from geoscene.compiled import njit
-from geoscene.frames import Frame, utm_crs
+from geoscene.geometry.frames import Frame, utm_crs
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 
 AFFINE_LIMIT = 1e-4

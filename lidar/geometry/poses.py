@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from geoscene.columns import Columns, row_blocks
-from geoscene.compiled import njit
+from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 

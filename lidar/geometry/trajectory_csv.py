@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.csv_tables import write_blocks
+from geoscene.support.csv_tables import write_blocks
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory, blocks_of
 

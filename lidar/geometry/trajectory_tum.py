@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import FormatError, InputError
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.files import atomic_folder, exclusive
-from geoscene.previews import DARK, Plan, around, card
-from geoscene.progress import Progress, silent
+from geoscene.drawing.previews import DARK, Plan, around, card
 from geoscene.scene import open_scene
+from geoscene.support.files import atomic_folder, exclusive
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows

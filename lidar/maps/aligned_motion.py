@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.recorded import Stream, cloud_points
 from lidar.maps.measured_poses import Motion

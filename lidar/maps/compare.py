@@ -14,9 +14,9 @@ from PIL import Image
 from pyproj import CRS
 
 from geoscene.classes import Class
-from geoscene.files import atomic_path, write_atomically
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
+from geoscene.support.files import atomic_path, write_atomically
 from geoscene.typing import Float
 from lidar.dataset.formats.table import Table
 from lidar.errors import InputError

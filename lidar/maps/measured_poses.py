@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float, Ints
 from lidar.dataset.layout import Dataset
 from lidar.dataset.navigation_files import read_fixes, read_samples

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from geoscene.columns import row_blocks
+from geoscene.support.columns import row_blocks
 from lidar.dataset.formats.table import Table
 from lidar.maps.squares import Square, Squares, squares_beside
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.classes import Class, class_codes
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.camera.render import RenderOptions, render
 from lidar.errors import InputError

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.formats import format_of
 from lidar.dataset.layout import Dataset

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.classes import Class
-from geoscene.files import atomic_path
+from geoscene.support.files import atomic_path
 from lidar.dataset.formats.table import Table
 from lidar.errors import InputError
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import temporary_folder
+from geoscene.support.files import temporary_folder
 from lidar.dataset.formats.table import Table, records
 
 Square = tuple[int, int]

@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from pyproj import CRS
 
-from geoscene.columns import row_blocks
 from geoscene.scene.geopackage import Layer, open_geopackage
+from geoscene.support.columns import row_blocks
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates

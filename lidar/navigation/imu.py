@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns
-from geoscene.csv_tables import table_blocks
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns
+from geoscene.support.csv_tables import table_blocks
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
 from lidar.geometry.poses import Trajectory, release, room

@@ -13,7 +13,7 @@ from geoscene.typing import Float
 from lidar.navigation.gnss import Fixes
 
 HEIGHTS = {"flat": "an assumed level ground", "orthometric": "the geoid", "ellipsoidal": "the ellipsoid"}
-"""What heights are above, by `geoscene.frames.Frame.vertical`."""
+"""What heights are above, by `geoscene.geometry.frames.Frame.vertical`."""
 KNOT = 1852.0 / 3600.0
 """Metres per second in a knot."""
 _SYSTEMS = {"G": ("GP", 1, 0), "R": ("GL", 2, 64), "E": ("GA", 3, 0), "C": ("GB", 4, 0)}
@@ -59,7 +59,7 @@ def _number(value: float, decimals: int) -> str:
 def height_note(vertical: str, geoid: str = "") -> str:
     """A TXT sentence that says what the heights in GGA are above.
 
-    vertical : as in `geoscene.frames.Frame`
+    vertical : as in `geoscene.geometry.frames.Frame`
     geoid    : name of the geoid that `nmea` is given, or empty
     """
     text = f"heights above {HEIGHTS[vertical]}"
@@ -77,7 +77,7 @@ def nmea(
     satellites of a system (GLONASS from 65 on) and ends with the number of the system.
 
     start      : UTC of the drive's start; sentences carry UTC
-    vertical   : reference of the fixes' heights, as in `geoscene.frames.Frame`
+    vertical   : reference of the fixes' heights, as in `geoscene.geometry.frames.Frame`
     separation : (n,) heights of the geoid above the ellipsoid, metres, for GGA, whose heights are then above
                  the geoid. Without it, heights are unchanged and the field is empty
 

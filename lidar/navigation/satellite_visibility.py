@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Bools, Float
 from lidar.geometry.poses import release, room
 from lidar.navigation.constellations import satellite_names, satellites

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from geoscene.csv_tables import write_columns
-from geoscene.files import write_json
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import write_json
 from geoscene.typing import Float, Ints
 from lidar.dataset.kitti_sequence import write_poses
 from lidar.dataset.layout import Dataset

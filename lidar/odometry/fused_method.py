@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError

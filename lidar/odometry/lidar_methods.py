@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from geoscene.errors import need
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.odometry.deskewing import still
 from lidar.odometry.estimate import Estimate, propagated

@@ -10,8 +10,8 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
-from geoscene.files import replaced_folder
-from geoscene.progress import Progress, silent
+from geoscene.support.files import replaced_folder
+from geoscene.support.progress import Progress, silent
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.odometry.estimate import OWN_FILES, Estimate, begun_at, write_estimate

@@ -6,7 +6,7 @@ from importlib import metadata
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, color_images

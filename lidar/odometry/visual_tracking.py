@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geoscene.errors import need
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.recorded import Stream
 from lidar.odometry.deskewing import still

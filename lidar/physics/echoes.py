@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
-from geoscene.compiled import njit
+from geoscene.support.columns import Columns
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.physics.footprint import AXIS_ONLY, Gap
 from lidar.raycast.memory import inlined

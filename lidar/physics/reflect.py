@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from geoscene.classes import materials
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.physics.fresnel import through_water

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns
+from geoscene.geometry import polylines
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.geometry import poses
 from lidar.geometry.poses import blocks_of, release, room
@@ -175,5 +175,5 @@ def _whole_turns(angle: Float) -> Float:
 
 
 def curvatures(line: Float) -> Float:
-    """Curvature (n,) at each point of a line (n, 2 or 3): see `geoscene.polylines.curvatures`."""
+    """Curvature (n,) at each point of a line (n, 2 or 3): see `geoscene.geometry.polylines.curvatures`."""
     return rowwise(polylines.curvatures, line, reach=2)

@@ -9,8 +9,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns, row_blocks
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float
 from lidar.errors import BlockedError
 from lidar.geometry.poses import release

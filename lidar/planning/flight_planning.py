@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class
-from geoscene.reach import RoadMap
+from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float

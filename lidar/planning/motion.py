@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler

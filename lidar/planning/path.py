@@ -19,9 +19,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns, row_blocks
-from geoscene.frames import Frame
+from geoscene.geometry import polylines
+from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
 from lidar.geometry.poses import blocks_of, release, room

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.errors import FrameError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import DatasetError, FormatError, RouteError
 from lidar.geometry.poses import Trajectory

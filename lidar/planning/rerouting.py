@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from lidar.errors import BlockedError, RouteError
 from lidar.planning.path import MARGIN, Path, Surface, plan_path

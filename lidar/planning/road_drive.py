@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import row_blocks
-from geoscene.progress import Progress, silent
-from geoscene.reach import RoadMap
+from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
+from geoscene.support.columns import row_blocks
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.planning.blockwise import rowwise

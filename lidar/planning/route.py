@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene import polylines
-from geoscene.frames import Frame
+from geoscene.geometry import polylines
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import graph_lanes
 from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states

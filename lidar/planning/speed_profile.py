@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.columns import row_blocks
+from geoscene.support.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import BLOCK_POSES, release, room

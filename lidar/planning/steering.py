@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import row_blocks
+from geoscene.support.columns import row_blocks
 from geoscene.typing import Float
 from lidar.geometry.poses import release, room
 from lidar.planning.blockwise import curvatures, gathered, headings, mean_gap, rowwise, smoothed

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import nearest_edge
 from geoscene.sources.tracks import read_track as read_points

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geoscene.files import write_atomically
-from geoscene.progress import Progress, silent
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
 from lidar.errors import InputError
 from lidar.options import PlotOptions
 
@@ -94,7 +94,7 @@ def plot(
 
 def check_out(out: Path, *, overwrite: bool) -> None:
     """Raise InputError for a name that is not of a PNG or SVG, or that is taken."""
-    from geoscene.canvas import SUFFIXES  # noqa: PLC0415  (0.1 s)
+    from geoscene.drawing.canvas import SUFFIXES  # noqa: PLC0415  (0.1 s)
 
     if out.suffix.lower() not in SUFFIXES:
         raise InputError(f"`out` {out}: plots are PNG or SVG; give a name that ends with .png or .svg")

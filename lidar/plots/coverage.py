@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.axes import Axis
-from geoscene.charts import Axes
 from geoscene.classes import Class
-from geoscene.panels import Raster, Scale, Series, figure
-from geoscene.progress import Progress
+from geoscene.drawing.axes import Axis
+from geoscene.drawing.charts import Axes
+from geoscene.drawing.panels import Raster, Scale, Series, figure
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import Dataset

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.canvas import Canvas
 from geoscene.classes import Class
+from geoscene.drawing.canvas import Canvas
 from geoscene.typing import Float, Ints
 
 WIDE = (1180, 300)

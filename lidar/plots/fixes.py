@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.charts import COLORS, Axes
-from geoscene.frames import Frame
-from geoscene.panels import Band, Panel, Series, figure
-from geoscene.progress import Progress
+from geoscene.drawing.charts import COLORS, Axes
+from geoscene.drawing.panels import Band, Panel, Series, figure
+from geoscene.geometry.frames import Frame
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.dataset.navigation_files import read_fixes

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from geoscene.charts import COLORS, Axes
-from geoscene.panels import Panel, Series, figure
-from geoscene.progress import Progress
+from geoscene.drawing.charts import COLORS, Axes
+from geoscene.drawing.panels import Panel, Series, figure
+from geoscene.support.progress import Progress
 from lidar.dataset.layout import Dataset
 from lidar.options import PlotOptions
 from lidar.plots.drawn import WIDE, Drawn, plain, thinned

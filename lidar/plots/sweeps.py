@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.axes import Axis
-from geoscene.canvas import Color
-from geoscene.charts import COLORS, Axes
 from geoscene.classes import class_codes
-from geoscene.panels import Panel, Raster, Scale, Series, figure
-from geoscene.progress import Progress
+from geoscene.drawing.axes import Axis
+from geoscene.drawing.canvas import Color
+from geoscene.drawing.charts import COLORS, Axes
+from geoscene.drawing.panels import Panel, Raster, Scale, Series, figure
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset

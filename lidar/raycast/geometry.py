@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast.hull import LONG, NARROW, displacements, margins_of, patches

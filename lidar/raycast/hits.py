@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 
 ROUNDING = 2.0**-22

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, Rays, Target, unpacked
 from lidar.raycast.exact import STACK, first_hit

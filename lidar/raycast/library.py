@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.compiled import level
+from geoscene.support.compiled import level
 from lidar.errors import BackendError
 
 TRIANGLE, INSTANCE_ARRAY = 0, 122

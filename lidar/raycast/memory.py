@@ -9,7 +9,7 @@ import numpy as np
 from numba import carray, types  # type: ignore[attr-defined]
 from numba.extending import intrinsic
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 
 intersect1: Any = types.ExternalFunction("rtcIntersect1", types.void(*[types.int64] * 3))
 occluded1: Any = types.ExternalFunction("rtcOccluded1", types.void(*[types.int64] * 3))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.tree import DEPTH, FIRST, LEAF, RIGHT
 

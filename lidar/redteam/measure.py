@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import digest_of, write_json
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
+from geoscene.support.files import digest_of, write_json
+from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float, Ints
-from geoscene.untrusted import read_arrays
 from lidar import __version__
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file

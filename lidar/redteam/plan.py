@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import reading
-from geoscene.untrusted import read_toml
+from geoscene.support.untrusted import read_toml
 from lidar.defences.registry import NamedDefence, read_defences
 from lidar.detection import RULES
 from lidar.detection.registry import read_detector

@@ -7,10 +7,19 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from geoscene.charts import Axes, Span, curves, html_matrix, html_page, html_picture, html_table, spans
-from geoscene.csv_tables import write_columns
-from geoscene.figures import share
-from geoscene.files import write_atomically, write_json
+from geoscene.drawing.charts import (
+    Axes,
+    Span,
+    curves,
+    html_matrix,
+    html_page,
+    html_picture,
+    html_table,
+    spans,
+)
+from geoscene.drawing.figures import share
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import write_atomically, write_json
 from lidar import __version__
 from lidar.redteam.evaluate import Accuracy, Detection, Matrix, Success, document_of
 from lidar.redteam.measure import FEWEST

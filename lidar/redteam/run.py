@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geoscene.errors import GeosceneError
-from geoscene.files import exclusive
-from geoscene.processes import run_tasks
-from geoscene.progress import Progress, silent
+from geoscene.support.files import exclusive
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress, silent
 from lidar.detection import RULES
 from lidar.detection.registry import read_detector
 from lidar.errors import InputError, LidarError

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import called, inlined
 from lidar.relief.roughness import BLOCK, KINDS, LEVELS, NODES, REACH, STEP, roughness

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import Rays
 from lidar.raycast.hits import Hits

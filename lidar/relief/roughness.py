@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.files import write_atomically
-from geoscene.mesh import Mesh
-from geoscene.storage import cache_folder
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.files import write_atomically
+from geoscene.support.storage import cache_folder
+from geoscene.support.untrusted import DAMAGED_ARCHIVE, read_arrays
 from geoscene.typing import Float
-from geoscene.untrusted import DAMAGED_ARCHIVE, read_arrays
 
 N0 = 0.1
 """Reference spatial frequency of ISO 8608, cycles per metre."""

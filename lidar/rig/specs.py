@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.untrusted import read_toml
+from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount

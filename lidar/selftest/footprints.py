@@ -12,15 +12,15 @@ import shapely
 from shapely import affinity
 
 from geoscene.buildings import build_solids, read_buildings
-from geoscene.frames import Frame
-from geoscene.mesh import Mesh
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
+from geoscene.geometry.watertight import Verdict, validate_mesh
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.typing import Float
-from geoscene.watertight import Verdict, validate_mesh
 from lidar.selftest.case import Case
 
 _FRAME = Frame.at(8.7, 49.4)

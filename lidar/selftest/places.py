@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from pyproj import Geod, Transformer
 
-from geoscene.frames import Frame, utm_crs, wrapped
+from geoscene.geometry.frames import Frame, utm_crs, wrapped
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.typing import Float

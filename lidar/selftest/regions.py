@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import Scene
 from geoscene.sources import read_osm
 from geoscene.typing import Float, Ints

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.progress import Progress, silent
+from geoscene.support.progress import Progress, silent
 from lidar.errors import BackendError, InputError
 from lidar.raycast.library import library
 from lidar.selftest.case import Case

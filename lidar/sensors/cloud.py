@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from lidar.errors import LidarError
 
 

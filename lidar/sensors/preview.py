@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.classes import Class, class_codes
-from geoscene.previews import DARK, Plan, around, card
+from geoscene.drawing.previews import DARK, Plan, around, card
 
 if TYPE_CHECKING:
     from lidar.sensors.cloud import Cloud

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.physics.echoes import Echoes, depth_of, gather, insert
 from lidar.physics.footprint import Gap

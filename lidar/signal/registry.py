@@ -12,7 +12,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from geoscene.untrusted import read_toml
+from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.random_streams import generator
 from lidar.signal.effects import Counts

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import LidarError
 from lidar.physics.detector import added_noise

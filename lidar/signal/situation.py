@@ -9,7 +9,7 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.camera.light import Light
 from lidar.geometry.poses import Poses

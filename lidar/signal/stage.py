@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.physics.detector import received

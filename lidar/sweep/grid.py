@@ -12,12 +12,12 @@ from typing import Any
 
 from cyclopts import App
 
-from geoscene.console import DEFAULTS, guard_numbers
 from geoscene.errors import reading
 from geoscene.scene import open_scene
 from geoscene.scene.layout import SceneFiles
-from geoscene.storage import url_of
-from geoscene.untrusted import read_toml
+from geoscene.support.console import DEFAULTS, guard_numbers
+from geoscene.support.storage import url_of
+from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.options import AccuracyOptions, DriveOptions
 from lidar.plan import sensors_of

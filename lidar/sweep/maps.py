@@ -12,17 +12,17 @@ from typing import Any
 
 from cyclopts import App
 
-from geoscene.cluster import Cluster
-from geoscene.console import DEFAULTS, guard_numbers
 from geoscene.errors import SceneFormatError
-from geoscene.files import digest_of, sources_digest, write_json
 from geoscene.options import BuildOptions, Degrees
-from geoscene.pipeline import build
-from geoscene.progress import Progress, silent
+from geoscene.pipeline.build import build
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
 from geoscene.sources import read_osm, with_elevation
-from geoscene.storage import cache_folder
+from geoscene.support.cluster import Cluster
+from geoscene.support.console import DEFAULTS, guard_numbers
+from geoscene.support.files import digest_of, sources_digest, write_json
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import cache_folder
 from lidar.errors import InputError
 from lidar.sweep.words import naming, words_of
 

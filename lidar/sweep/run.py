@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.cluster import Cluster, connected
-from geoscene.csv_tables import write_columns
 from geoscene.errors import GeosceneError, WorkersLostError
-from geoscene.files import digest_of, exclusive, write_json
-from geoscene.processes import run_tasks
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
+from geoscene.support.cluster import Cluster, connected
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import digest_of, exclusive, write_json
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress, silent
 from lidar import __version__
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset

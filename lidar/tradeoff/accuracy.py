@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
 from lidar import frame_loop, pipeline
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError

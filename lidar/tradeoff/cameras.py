@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.camera.settings import CameraSettings
 from lidar.options import TradeoffOptions

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from geoscene.figures import metres
+from geoscene.drawing.figures import metres
 from lidar.errors import InputError
 from lidar.options import Accuracy
 from lidar.tradeoff.errors import Estimate

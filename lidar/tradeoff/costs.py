@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.rig.devices import Camera, Scanner
 from lidar.tradeoff.errors import Estimate, median
 from lidar.tradeoff.memory import Task, peaks

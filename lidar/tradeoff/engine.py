@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
 from lidar.options import DriveOptions, TradeoffOptions

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.las import SCALE, LasInfo

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.camera.png import depth_to_counts, encode_png, feature_to_image
 from lidar.camera.render import Frame, exposure_times, render

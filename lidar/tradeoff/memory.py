@@ -7,8 +7,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from geoscene.memory import peak_memory
 from geoscene.scene import open_scene
+from geoscene.support.memory import peak_memory
 from geoscene.typing import Float
 from lidar.camera.settings import CameraSettings
 from lidar.dataset.formats.table import cloud_table

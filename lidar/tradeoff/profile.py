@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import reading
-from geoscene.files import digest, write_json
-from geoscene.progress import Progress, silent
 from geoscene.scene import Scene
-from geoscene.storage import cache_folder
+from geoscene.support.files import digest, write_json
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import cache_folder
 from lidar import __version__
 from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError

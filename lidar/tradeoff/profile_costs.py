@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.camera.settings import CameraSettings
 from lidar.dataset.record import record_frame

@@ -8,7 +8,7 @@ from functools import partial
 from itertools import groupby
 from typing import Any
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.camera.settings import CameraSettings
 from lidar.errors import InputError
 from lidar.physics.settings import ScannerSettings

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from pyproj import Transformer
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.rig.devices import Scanner
 from lidar.tradeoff.comparison import Listing, Record

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from geoscene.charts import (
+from geoscene.drawing.charts import (
     Axes,
     Point,
     html_page,
@@ -18,8 +18,8 @@ from geoscene.charts import (
     print_table,
     scatter,
 )
-from geoscene.figures import metres, share, size
-from geoscene.files import write_atomically, write_json
+from geoscene.drawing.figures import metres, share, size
+from geoscene.support.files import write_atomically, write_json
 from lidar.tradeoff.comparison import Comparison, Kind, Listing, Row
 from lidar.tradeoff.engine import Tradeoff
 from lidar.tradeoff.errors import Estimate

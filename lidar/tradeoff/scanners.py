@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.options import TradeoffOptions
 from lidar.physics.settings import ScannerSettings
 from lidar.rig.devices import Scanner

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from geoscene.figures import metres, share
+from geoscene.drawing.figures import metres, share
 from lidar.options import Accuracy
 from lidar.tradeoff.errors import Estimate
 from lidar.tradeoff.words import LOST, levels

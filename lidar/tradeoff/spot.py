@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from geoscene.progress import Progress, silent
+from geoscene.support.progress import Progress, silent
 from lidar.plan import DrivePlan
 from lidar.rig.devices import Camera, Scanner
 from lidar.tradeoff.errors import Estimate, resampled

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, cloud_table, records

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf
 
-from geoscene.figures import metres, share
+from geoscene.drawing.figures import metres, share
 from lidar.tradeoff.comparison import Comparison, Kind, Row
 
 TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera": (1.0, 3.0, 10.0)}

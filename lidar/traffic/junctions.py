@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.support.compiled import njit
 from geoscene.typing import Float, Ints
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes

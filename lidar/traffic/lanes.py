@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_states
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.planning.route import HEADING_REACH
 from lidar.planning.steering import relaxed

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns
+from geoscene.geometry import polylines
 from geoscene.scene import Scene
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import Lanes, edge_name, lane_shift

@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float
 from lidar.geometry.poses import release

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
+from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded

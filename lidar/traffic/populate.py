@@ -11,12 +11,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import row_blocks
 from geoscene.errors import SceneFormatError
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
+from geoscene.support.columns import row_blocks
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.planning.road_conditions import DRY, RoadConditions

@@ -8,11 +8,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene import polylines
-from geoscene.columns import Columns
 from geoscene.errors import SceneFormatError
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
 from lidar.rig.vehicle import Vehicle

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 
-from geoscene.columns import Columns, row_blocks
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory, release, room
 from lidar.traffic.ego_trip import EgoTrip

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float, Ints
 from lidar.traffic.junctions import Signals, is_green
 from lidar.traffic.lanes import STEP

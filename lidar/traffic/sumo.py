@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import need
 from geoscene.export.sumo import write_sumo
-from geoscene.polylines import directions
+from geoscene.geometry.polylines import directions
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns
-from geoscene.compiled import njit
+from geoscene.support.columns import Columns
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.traffic.lanes import STEP, ActorPath
 

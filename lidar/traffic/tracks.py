@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns, row_blocks
 from geoscene.scene import Scene
+from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.traffic.ground import ground_heights

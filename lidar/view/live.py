@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes
 from geoscene.errors import need
-from geoscene.files import atomic_path
+from geoscene.support.files import atomic_path
 from lidar.dataset.measured import Columns, MeasuredCloud, MeasuredImages
 from lidar.errors import InputError, LidarError
 from lidar.geometry.poses import Trajectory

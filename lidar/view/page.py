@@ -9,8 +9,8 @@ from tempfile import SpooledTemporaryFile
 from typing import IO, Any
 
 from geoscene.export.files import compact_json
-from geoscene.files import atomic_file, exclusive, spool
-from geoscene.progress import Progress, silent
+from geoscene.support.files import atomic_file, exclusive, spool
+from geoscene.support.progress import Progress, silent
 from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.physics.link import GATE, amplitude
 from lidar.raycast.memory import inlined
@@ -324,7 +324,7 @@ def drawn_particles(
 
 @inlined
 def _uniform(key: Any, number: Any) -> Any:
-    """The random number (0 to 1) of a key with a counter: SplitMix64, as `geoscene.splitmix`."""
+    """The random number (0 to 1) of a key with a counter: SplitMix64, as `geoscene.support.splitmix`."""
     x = key + np.uint64(number) * np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.random_streams import generator

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-from geoscene.canvas import Canvas
-from geoscene.charts import Axes
-from geoscene.panels import Panel, Series, figure
+from geoscene.drawing.canvas import Canvas
+from geoscene.drawing.charts import Axes
+from geoscene.drawing.panels import Panel, Series, figure
 from geoscene.typing import Float
 from lidar.physics.link import amplitude
 from lidar.rig.scanner import Sensor

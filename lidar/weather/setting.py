@@ -9,7 +9,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from geoscene.untrusted import read_toml
+from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.signal.stage import POSES, ROAD_USERS, Stage, parameter
 

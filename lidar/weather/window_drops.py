@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.random_streams import generator
 from lidar.rig.specs import CameraSpec

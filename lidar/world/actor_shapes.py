@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from lidar.world.actor_solids import (
     DARK,
     GLASS,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.objects.solids import lathe
 from geoscene.typing import Float
 

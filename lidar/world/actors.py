@@ -9,9 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.columns import Columns, row_blocks
-from geoscene.compiled import njit
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.world.actor_shapes import Shape

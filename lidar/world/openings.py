@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.facades import WallRelief
 from geoscene.classes import Class, materials
-from geoscene.mesh import WALL
+from geoscene.geometry.mesh import WALL
 from geoscene.typing import Float
 from lidar.relief import PARTS, WallTables, pairs_of, tables_of
 from lidar.world.surfaces import Surfaces

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.typing import Float
 from lidar.world.actor_solids import DARK, Rgb, ball, limb, loft
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from geoscene.limits import Limit
+from geoscene.pipeline.limits import Limit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.gpu.device import CPU, name_fault

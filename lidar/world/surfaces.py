@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import materials
-from geoscene.columns import Columns
-from geoscene.compiled import njit
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.columns import Columns
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import inlined
 from lidar.world.settings import WorldSettings
@@ -39,7 +39,7 @@ class Surfaces(Columns):
     feature  : (n,) int32, feature number of the scene, or of the actor
     klass    : (n,) uint8, code of `geoscene.classes.Class`
     material : (n,) uint8, code of `geoscene.classes.Material`, with the bit `OPEN` where water or snow lies
-    surface  : (n,) uint8, OTHER, WALL, ROOF or FLOOR of `geoscene.mesh`
+    surface  : (n,) uint8, OTHER, WALL, ROOF or FLOOR of `geoscene.geometry.mesh`
     color    : (n, 3) uint8, sRGB
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Instances, Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from lidar.world.settings import WorldSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.typing import Float
 from lidar.world.actors import Actors, poses_of, rotations, states
 from lidar.world.world import World

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
 from geoscene.typing import Float

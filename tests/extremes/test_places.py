@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.frames import Frame, utm_crs
+from geoscene.geometry.frames import Frame, utm_crs
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.options import DriveOptions
 from lidar.plan import plan_drive

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.watertight import check_solids
+from geoscene.geometry.watertight import check_solids
 from lidar.errors import InputError
 from lidar.raycast import Caster
 from lidar.selftest.cases import CASES

@@ -2,9 +2,9 @@
 
 import json
 import subprocess
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 from helpers.programs import ENVIRONMENT, command
 
 from lidar.selftest import run
@@ -13,7 +13,7 @@ from lidar.selftest.cases import CASES, GROUPS
 from lidar.selftest.regions import CASES as REGIONS
 from lidar.selftest.scale import CASES as SCALE
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "extremes.md"
+PAGE = ROOT / "docs" / "extremes.md"
 
 
 @pytest.mark.parametrize("case", [*SCALE, *REGIONS], ids=lambda case: case.name)

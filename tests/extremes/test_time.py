@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.navigation.gnss import epochs, observe_gnss

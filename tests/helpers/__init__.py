@@ -1,4 +1,9 @@
 """Scenes, road graphs, programs and a browser for tests."""
 
+from pathlib import Path
+
 DEMO_BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 """West, south, east, north in degrees of the part of the demo map in the fixture ``scene``."""
+
+ROOT = Path(__file__).resolve().parents[2]
+"""The repository."""

@@ -1,10 +1,9 @@
 """A short drive of the rig `seed` in snow, among road users and under attack, for tests of pages."""
 
-from pathlib import Path
-
+from helpers import ROOT
 from helpers.programs import run_program
 
-ATTACK = Path(__file__).resolve().parents[2] / "examples" / "attacks" / "injected_car.toml"
+ATTACK = ROOT / "examples" / "attacks" / "injected_car.toml"
 
 
 def record(scene, out, *, seconds=0.6):

@@ -7,8 +7,8 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
-from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
 from geoscene.objects.shapes import place, shapes
 from geoscene.objects.solids import prism, rectangle
 from geoscene.scene import open_scene

@@ -6,7 +6,7 @@ import numpy as np
 
 from geoscene.buildings.facades import Facades, Openings, WallRelief
 from geoscene.classes import Class, materials
-from geoscene.mesh import WALL, Mesh
+from geoscene.geometry.mesh import WALL, Mesh
 
 NORMALS = {"front": (0, 0, -1), "left": (1, 0, 0), "right": (-1, 0, 0), "low": (0, 1, 0), "high": (0, -1, 0)}
 

@@ -6,8 +6,8 @@ import numpy as np
 from pyproj import CRS
 
 from geoscene.classes import Class
-from geoscene.files import write_json
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.files import write_json
 from lidar.dataset.formats import las, pcd
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.layout import open_dataset

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from geoscene.files import write_json
+from geoscene.support.files import write_json
 from helpers.map_data import FRAME, START
 from lidar.dataset.formats import pcd
 from lidar.dataset.layout import open_dataset

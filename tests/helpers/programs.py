@@ -12,8 +12,9 @@ from unittest.mock import patch
 
 import pytest
 
-_ROOT = Path(__file__).resolve().parents[2]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(_ROOT)}
+from helpers import ROOT
+
+ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
 """Environment of processes that import this checkout, even if another version is installed."""
 SMALL_FILES = ENVIRONMENT | {"PYTHONDONTWRITEBYTECODE": "1"}
 """The same for processes with a limit on the size of files, which would cut compiled modules off."""

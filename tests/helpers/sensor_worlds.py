@@ -6,7 +6,7 @@ import numpy as np
 
 from geoscene.buildings.facades import WallRelief
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.raycast.geometry import split

@@ -4,7 +4,7 @@ import zlib
 
 import numpy as np
 
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Instances, Mesh
 from geoscene.scene.tile_files import Tile
 from geoscene.view.looks import Facades
 from geoscene.view.tiles import SCALE, TURN, _turned

@@ -2,13 +2,13 @@
 
 import json
 import subprocess
-from pathlib import Path
 
+from helpers import ROOT
 from helpers.programs import ENVIRONMENT, command
 
 from geoscene.classes import Class, class_rows, materials
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "classes.md"
+DOCUMENT = ROOT / "docs" / "classes.md"
 
 
 def test_every_class_and_material_is_documented_with_its_codes():

@@ -13,9 +13,9 @@ from helpers.clusters import two_workers
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
-import geoscene.cluster
-from geoscene.cluster import connected
+import geoscene.support.cluster
 from geoscene.errors import InputError, MissingExtraError
+from geoscene.support.cluster import connected
 from lidar.options import DriveOptions
 from lidar.pipeline import drive
 from lidar.sweep import sweep
@@ -103,7 +103,7 @@ def test_errors_of_tasks_are_raised_as_they_are(cluster):
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(geoscene.cluster, "_SECONDS", 0.5)
+    monkeypatch.setattr(geoscene.support.cluster, "_SECONDS", 0.5)
     words = (
         "drive",
         scene.path,

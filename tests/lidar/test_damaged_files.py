@@ -10,7 +10,7 @@ import pytest
 from helpers.mutations import mutated
 
 from geoscene.errors import GeosceneError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.sources.tracks import read_track
 from lidar.dataset.journal import read_journal
 from lidar.defences.calibration import read_calibration

@@ -7,13 +7,13 @@ import shutil
 import signal
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 from helpers.scenes import names_in, same_files
 
 from geoscene.errors import NotWrittenError
-from geoscene.files import exclusive
+from geoscene.support.files import exclusive
 from lidar import pipeline
 from lidar.dataset.derived import copy_folder
 from lidar.dataset.layout import open_dataset, remove_dataset
@@ -24,7 +24,7 @@ from lidar.options import DriveOptions
 from lidar.pipeline import drive
 from lidar.sign import sign_dataset
 
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 OPTIONS = DriveOptions(rig="vlp16", duration=0.3, seed=3, formats=("pcd",))
 
 

@@ -11,9 +11,9 @@ import pytest
 import shapely
 from helpers.roadgrids import grid
 
-from geoscene import csv_tables
-from geoscene.csv_tables import write_columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support import csv_tables
+from geoscene.support.csv_tables import write_columns
 from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import frame_numbers
 from lidar.errors import DatasetError, InputError

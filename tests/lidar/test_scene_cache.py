@@ -12,11 +12,11 @@ import shapely
 from helpers.programs import ENVIRONMENT, command
 from helpers.scenes import same_files
 
-from geoscene import tiles
 from geoscene.errors import InputError as SceneInputError
 from geoscene.errors import MissingExtraError, NetworkError
 from geoscene.options import BuildOptions, CloudOptions
-from geoscene.pipeline import build
+from geoscene.pipeline import tiles
+from geoscene.pipeline.build import build
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
 from geoscene.sources import Servers, read_osm

@@ -6,7 +6,7 @@ import pytest
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
-from geoscene.storage import Stored, cache_folder
+from geoscene.support.storage import Stored, cache_folder
 from lidar.dataset.layout import open_dataset
 
 pytestmark = pytest.mark.filterwarnings("default")

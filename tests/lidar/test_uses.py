@@ -8,7 +8,7 @@ from helpers.programs import run_program
 
 from geoscene.errors import SceneFormatError
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions

@@ -16,10 +16,10 @@ from geoscene.buildings.facades.fit import OUT, Sheet, obstacles
 from geoscene.buildings.facades.grids import Elevations
 from geoscene.buildings.facades.kinds import SHOP, WINDOW
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh, concatenate
-from geoscene.splitmix import uniform_at
+from geoscene.geometry.mesh import Mesh, concatenate
+from geoscene.geometry.watertight import validate_mesh
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import validate_mesh
 
 _GAP = 0.005
 """Metres between a part and its wall."""

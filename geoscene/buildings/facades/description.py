@@ -12,7 +12,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 
 T = TypeVar("T", bound=np.generic)

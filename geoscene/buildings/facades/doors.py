@@ -8,7 +8,7 @@ import shapely
 from geoscene.buildings.facades.fit import OUT, Sheet
 from geoscene.buildings.facades.grids import Cells, Elevations, nth
 from geoscene.buildings.facades.kinds import DOOR, GATE
-from geoscene.splitmix import uniform_at
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
 _STREET = 40.0

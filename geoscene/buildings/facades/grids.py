@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from geoscene.buildings.facades.setting import Setting
 from geoscene.buildings.facades.styles import Styles
 from geoscene.buildings.facades.walls import Walls
-from geoscene.columns import Columns
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Height, Ints
 
 _BESIDE = 0.3

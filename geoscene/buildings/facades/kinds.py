@@ -9,7 +9,7 @@ import numpy as np
 from geoscene.buildings.facades.description import Openings
 from geoscene.buildings.facades.styles import TYPES, Styles
 from geoscene.classes import materials
-from geoscene.columns import Columns
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 BLANK, WINDOW, SHOP, DOOR, GATE = range(5)

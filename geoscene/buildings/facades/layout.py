@@ -16,8 +16,8 @@ from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_o
 from geoscene.buildings.facades.setting import Setting
 from geoscene.buildings.facades.solids import are_simple
 from geoscene.buildings.facades.walls import find_walls
-from geoscene.mesh import Mesh
-from geoscene.splitmix import uniform_at
+from geoscene.geometry.mesh import Mesh
+from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Height, Ints
 
 _PLINTH = 0.35

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.facades.styles import Styles, choose_styles
 from geoscene.buildings.table import Buildings
-from geoscene.columns import Columns
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.sources.data import OsmData, Point, Tags
+from geoscene.support.columns import Columns
 from geoscene.tags import first_value, parse_length
 from geoscene.typing import Float, Ints
 

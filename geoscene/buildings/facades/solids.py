@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.facades.description import Openings, WallRelief
 from geoscene.buildings.shells import triangulate
-from geoscene.columns import Columns
-from geoscene.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
+from geoscene.geometry.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
+from geoscene.geometry.watertight import edge_uses, weld
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import edge_uses, weld
 
 _OF_WALL = 255
 """Material of faces of a template that have the material and colour of their wall."""
@@ -27,7 +27,7 @@ class _Template:
     corners  : (t, 3, 3) x and y in the cell, and the depth behind the wall
     material : (t,) uint8, ``_OF_WALL`` for the wall's
     color    : (t, 3) uint8
-    surface  : (t,) uint8, codes of `geoscene.mesh`
+    surface  : (t,) uint8, codes of `geoscene.geometry.mesh`
     rim      : (4,) left, lower, right and upper edge
     """
 

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from geoscene.buildings.guesses import seeds
 from geoscene.buildings.table import Buildings
 from geoscene.classes import materials
-from geoscene.columns import Columns
 from geoscene.sources.data import Tags
-from geoscene.splitmix import uniform_at
+from geoscene.support.columns import Columns
+from geoscene.support.splitmix import uniform_at
 from geoscene.tags import first_value
 from geoscene.typing import Bools, Float, Ints
 

@@ -8,10 +8,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.columns import Columns
-from geoscene.mesh import WALL, Mesh
+from geoscene.geometry.mesh import WALL, Mesh
+from geoscene.geometry.watertight import edge_uses, weld
+from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
-from geoscene.watertight import edge_uses, weld
 
 _UPRIGHT = 1e-3
 """Maximum vertical component of the unit normal of an upright face."""

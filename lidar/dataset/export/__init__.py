@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geoscene.files import atomic_folder
-from geoscene.progress import Progress, silent
+from geoscene.support.files import atomic_folder
+from geoscene.support.progress import Progress, silent
 from lidar.errors import InputError
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.files import atomic_path, write_json
-from geoscene.progress import Progress
+from geoscene.support.files import atomic_path, write_json
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import labelled_clouds, still_points

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
 from geoscene.classes import Class, class_codes
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.camera.png import feature_to_image, image_to_feature, read_png, write_png
 from lidar.dataset.boxes import read_boxes

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from lidar.dataset.export.kitti_drive import KittiDrive, read_drive
 from lidar.dataset.export.kitti_objects import object_lines
 from lidar.dataset.kitti_sequence import numbers, write_calibration, write_poses, write_times

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.camera.png import image_to_feature, read_png, write_png
 from lidar.dataset.export.kitti_drive import KittiDrive, read_drive, write_stamps

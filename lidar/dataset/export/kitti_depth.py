@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically, write_json
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically, write_json
+from geoscene.support.progress import Progress
 from lidar.camera.png import DEPTH_SCALE, depth_to_counts, write_png
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import FORMATS, LABELS, kitti

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.export.kitti_drive import CAMERAS, KittiDrive, read_drive, write_stamps
 from lidar.dataset.kitti_sequence import numbers

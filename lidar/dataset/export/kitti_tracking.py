@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from lidar.dataset.export.kitti import OBJECTS
 from lidar.dataset.export.kitti_drive import read_drive
 from lidar.dataset.export.kitti_objects import object_lines

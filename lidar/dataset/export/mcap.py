@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from geoscene.files import write_json
-from geoscene.progress import Progress
+from geoscene.support.files import write_json
+from geoscene.support.progress import Progress
 from lidar.dataset.export.ros2 import message_counts, write_recording
 from lidar.dataset.export.ros_drive import BASE, MAP, Topic
 from lidar.dataset.export.ros_topics import ODOMETRY

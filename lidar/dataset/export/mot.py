@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from geoscene.classes import Class
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, color_images

@@ -21,9 +21,9 @@ from PIL import Image, ImageDraw
 
 from geoscene.classes import Class, class_codes
 from geoscene.errors import GeosceneError
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
 from geoscene.scene import open_scene
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.camera.png import write_png
 from lidar.dataset.boxes import COLUMNS, read_boxes

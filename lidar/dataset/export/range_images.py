@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically, write_json
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically, write_json
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.camera.png import write_png
 from lidar.dataset.formats.table import Table

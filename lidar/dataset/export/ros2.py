@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import need
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.dataset.export.ros_drive import MAP, RosDrive, Topic
 from lidar.dataset.export.ros_messages import encoded, typestore
 from lidar.dataset.export.ros_topics import topics_of

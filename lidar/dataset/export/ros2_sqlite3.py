@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.dataset.export.ros2 import message_counts, write_recording
 from lidar.dataset.layout import Dataset
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.progress import Progress
+from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import write_poses
 from lidar.dataset.layout import Dataset
 from lidar.geometry.attitude import quat_from_matrix

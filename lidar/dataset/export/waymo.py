@@ -17,8 +17,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from geoscene.classes import Class
-from geoscene.files import write_atomically
-from geoscene.progress import Progress
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.export.waymo_parquet import DISTORTION, SHUTTER, Component, Row

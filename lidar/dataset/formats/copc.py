@@ -22,8 +22,8 @@ from typing import IO, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
-from geoscene.files import atomic_file, naming
+from geoscene.support.compiled import njit
+from geoscene.support.files import atomic_file, naming
 from lidar.dataset.formats.las import Encoder, LasInfo, compressor_errors, count, read, read_chunks
 from lidar.dataset.formats.table import Table
 

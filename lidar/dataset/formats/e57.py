@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from geoscene.errors import need
-from geoscene.files import atomic_path, not_written
+from geoscene.support.files import atomic_path, not_written
 from geoscene.typing import Float
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import NO_FRAME, FrameInfo, Table, rows

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import class_codes
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.table import PointLabels, Table, columns_as_rows, read_rows
 
 # Moving road users have codes of their own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle.

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from geoscene.classes import class_codes
-from geoscene.compiled import njit
-from geoscene.files import atomic_path
+from geoscene.support.compiled import njit
+from geoscene.support.files import atomic_path
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 
 _LITERALS = 32
 _FARTHEST = 1 << 13

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import atomic_file
-from geoscene.untrusted import DAMAGED_ARCHIVE, array_header, read_arrays
+from geoscene.support.files import atomic_file
+from geoscene.support.untrusted import DAMAGED_ARCHIVE, array_header, read_arrays
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 

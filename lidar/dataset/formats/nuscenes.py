@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.table import PointLabels, Table, columns_as_rows, read_rows
 
 _COLUMNS = ("x", "y", "z", "intensity", "ring")

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.errors import need
-from geoscene.files import atomic_path
+from geoscene.support.files import atomic_path
 from lidar.dataset.formats.table import NO_FRAME, FrameInfo, Table, rows
 from lidar.errors import FormatError
 

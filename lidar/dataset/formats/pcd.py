@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.lzf import decompressed
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.pcd import count, pcd_header, read
 from lidar.dataset.formats.table import Table, rows
 

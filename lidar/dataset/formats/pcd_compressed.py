@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.lzf import compressed
 from lidar.dataset.formats.pcd import count, pcd_header, read
 from lidar.dataset.formats.table import Table, rows

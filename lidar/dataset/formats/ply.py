@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.files import write_atomically
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
 from lidar.errors import FormatError

@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.columns import row_blocks
-from geoscene.files import append, atomic_file, spool
+from geoscene.support.columns import row_blocks
+from geoscene.support.files import append, atomic_file, spool
 from geoscene.typing import Float
 from lidar.errors import FormatError, LidarError
 from lidar.geometry.poses import Trajectory

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.compiled import njit
-from geoscene.files import write_atomically
+from geoscene.support.compiled import njit
+from geoscene.support.files import write_atomically
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
 

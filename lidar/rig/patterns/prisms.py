@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.rig.patterns.beams import Firings, blocks, from_origin, numbers
 from lidar.rig.toml_table import Table

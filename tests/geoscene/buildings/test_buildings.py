@@ -22,11 +22,11 @@ from geoscene.buildings.shells import prisms
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
-from geoscene.frames import Frame
-from geoscene.mesh import FLOOR, ROOF, WALL
-from geoscene.report import summarise
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL
+from geoscene.geometry.watertight import check_solids, validate_mesh
 from geoscene.sources.data import Area, OsmData, Relation
-from geoscene.watertight import check_solids, validate_mesh
+from geoscene.support.report import summarise
 
 FRAME = Frame.at(8.7, 49.4)
 

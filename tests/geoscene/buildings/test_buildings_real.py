@@ -8,9 +8,9 @@ import shapely
 from geoscene.buildings import BuildingOptions, build_solids, read_buildings
 from geoscene.buildings.features import is_building, is_building_part
 from geoscene.buildings.footprints import project
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.sources import read_osm
-from geoscene.watertight import validate_mesh
 
 pytestmark = pytest.mark.shared
 

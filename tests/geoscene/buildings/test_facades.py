@@ -14,10 +14,10 @@ from geoscene.buildings.facades import read_setting, wall_relief
 from geoscene.buildings.facades.solids import are_simple, outlines, relief_mesh
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
-from geoscene.frames import Frame
-from geoscene.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.sources.data import Area, OsmData, Point, Way
-from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(8.7, 49.4)
 GLASS = materials()["glass"].code

@@ -12,8 +12,8 @@ from geoscene.buildings.footprints import clean
 from geoscene.buildings.roofs import RoofSpec, roof_shell
 from geoscene.buildings.skeleton import loops, straight_skeleton
 from geoscene.buildings.table import SHAPES
-from geoscene.mesh import FLOOR, ROOF
-from geoscene.watertight import check_solids
+from geoscene.geometry.mesh import FLOOR, ROOF
+from geoscene.geometry.watertight import check_solids
 
 RECTANGLE = [(0, 0), (12, 0), (12, 8), (0, 8)]
 L_SHAPE = [(0, 0), (18, 0), (18, 7), (7, 7), (7, 16), (0, 16)]

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from geoscene.buildings import read_buildings
 from geoscene.buildings.tops import with_measured_tops
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData
 
 FRAME = Frame.at(8.7, 49.4)

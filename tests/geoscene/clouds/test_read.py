@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from geoscene.clouds.read import open_cloud
 from geoscene.clouds.spool import Points, spool_clouds, without_outliers
 from geoscene.errors import InputError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 
 NEW_YORK = (-73.99, 40.72)
 US_FOOT = 1200 / 3937

@@ -13,12 +13,12 @@ from helpers.clouds import write_las
 from geoscene.clouds.apply import check_unit
 from geoscene.clouds.survey import with_clouds
 from geoscene.errors import InputError
-from geoscene.files import digest_of
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.support.files import digest_of
 
 CENTRE = (9.5, 47.1)
 FRAME = Frame.at(*CENTRE)

@@ -9,7 +9,7 @@ from helpers.export_worlds import write_world
 from geoscene.errors import MissingExtraError, SceneFormatError
 from geoscene.export.libraries import to_networkx, to_open3d, to_trimesh
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 

@@ -20,12 +20,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from geoscene import files
 from geoscene.classes import Class
 from geoscene.errors import InputError, MissingExtraError
 from geoscene.export import KINDS, export_scene, kind_of
 from geoscene.export.zbuffer import draw_triangles
 from geoscene.options import ExportOptions
+from geoscene.support import files
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,10 @@ from geoscene.export import export_scene
 from geoscene.export.cityjson import LOD
 from geoscene.export.shells import manifold_patches
 from geoscene.export.vertices import Vertices
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.objects.shapes import shapes
 from geoscene.options import ExportOptions
-from geoscene.watertight import validate_mesh
 
 
 @pytest.fixture(scope="module")

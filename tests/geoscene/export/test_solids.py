@@ -10,9 +10,9 @@ from helpers.export_worlds import NAMES, SOLID_VOLUMES, write_world
 
 from geoscene.classes import Class
 from geoscene.export import export_scene
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.options import ExportOptions
-from geoscene.watertight import validate_mesh
 
 STEPS = {
     "cityjson": 1e-5,

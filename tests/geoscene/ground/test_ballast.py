@@ -5,11 +5,11 @@ import pytest
 from helpers.surfaces import assert_one_surface, heights_on
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import concatenate
 from geoscene.ground import Layers, ground_tile, landcover, plan_ground
 from geoscene.ground.ballast import HEIGHT, SLOPE
 from geoscene.ground.camber import Camber, Raised
-from geoscene.mesh import concatenate
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.ballast import read_beds
 from geoscene.roadgraph.surfaces import road_surfaces

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground import Layers, ground_tile, plan_ground
 from geoscene.ground.ballast import Beds
 from geoscene.ground.camber import CAMBER, Kerbs, Raised

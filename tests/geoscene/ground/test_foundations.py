@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground import Layers, water_levels
 from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.terrain import base_heights

@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
+from geoscene.geometry.mesh import concatenate
+from geoscene.geometry.watertight import degenerate_faces
 from geoscene.ground import (
     Layers,
     building_pads,
@@ -24,8 +26,6 @@ from geoscene.ground import (
     triangulate,
 )
 from geoscene.ground.partition import PRECISION, SLIVER, tile_box, tile_span
-from geoscene.mesh import concatenate
-from geoscene.watertight import degenerate_faces
 
 EXTENT = (-30.0, -20.0, 30.0, 45.0)
 GRASS = materials()["grass"].code

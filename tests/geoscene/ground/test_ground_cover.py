@@ -5,7 +5,8 @@ import pytest
 import shapely
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import concatenate
 from geoscene.ground import (
     Layers,
     building_pads,
@@ -17,10 +18,9 @@ from geoscene.ground import (
 )
 from geoscene.ground.coast import sea
 from geoscene.ground.terrain import open_terrain
-from geoscene.mesh import concatenate
-from geoscene.report import Problem
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Way
+from geoscene.support.report import Problem
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)

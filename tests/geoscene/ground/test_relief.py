@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
+from geoscene.geometry.mesh import concatenate
 from geoscene.ground import Layers, ground_tile, ground_tiles, joined, plan_ground, tile_box, tile_span
 from geoscene.ground.partition import follows_relief, tile_lattice
 from geoscene.ground.relief import Relief
-from geoscene.mesh import concatenate
 
 GRASS = materials()["grass"].code
 EXTENTS = ((0.0, 0.0, 1600.0, 1600.0), (-730.0, 35.0, 190.0, 1511.0), (13.0, -1399.0, 640.0, 17.0))

@@ -11,7 +11,7 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 
 FRAME = Frame.at(9.0, 50.0)

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
-from geoscene.mesh import Mesh
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of, tree_shapes
 from geoscene.objects.forests import Forests, forest_trees
 from geoscene.objects.shapes import LEAF_AREA_DENSITY, leaf_area_density, shapes

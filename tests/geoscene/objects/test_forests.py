@@ -11,12 +11,12 @@ import shapely
 from geoscene.classes import Class
 from geoscene.export import export_scene
 from geoscene.export.tables import solids
+from geoscene.geometry.mesh import Mesh
 from geoscene.ground import Layers, building_pads, ground_tile, plan_ground, tile_box
-from geoscene.mesh import Mesh
 from geoscene.objects.forests import Forests, forest_instances, forest_tree_count, forest_trees
 from geoscene.objects.shapes import shapes
 from geoscene.options import BuildOptions, ExportOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.tile_files import read_tile
 from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm

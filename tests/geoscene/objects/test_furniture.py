@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from geoscene.classes import Class, materials
 from geoscene.export.objects import expand
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.objects.barriers import barrier_meshes, open_barriers, read_barriers
 from geoscene.objects.furniture import furniture_instances, read_furniture, shape_of
@@ -16,7 +17,6 @@ from geoscene.objects.shapes import shapes
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Point, Way
 from geoscene.structures.ground_contact import OPENING
-from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)

@@ -9,15 +9,15 @@ from hypothesis import strategies as st
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.buildings.shells import PARAPET
-from geoscene.frames import Frame
-from geoscene.mesh import ROOF
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import ROOF
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.objects.roof_shapes import DORMER_DEPTH, roof_shapes
 from geoscene.objects.rooftops import plan_rooftops, roof_objects
 from geoscene.objects.shapes import shapes
-from geoscene.plan import take_buildings
+from geoscene.pipeline.plan import take_buildings
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
-from geoscene.watertight import validate_mesh
 
 BERLIN, NEW_YORK = (13.43, 52.48), (-73.99, 40.72)
 NAMES = list(shapes(relief=True))

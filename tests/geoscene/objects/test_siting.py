@@ -8,9 +8,9 @@ from geoscene.classes import Class
 from geoscene.ground.partition import rows_at, values_at
 from geoscene.objects.siting import FARTHEST
 from geoscene.options import BuildOptions
-from geoscene.plan import make_plan
-from geoscene.progress import silent
+from geoscene.pipeline.plan import make_plan
 from geoscene.sources import demo_path, read_osm
+from geoscene.support.progress import silent
 
 EXTRACTS = [
     "nyc_lower_east_side.osm.pbf",

@@ -9,7 +9,8 @@ import shapely
 from scipy.spatial import cKDTree
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.objects.furniture import STANDS, read_furniture
 from geoscene.objects.shapes import shapes
@@ -18,11 +19,10 @@ from geoscene.objects.siting import Sites
 from geoscene.objects.street import Taken, guess_furniture, street_shape
 from geoscene.objects.street_shapes import street_shapes
 from geoscene.options import BuildOptions
-from geoscene.plan import make_plan
-from geoscene.progress import silent
+from geoscene.pipeline.plan import make_plan
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Way
-from geoscene.watertight import validate_mesh
+from geoscene.support.progress import silent
 
 FRAME = Frame.at(11.0, 50.0)
 EXTENT = (-300.0, -40.0, 300.0, 40.0)

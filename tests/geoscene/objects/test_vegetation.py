@@ -7,9 +7,9 @@ import shapely
 
 from geoscene.classes import Class, materials
 from geoscene.export.objects import expand
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh
 from geoscene.ground import Layers, building_pads, plan_ground
-from geoscene.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shapes
 from geoscene.objects.vegetation import clear_of, read_trees, tree_instances
 from geoscene.sources.data import OsmData, Point, Way

@@ -5,14 +5,14 @@ import pytest
 
 from geoscene.classes import Class
 from geoscene.export.objects import expand
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.objects.shapes import shapes
 from geoscene.objects.wires import read_wires, wire_instances
 from geoscene.options import BuildOptions
-from geoscene.plan import make_plan
-from geoscene.progress import silent
+from geoscene.pipeline.plan import make_plan
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Point, Way
+from geoscene.support.progress import silent
 
 FRAME = Frame.at(11.0, 50.0)
 EXTENT = (-200.0, -200.0, 200.0, 200.0)

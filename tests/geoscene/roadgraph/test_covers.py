@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.layers import COVERS, GULLIES, PATCHES
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.covers import cover_rows

@@ -8,7 +8,7 @@ import pytest
 
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.roadgraph.driving_side import LEFT_HAND, driving_side, side_at
 from geoscene.sources.data import OsmData, Way
 from lidar.options import DriveOptions

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.lane_uses import NO_USES, read_lane_uses
 from geoscene.roadgraph.surfaces import SurfaceOptions, road_surfaces

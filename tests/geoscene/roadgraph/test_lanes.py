@@ -8,7 +8,7 @@ from helpers.export_worlds import write_world
 from helpers.roadgrids import road_graph
 
 from geoscene.export import export_scene
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph, write_graphml
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.driving_side import Side

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import geoscene
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.surface_rows import GRID, SurfaceRows

@@ -4,7 +4,7 @@ import geopandas
 import numpy as np
 import shapely
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.scene.geopackage import Layer, read_layer, write_geopackage
 
 

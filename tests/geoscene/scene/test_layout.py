@@ -6,13 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import ROOT
 from helpers.export_worlds import write_world
 
 from geoscene.errors import SceneFormatError
 from geoscene.scene import SceneFiles, layout, open_scene
 from geoscene.scene.layout import changed_files, using
-
-REPOSITORY = Path(__file__).parents[3]
 
 
 def test_scene_file_names_occur_only_in_the_layout_module():
@@ -21,7 +20,7 @@ def test_scene_file_names_occur_only_in_the_layout_module():
     names = {str(path) for path in [*named, files.tile_reports, files.tile_journal]}
     spelled = []
     for folder in ("geoscene", "lidar", "examples", "benchmarks"):
-        for module in (REPOSITORY / folder).rglob("*.py"):
+        for module in (ROOT / folder).rglob("*.py"):
             if module.samefile(layout.__file__):
                 continue
             tree = ast.parse(module.read_text("utf-8"))

@@ -2,14 +2,13 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import networkx as nx
 import pytest
+from helpers import ROOT
 
 from geoscene.sources import demo_path, read_osm
 
-ROOT = Path(__file__).resolve().parents[3]
 DRIVABLE = {"primary", "secondary", "tertiary", "unclassified", "residential", "living_street"}
 
 

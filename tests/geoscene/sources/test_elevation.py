@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from geoscene.errors import InputError, NetworkError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
 from geoscene.sources import OsmData, TileServer, Way, demo_path, fetch_elevation, read_osm
 from geoscene.sources.elevation import decode_terrarium, zoom_at

@@ -7,11 +7,11 @@ import pytest
 
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
-from geoscene.plan import make_plan
-from geoscene.progress import silent
+from geoscene.pipeline.build import build
+from geoscene.pipeline.plan import make_plan
 from geoscene.sources import OsmData, read_osm
 from geoscene.sources.extent import checked_bounds
+from geoscene.support.progress import silent
 
 HOUSE = {"building": "yes", "building:levels": "2"}
 ROAD = {"highway": "residential"}

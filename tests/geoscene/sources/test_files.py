@@ -15,10 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.errors import InputError, SourceNotFoundError
-from geoscene.report import Problem
 from geoscene.sources import OsmData, demo_path, read_osm
 from geoscene.sources.areas import is_multipolygon
 from geoscene.sources.tags import is_building
+from geoscene.support.report import Problem
 
 ALL = [
     "baltimore_harbor.osm.pbf",

@@ -14,7 +14,7 @@ from pyproj import CRS
 
 from geoscene.buildings import read_buildings
 from geoscene.errors import InputError, MissingExtraError, SourceNotFoundError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.sources import SOURCES, credits_of, demo_path, merged, read_osm, read_source
 from geoscene.sources.registry import reader_of
 from geoscene.sources.tags import is_building

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from geoscene.classes import Class
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.options import RELIEFS
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.surfaces import road_surfaces
@@ -17,7 +18,6 @@ from geoscene.structures import (
     read_structures,
 )
 from geoscene.structures.lining import NICHE, WALKWAY
-from geoscene.watertight import validate_mesh
 from tests.geoscene.structures.test_structures import (
     FRAME,
     PLACES,

@@ -11,11 +11,12 @@ from scipy.spatial import cKDTree
 
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import FLOOR, ROOF, Mesh, concatenate
+from geoscene.geometry.watertight import validate_mesh
 from geoscene.ground import ground_tile, plan_ground
 from geoscene.ground.layers import Layers
 from geoscene.ground.terrain import open_terrain
-from geoscene.mesh import FLOOR, ROOF, Mesh, concatenate
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources import read_osm
@@ -31,7 +32,6 @@ from geoscene.structures import (
     within_extent,
 )
 from geoscene.structures.layered import PRECISION, Plan, cut_plan, half_edges, raise_shell, without_slivers
-from geoscene.watertight import validate_mesh
 
 FRAME = Frame.at(10.0, 50.0)
 SIZES = StructureOptions()

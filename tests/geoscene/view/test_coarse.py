@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from geoscene.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
 from geoscene.view.coarse import coarser_mesh, fewer_instances
 
 BOX = (0.0, 0.0, 64.0, 64.0)

@@ -8,9 +8,9 @@ import pytest
 from geoscene.buildings.guesses import WINDOWS
 from geoscene.classes import Class
 from geoscene.export.objects import read_features
-from geoscene.mesh import ROOF, WALL
+from geoscene.geometry.mesh import ROOF, WALL
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from geoscene.view.looks import GUESSED, STEP, read_looks
 

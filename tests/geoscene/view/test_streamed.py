@@ -12,7 +12,7 @@ from helpers.view_tiles import unpack_tile
 
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions, ViewOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
 from geoscene.view.looks import read_looks

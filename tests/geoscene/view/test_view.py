@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class
 from geoscene.errors import InputError
-from geoscene.frames import Frame
-from geoscene.mesh import Instances, Mesh
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Instances, Mesh
 from geoscene.options import BuildOptions, ViewOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene

@@ -10,9 +10,9 @@ from PIL import Image
 
 from geoscene.classes import Class
 from geoscene.cli import app
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.view import view_scene

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from geoscene.classes import Class
-from geoscene.frames import Frame as SceneFrame
+from geoscene.geometry.frames import Frame as SceneFrame
 from lidar.camera.render import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount

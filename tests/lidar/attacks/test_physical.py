@@ -1,15 +1,15 @@
 """Physical attacks: budgets, published figures, line of sight, and what their returns look like."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import ROOT
 from helpers.sensor_worlds import box, driven, plate, world
 from scipy import stats
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.attacks.attacker import DEVICES
 from lidar.attacks.sight import check_sight, sent_only
 from lidar.errors import InputError
@@ -476,7 +476,7 @@ def test_a_device_that_is_never_in_sight_is_refused():
         check_sight(far, [(situation(VLP), pytest.fail)])
 
 
-EXAMPLES = sorted((Path(__file__).parents[3] / "examples" / "attacks").glob("*.toml"))
+EXAMPLES = sorted((ROOT / "examples" / "attacks").glob("*.toml"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from lidar.camera.ground_texture import (
     ASPHALT,
     BARE,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from geoscene.classes import Class
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.camera.png import depth_to_counts, encode_png
 from lidar.camera.render import RenderOptions, render

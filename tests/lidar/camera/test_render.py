@@ -9,7 +9,7 @@ from helpers.facades import with_windows
 from helpers.sensor_worlds import MeshWorld, box, plate, world
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import ROOF, WALL, Mesh, concatenate
+from geoscene.geometry.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.camera.edges import edge_pixels
 from lidar.camera.png import encode_png
 from lidar.camera.render import RenderOptions, _shared_rays, exposure_times, optical_flow, render

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.sensor_worlds import MeshWorld, plate
 
-from geoscene.mesh import concatenate
+from geoscene.geometry.mesh import concatenate
 from geoscene.objects.shapes import shapes
 from lidar.camera.light import daylight
 from lidar.camera.render import RenderOptions, render

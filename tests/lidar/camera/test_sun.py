@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.camera.light import daylight
 from lidar.camera.sun import refraction, sun_direction, sun_position
 from lidar.errors import InputError

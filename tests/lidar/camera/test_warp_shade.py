@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.camera import shade
 from lidar.camera.facades import Facades

@@ -9,10 +9,10 @@ import pytest
 from helpers.sensor_worlds import driven
 from scipy.spatial.transform import Rotation
 
-from geoscene.csv_tables import write_columns
 from geoscene.errors import InputError as FolderError
-from geoscene.files import write_json
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import write_json
 from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.export import EXPORTERS

@@ -10,7 +10,7 @@ import pytest
 from helpers.programs import run_program
 
 from geoscene.classes import Class
-from geoscene.files import write_json
+from geoscene.support.files import write_json
 from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import read_cloud
 from lidar.dataset.info import describe

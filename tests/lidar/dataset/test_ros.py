@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from geoscene.classes import Class
 from geoscene.errors import MissingExtraError
-from geoscene.files import write_json
+from geoscene.support.files import write_json
 from lidar.camera.png import counts_to_depth, image_to_feature, read_png
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.export import EXPORTERS, ros_topics

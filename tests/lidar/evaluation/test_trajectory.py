@@ -14,7 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geoscene.canvas import Canvas
+from geoscene.drawing.canvas import Canvas
 from lidar.dataset.kitti_sequence import write_poses
 from lidar.errors import FormatError, InputError
 from lidar.evaluation.figures import qualities

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from pyproj import CRS, Geod
 
 from geoscene.errors import FrameError
-from geoscene.frames import Frame, utm_crs
+from geoscene.geometry.frames import Frame, utm_crs
 from lidar.geometry.georeference import AFFINE_LIMIT, Georeference, export_crs
 
 # Published-formula anchors (transverse Mercator of WGS 84): E, N, point scale, convergence in degrees.

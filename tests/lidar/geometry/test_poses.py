@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.dataset.metadata import pose_columns
 from lidar.geometry.attitude import (
     body_rates,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from lidar.camera import ground_texture, texture
 
 wp = pytest.importorskip("warp", reason="the extra gpu is not installed")

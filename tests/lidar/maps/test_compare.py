@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, class_codes
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, concatenate
 from lidar.camera.render import RenderOptions
 from lidar.errors import InputError
 from lidar.maps.picture import (

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geoscene.progress import silent
+from geoscene.support.progress import silent
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.recorded import Stream
 from lidar.errors import FormatError, InputError

@@ -12,7 +12,7 @@ import shapely
 from pynmeagps import NMEAReader
 from pyproj import Geod
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount

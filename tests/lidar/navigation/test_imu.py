@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from geoscene import csv_tables
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
+from geoscene.support import csv_tables
 from lidar.geometry import poses
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount

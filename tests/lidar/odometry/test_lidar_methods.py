@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from geoscene.progress import silent
+from geoscene.support.progress import silent
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.trajectory_tum import read_tum
 from lidar.odometry.deskewing import still

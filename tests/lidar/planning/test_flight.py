@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.errors import InputError, RouteError
 from lidar.geometry.attitude import euler_from_quat
 from lidar.planning.flight import survey_flight, waypoint_flight

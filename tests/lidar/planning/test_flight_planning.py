@@ -13,7 +13,7 @@ from helpers.programs import run_program
 from helpers.rasters import write_slope
 
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table

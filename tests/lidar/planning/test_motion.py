@@ -9,7 +9,7 @@ from helpers.roadgrids import grid, road_graph
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates, euler_from_quat, matrix_from_quat
 from lidar.planning.motion import drive_path, motion_along, speed_limits

@@ -7,7 +7,7 @@ from helpers.roadgrids import grid, road_graph
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
 from geoscene.sources import read_osm
 from lidar.errors import BlockedError, RouteError

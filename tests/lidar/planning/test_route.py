@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.errors import InputError
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.routing import turn_table
 from geoscene.sources import read_osm

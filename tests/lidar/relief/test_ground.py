@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
-from geoscene.mesh import Mesh
+from geoscene.geometry.mesh import Mesh
 from lidar.errors import InputError
 from lidar.raycast import Caster
 from lidar.relief import GroundRefiner, ground_tables

@@ -7,7 +7,7 @@ from helpers.facades import with_windows
 from helpers.sensor_worlds import MeshWorld, box
 
 from geoscene.buildings.facades.solids import relief_mesh
-from geoscene.mesh import ROOF, WALL
+from geoscene.geometry.mesh import ROOF, WALL
 from lidar.raycast import Caster
 
 

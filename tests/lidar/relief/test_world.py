@@ -9,8 +9,8 @@ from helpers.facades import plane_mesh, random_relief
 from helpers.sensor_worlds import driven
 
 from geoscene.classes import Class
-from geoscene.frames import Frame
-from geoscene.mesh import Mesh, concatenate
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_tile

@@ -10,9 +10,9 @@ from helpers.programs import run_program
 from helpers.rasters import write_slope
 from helpers.scenes import same_files
 
-import geoscene.processes
+import geoscene.support.processes
 import lidar.pipeline
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.scene import open_scene
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
@@ -89,7 +89,9 @@ def test_unchanged_drives_are_kept_without_planning_them(scene, tmp_path, monkey
     trajectory = tmp_path / "out" / first.rows[0].name / "trajectory.csv"
     before = trajectory.read_bytes()
     monkeypatch.setattr(lidar.pipeline, "plan_drive", noted)
-    monkeypatch.setattr(geoscene.processes, "threads_of_libraries", lambda: 0)  # forked workers have it too
+    monkeypatch.setattr(
+        geoscene.support.processes, "threads_of_libraries", lambda: 0
+    )  # forked workers have it too
     assert sweep(file, tmp_path / "out").rows == first.rows
     assert not log.exists()
     trajectory.write_bytes(before[:100])
@@ -314,7 +316,9 @@ def test_a_drive_that_kills_its_process_is_a_row_and_the_others_go_on(scene, tmp
         return recorded(scene, out, options=options, **more)
 
     monkeypatch.setattr(lidar.pipeline, "drive", deadly)
-    monkeypatch.setattr(geoscene.processes, "threads_of_libraries", lambda: 0)  # forked workers have both
+    monkeypatch.setattr(
+        geoscene.support.processes, "threads_of_libraries", lambda: 0
+    )  # forked workers have both
     rows = sweep(written(tmp_path / "grid.toml", scene), tmp_path / "out").rows
     assert [row.state for row in rows] == ["failed", "done"]
     assert "killed by signal 9" in rows[0].error

@@ -6,7 +6,7 @@ import laspy
 import numpy as np
 import pytest
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
 from lidar.maps.voxels import nearest_to_centre

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from geoscene.figures import metres
-from geoscene.progress import silent
+from geoscene.drawing.figures import metres
+from geoscene.support.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.physics.settings import LEVELS, PLAIN

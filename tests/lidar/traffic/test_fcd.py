@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from geoscene.polylines import parallel
+from geoscene.geometry.polylines import parallel
 from lidar.cli import app
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from geoscene.classes import Class
-from geoscene.frames import Frame as GeoFrame
+from geoscene.geometry.frames import Frame as GeoFrame
 from lidar.camera import shade
 from lidar.camera.light import daylight
 from lidar.camera.render import Frame

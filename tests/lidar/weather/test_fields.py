@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.sensor_worlds import box, driven, world
 
-from geoscene.frames import Frame
+from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses

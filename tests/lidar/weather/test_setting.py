@@ -1,7 +1,7 @@
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
+from helpers import ROOT
 
 from lidar.errors import InputError
 from lidar.weather.setting import KINDS, WeatherSetting, read_weather
@@ -120,7 +120,7 @@ def test_a_setting_is_made_again_from_its_table(kind):
 
 
 def test_the_example_is_a_morning():
-    path = Path(__file__).parents[3] / "examples" / "weather" / "morning.toml"
+    path = ROOT / "examples" / "weather" / "morning.toml"
     settings = read_weather(str(path))
     assert [s.kind for s in settings] == ["fog", "rain", "rain"]
     now = [[s.kind for s in settings if s.amount_at(t) is not None] for t in (0, 299, 300, 600, 900, 5000)]

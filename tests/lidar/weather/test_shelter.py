@@ -7,7 +7,7 @@ import pytest
 from helpers.sensor_worlds import box, driven, world
 
 from geoscene.classes import Class
-from geoscene.frames import Frame as GeoFrame
+from geoscene.geometry.frames import Frame as GeoFrame
 from lidar.camera.light import daylight
 from lidar.camera.render import Frame
 from lidar.geometry.mounts import Mount

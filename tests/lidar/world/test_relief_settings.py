@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geoscene.options import RELIEFS, BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.options import DriveOptions

@@ -4,7 +4,7 @@ import numpy as np
 
 from geoscene.classes import Class
 from geoscene.options import BuildOptions
-from geoscene.pipeline import build
+from geoscene.pipeline.build import build
 from geoscene.sources.data import OsmData, Point, Way
 from lidar.world.world import World
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from geoscene.classes import Class, materials
-from geoscene.frames import Frame
-from geoscene.mesh import WALL, Instances, Mesh, concatenate
+from geoscene.geometry.frames import Frame
+from geoscene.geometry.mesh import WALL, Instances, Mesh, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile

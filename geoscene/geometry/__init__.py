@@ -1,0 +1,1 @@
+"""Projected frames, meshes and polylines; tests for intersections and watertightness."""

@@ -1,0 +1,302 @@
+"""Shared by both command-line programs: option parsing, one-line errors, exit codes, progress bars, JSON."""
+
+from __future__ import annotations
+
+import atexit
+import errno
+import gc
+import json
+import logging
+import os
+import re
+import shlex
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+from cyclopts import App, CycloptsError, Parameter, Token
+
+from geoscene.errors import InputError
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import url_of
+
+DONE, FAILURE, USAGE = 0, 1, 2
+"""Exit codes: success, failure, unusable input or options."""
+
+_COLLECTED = (500_000, 50, 50)
+"""Thresholds of Python's search for cyclic garbage: with its defaults it takes a tenth of a build, whose many
+objects are kept. The first is more than what programs import and short drives make."""
+
+_THREADS = "OPENBLAS_NUM_THREADS"
+"""Environment variable of NumPy and SciPy, which are imported later: threads of their linear algebra wait
+busily for work, of which the small blocks of sparse matrices give them none."""
+
+_NO_SPACE = "; free some space and run the same command again"
+_PERMISSION = "; give a path that you may write to and files that you may read"
+_NO_DIRECTORY = "; a file is where a directory is needed"
+_HINTS = {
+    errno.EEXIST: _NO_DIRECTORY,
+    errno.ENOTDIR: _NO_DIRECTORY,
+    errno.EISDIR: "; a directory is where a file is needed",
+    errno.ENOSPC: _NO_SPACE,
+    errno.EDQUOT: _NO_SPACE,
+    errno.EACCES: _PERMISSION,
+    errno.EPERM: _PERMISSION,
+    errno.EROFS: "; give a path that you may write to",
+}
+_TEMPORARY = re.compile(r"\.\d+\.part(?=$|[./])|(\.new|\.old)?\.part(?=$|/)|\.lock$")
+"""What names of files have more than those that they become."""
+
+_BROKEN_PIPE = 141
+
+_INTERRUPTIONS = (signal.SIGINT, signal.SIGTERM)
+"""Signals of Ctrl-C, and of ``timeout``, ``kill`` and batch systems; the exit code is 128 plus the number."""
+
+_RESUMED = ("build", "drive", "sweep")
+"""Commands that go on where they were interrupted."""
+
+_GRACE = 1.5
+"""Seconds to clear up in after an interruption, which may also get lost in callbacks of compiled code."""
+
+_NUMBERS = re.compile(r"-\d+(\.\d*)?(,-?\d+(\.\d*)?)+")
+
+
+def guard_numbers(words: Sequence[str]) -> list[str]:
+    """Put a space before ``-30.1,-51.2``, so that it is not parsed as an option; number parsers ignore it."""
+    return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
+
+
+SEVERAL = Parameter(consume_multiple=True)
+"""Parameter of an option that takes all values up to the next option."""
+
+
+def shown_default(value: object) -> str | None:
+    """Text of a default value in help; None for an empty default."""
+    if isinstance(value, tuple):
+        value = ",".join(map(str, value))
+    return None if value is None or value is False or value == "" else str(value)
+
+
+DEFAULTS = Parameter(negative=(), show_default=shown_default)
+"""Parameter of every option of both programs."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, slots=True)
+class Report:
+    """Options of a command's output."""
+
+    overwrite: bool = False
+    """Replace an existing output."""
+
+    json: bool = False
+    """Print the summary as JSON."""
+
+    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"])] = False
+    """Show no progress bars."""
+
+
+def _words(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    return tuple(word for word in tokens[0].value.lower().split(",") if word)
+
+
+WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
+"""Parameter of an option that takes comma-separated words, as a tuple in lower case."""
+
+
+def degrees(names: str) -> Parameter:
+    """Parameter of an option that takes comma-separated degrees: LAT,LON, or W,S,E,N as they are given."""
+
+    def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
+        text, count = tokens[0].value.strip(), names.count(",") + 1
+        try:
+            values = tuple(float(v) for v in text.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != count:
+            raise ValueError(f"{text}: give {count} numbers in degrees as {names}")
+        if names == "LAT,LON" and not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
+            raise ValueError(f"{text}: not a latitude and longitude in degrees")
+        return values
+
+    return Parameter(converter=convert, n_tokens=1, metavar=names)
+
+
+def whole(_: object, tokens: Sequence[Token]) -> int:
+    """Converter of options that take a whole number; 1.5 is an error."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError("give a whole number") from None
+
+
+def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exception], ...]) -> None:
+    """Run a program and exit with its code.
+
+    roots : exceptions printed as one line, exit code 1
+    usage : those of them caused by input or options, exit code 2
+    """
+    logging.basicConfig(
+        level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
+    )
+    gc.set_threshold(*_COLLECTED)
+    atexit.register(gc.freeze)  # the end of a process need not search what is left: 0.5 s of a drive
+    os.environ.setdefault(_THREADS, "1")
+    logging.getLogger("laspy").setLevel(logging.CRITICAL)  # it logs the errors that it raises
+    logging.getLogger("geoscene.support.cluster").setLevel(
+        logging.INFO
+    )  # it names the page with the progress
+    try:
+        with _ended_by_interruptions(app):
+            words = guard_numbers(sys.argv[1:])
+            code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
+            sys.stdout.flush()
+    except CycloptsError as error:
+        message = str(error).rstrip(".")
+        _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
+        sys.exit(USAGE)
+    except roots as error:
+        _print_error(app, error)
+        sys.exit(USAGE if isinstance(error, usage) else FAILURE)
+    except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(_BROKEN_PIPE)
+    except MemoryError:
+        _print_error(app, "out of memory; take a smaller area or fewer workers")
+        sys.exit(FAILURE)
+    except OSError as error:
+        # Files are first written as <name>.<process>.part; the message names the final file.
+        name = _TEMPORARY.sub("", str(error.filename or "the system"))
+        hint = _HINTS.get(error.errno or 0, "")
+        _print_error(app, f"{name}: {error.strerror or error}{hint}")
+        sys.exit(FAILURE)
+    sys.exit(code if isinstance(code, int) else DONE)
+
+
+@contextmanager
+def _ended_by_interruptions(app: App) -> Iterator[None]:
+    """Let the first interruption of the block raise KeyboardInterrupt, and end the program soon after.
+
+    What the block raises then counts as that: compiled code turns a KeyboardInterrupt into other errors.
+    """
+    arrived: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        arrived.append(number)
+        if hasattr(signal, "setitimer"):
+            for interruption in _INTERRUPTIONS:  # ``timeout`` sends two
+                signal.signal(interruption, signal.SIG_IGN)
+            signal.signal(signal.SIGALRM, lambda *_: _exit_interrupted(app, number))
+            signal.setitimer(signal.ITIMER_REAL, _GRACE)
+        raise KeyboardInterrupt
+
+    for interruption in _INTERRUPTIONS:
+        if signal.getsignal(interruption) != signal.SIG_IGN:  # as of SIGINT in the background of a script
+            signal.signal(interruption, interrupt)
+    try:
+        yield
+    except BaseException:
+        if arrived:
+            _exit_interrupted(app, arrived[0])
+        raise
+
+
+def _exit_interrupted(app: App, number: int) -> NoReturn:
+    """End at once, without waiting for other threads; files appear when they are complete."""
+    from multiprocessing import active_children  # noqa: PLC0415 - slow to import
+
+    for child in active_children():
+        child.kill()
+    with suppress(RuntimeError):  # if it was interrupted in writing to standard error
+        resumed = _command(app).strip() in _RESUMED
+        _print_error(app, "interrupted" + "; repeat the command to resume" * resumed)
+        sys.stderr.flush()
+    os._exit(128 + number)
+
+
+def _command(app: App) -> str:
+    """The command on the command line with the commands that it is nested in, each followed by a space."""
+    return "".join(f"{name} " for name in app.parse_commands(sys.argv[1:])[0])
+
+
+def with_flags(app: App, text: str) -> str:
+    """A library message with parameters (`` `tile_size` ``) replaced by flags of the command (--tile-size).
+
+    Parameters that the command does not have keep their name.
+    """
+    flags = {}
+    if "`" in text and (words := app.parse_commands(sys.argv[1:])[0]):
+        command = app
+        for word in words:
+            command = command[word]
+        if command.default_command is not None:  # not a group of commands
+            arguments = command.assemble_argument_collection()
+            flags = {argument.field_info.name: argument.name for argument in arguments}
+    return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
+
+
+def _print_error(app: App, message: object) -> None:
+    text = " ".join(with_flags(app, str(message)).split())
+    print(f"{app.name[0]}: {text}", file=sys.stderr)
+
+
+def command_line(*words: object) -> str:
+    """Words as a command to paste into a shell, with quotes where needed."""
+    return shlex.join(map(str, words))
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print a document as JSON on standard output."""
+    print(json.dumps(document, indent=2, ensure_ascii=False))
+
+
+def note_new_folder(out: Path) -> None:
+    """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed.
+
+    Raises InputError for a URL.
+    """
+    if url := url_of(out):
+        raise InputError(
+            f"`out` {url}: only geoscene build and lidar drive write to object storage; give a path of this"
+            " machine"
+        )
+    if not (folder := out.absolute().parent).exists():
+        print(f"{folder}: this folder does not exist and is made", file=sys.stderr)
+
+
+@contextmanager
+def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
+    """Yield a `Progress` that draws bars on standard error, or a silent one if that is not a terminal.
+
+    A bar appears once its stage has taken about a second, at once if its length is unknown.
+    """
+    if quiet or not sys.stderr.isatty():
+        yield silent
+        return
+    from rich.console import Console  # noqa: PLC0415
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+    from rich.progress import Progress as Bars  # noqa: PLC0415
+
+    columns = (TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        yield _bar_callback(bars)
+
+
+def _bar_callback(bars: Any) -> Progress:
+    tasks: dict[str, Any] = {}
+    started: dict[str, float] = {}
+
+    def update(stage: str, done: int, *, total: int) -> None:
+        now = time.monotonic()
+        if stage not in tasks:
+            if total and now - started.setdefault(stage, now) < 1.0:
+                return
+            tasks[stage] = bars.add_task(stage, total=total or None)
+        bars.update(tasks[stage], completed=done, total=total or None)
+
+    return update
