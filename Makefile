@@ -38,7 +38,7 @@ test-fast: $(STAMP)
 
 test-gpu: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check warp-lang==1.19.0
-	$(PYTEST) tests/lidar/gpu tests/lidar/raycast/test_warp.py tests/lidar/camera/test_warp_shade.py
+	$(PYTEST) tests/lidar/raycast/test_warp.py tests/lidar/sensors/camera/test_warp_shade.py
 
 fuzz: $(STAMP)
 	$(PYTEST) --hypothesis-profile=fuzz -m hypothesis

@@ -14,8 +14,8 @@ from typing import Any
 import forked
 from mutations import WORDS
 
-from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS
+from lidar.dataset.layouts import EXPORTERS
 
 Words = list[str]
 Line = list[tuple[float, float]]

@@ -4,7 +4,7 @@
 
 EXTRACTS is a folder with nyc_lower_east_side.osm.pbf and monaco.osm.pbf. Builds both, records six drives
 with a 32-beam scanner, a camera, a receiver and an inertial unit, and writes
-lidar/defences/calibration.toml. Takes ten minutes on two cores.
+lidar/tools/defences/calibration.toml. Takes ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 from geoscene.scene.layout import SceneFiles
-from lidar.defences.calibration import Calibration, calibration_text, read_calibration
+from lidar.tools.defences.calibration import Calibration, calibration_text, read_calibration
 
 RIG = """
 name = "probe"

@@ -5,7 +5,7 @@
 EXTRACTS is a folder with the extracts of `PLACES`. Builds them, records 8 drives to train with and 12 to
 measure on, trains a model, and prints the tables of docs/security.md for the rules, for the model, and for
 one that was trained without the two places that are measured on. ``--write`` writes the model to
-lidar/detection/learned.npz.
+lidar/tools/detection/learned.npz.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from pathlib import Path
 
 from geoscene.scene.layout import SceneFiles
 from lidar.dataset.layout import Paths
-from lidar.detection.registry import MODEL
-from lidar.redteam.evaluate import Accuracy, accuracies
-from lidar.redteam.measure import Case, measured
-from lidar.redteam.plan import Measure
+from lidar.tools.detection.registry import MODEL
+from lidar.tools.redteam.evaluate import Accuracy, accuracies
+from lidar.tools.redteam.measure import Case, measured
+from lidar.tools.redteam.plan import Measure
 
 PLACES = {
     "nyc_lower_east_side": ".osm.pbf",

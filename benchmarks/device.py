@@ -26,15 +26,15 @@ import numpy as np
 from geoscene.errors import SceneFormatError, need
 from geoscene.scene import Scene, open_scene
 from lidar import DriveOptions, drive
-from lidar.camera.render import RenderOptions, render
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.gpu.device import WARP_CPU, device
-from lidar.plan import plan_drive
+from lidar.raycast.device import WARP_CPU, device
 from lidar.raycast.hits import Hits
-from lidar.rig.scanner import load_sensor
-from lidar.rig.specs import CameraSpec
-from lidar.sensors.scan import scan
+from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.scanner import load_sensor
+from lidar.sensors.rig.specs import CameraSpec
+from lidar.simulation.plan import plan_drive
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 

@@ -29,8 +29,20 @@ _MODULES = (
         "laspy",
         "lazrs",
     ),
-    *("lidar.cli", "lidar.pipeline", "lidar.apply", "lidar.sign", "lidar.verify", "lidar.maps.aggregate"),
-    *("lidar.view", "lidar.sweep", "lidar.denoise.denoise", "lidar.dataset.export.nuscenes"),
+    *(
+        "lidar.cli",
+        "lidar.simulation.drive",
+        "lidar.tools.apply",
+        "lidar.tools.sign",
+        "lidar.tools.verify",
+        "lidar.tools.maps.aggregate",
+    ),
+    *(
+        "lidar.tools.view",
+        "lidar.tools.sweep",
+        "lidar.tools.denoise.denoise",
+        "lidar.dataset.layouts.nuscenes",
+    ),
 )
 _CHANGES = frozenset(("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.truncate"))
 

@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.scene import open_scene
-from lidar.dataset.measured import MeasuredImages
-from lidar.dataset.record_images import measure_images
-from lidar.dataset.recording import Recording
-from lidar.frame_loop import chunks
 from lidar.options import DriveOptions
-from lidar.plan import plan_drive
-from lidar.rig.devices import Camera
+from lidar.sensors.rig.devices import Camera
+from lidar.simulation.frame_loop import chunks
+from lidar.simulation.measured import MeasuredImages
+from lidar.simulation.plan import plan_drive
+from lidar.simulation.record_images import measure_images
+from lidar.simulation.recording import Recording
 from lidar.traffic.populate import TrafficOptions
 from lidar.world.thread_worlds import Worlds
 

@@ -16,13 +16,13 @@ import numpy as np
 
 from geoscene.options import RELIEFS
 from geoscene.scene import open_scene
-from lidar.camera.render import RenderOptions, render
-from lidar.camera.sun import sun_direction
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.options import DriveOptions
-from lidar.plan import plan_drive
-from lidar.rig.specs import CameraSpec
+from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.rig.specs import CameraSpec
+from lidar.simulation.plan import plan_drive
 from lidar.world.world import World
 
 ROUNDS = 3

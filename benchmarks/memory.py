@@ -27,7 +27,7 @@ STEP = 100.0
 
 
 def _route(scene_path: Path, km: float, queue: multiprocessing.Queue[NDArray[np.float64]]) -> None:
-    from lidar.planning.route import RouteOptions, plan_route  # noqa: PLC0415
+    from lidar.motion.route import RouteOptions, plan_route  # noqa: PLC0415
 
     scene = open_scene(scene_path)
     queue.put(

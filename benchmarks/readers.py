@@ -15,9 +15,6 @@ from geoscene.scene.geopackage import read_layer
 from geoscene.scene.layout import SceneFiles, open_scene
 from geoscene.scene.tile_files import read_shapes, read_tile
 from geoscene.sources import read_osm, read_source
-from lidar.attacks.images import _picture
-from lidar.attacks.placed_object import _read_mesh
-from lidar.camera.png import read_png
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.checksums import differences, read_checksums
 from lidar.dataset.formats import FORMATS, MAPS, format_of, read_table
@@ -26,24 +23,27 @@ from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset, read_rows, read_sensors
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.truth_files import read_truth
-from lidar.defences.calibration import read_calibration
-from lidar.detection.forest import read_forest
 from lidar.errors import FormatError
 from lidar.geometry.trajectory_tum import read_tum
-from lidar.integrity.digest_files import read_digests, read_links
-from lidar.integrity.keys import read_signer
-from lidar.maps.selection import _polygons
-from lidar.planning.replay import read_replay
-from lidar.planning.waypoints import read_track
-from lidar.redteam.plan import read_plan
-from lidar.rig.devices import cameras, scanners
-from lidar.rig.scanner import load_sensor
-from lidar.rig.specs import load_rig, rig_digest
-from lidar.rig.vehicle import load_vehicle
+from lidar.motion.replay import read_replay
+from lidar.motion.vehicle import load_vehicle
+from lidar.motion.waypoints import read_track
+from lidar.sensors.camera.png import read_png
+from lidar.sensors.rig.devices import cameras, scanners
+from lidar.sensors.rig.scanner import load_sensor
+from lidar.sensors.rig.specs import load_rig, rig_digest
+from lidar.signal.attacks.images import _picture
+from lidar.signal.attacks.placed_object import _read_mesh
 from lidar.signal.registry import read_stages
-from lidar.sweep.grid import read_grid
+from lidar.signal.weather.setting import read_weather
+from lidar.tools.defences.calibration import read_calibration
+from lidar.tools.detection.forest import read_forest
+from lidar.tools.integrity.digest_files import read_digests, read_links
+from lidar.tools.integrity.keys import read_signer
+from lidar.tools.maps.selection import _polygons
+from lidar.tools.redteam.plan import read_plan
+from lidar.tools.sweep.grid import read_grid
 from lidar.traffic.fcd import read_fcd
-from lidar.weather.setting import read_weather
 
 _FRAME = Frame.at(*PLACE)
 

@@ -17,12 +17,12 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.scene import open_scene
-from lidar.camera.render import RenderOptions, render
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.rig.scanner import load_sensor
-from lidar.rig.specs import CameraSpec
-from lidar.sensors.scan import scan
+from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.scanner import load_sensor
+from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 

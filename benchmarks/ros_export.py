@@ -25,11 +25,11 @@ from typing import Any
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from geoscene.support.progress import silent
-from lidar.dataset.export import ros2
-from lidar.dataset.export.ros_drive import RosDrive, Topic
-from lidar.dataset.export.ros_messages import encoded, typestore
-from lidar.dataset.export.ros_topics import topics_of
 from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.layouts import ros2
+from lidar.dataset.layouts.ros_drive import RosDrive, Topic
+from lidar.dataset.layouts.ros_messages import encoded, typestore
+from lidar.dataset.layouts.ros_topics import topics_of
 
 Messages = list[tuple[int, int, Any]]
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
-from lidar.integrity.tampering import FrameVerdict, Place, frame_verdict
-from lidar.integrity.watermark import Cells, Watermark
+from lidar.tools.integrity.tampering import FrameVerdict, Place, frame_verdict
+from lidar.tools.integrity.watermark import Cells, Watermark
 
 MARK = Watermark(b"key of a benchmark")
 TRIALS = 40

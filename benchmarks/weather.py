@@ -22,16 +22,16 @@ from typing import Any
 import numpy as np
 
 from geoscene.scene import open_scene
-from lidar.dataset.recording import Recording
-from lidar.dataset.situations import situation_of
-from lidar.frame_loop import chunks
 from lidar.options import DriveOptions
-from lidar.physics.echoes import Origin
-from lidar.plan import DrivePlan, plan_drive
-from lidar.rig.devices import Scanner
-from lidar.sensors.scan import cast, measured
+from lidar.sensors.laser.scan import cast, measured
+from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.rig.devices import Scanner
 from lidar.signal.run import Altered, altered_sweep, cloud_truth
-from lidar.weather.setting import read_weather
+from lidar.signal.weather.setting import read_weather
+from lidar.simulation.frame_loop import chunks
+from lidar.simulation.plan import DrivePlan, plan_drive
+from lidar.simulation.recording import Recording
+from lidar.simulation.situations import situation_of
 from lidar.world.thread_worlds import Worlds
 
 SENSORS = {"vlp16": "VLP-16", "hdl64e_s2": "HDL-64E S2"}

@@ -19,11 +19,15 @@ from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.support.console import progress_bar
 from geoscene.view import view_scene
-from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
-from lidar.maps.aggregate import aggregate
-from lidar.maps.picture import (
+from lidar.motion.vehicle import load_vehicle
+from lidar.options import DriveOptions, MapOptions
+from lidar.sensors.camera.png import counts_to_depth, read_png, write_png
+from lidar.sensors.rig.specs import load_rig
+from lidar.simulation.drive import drive
+from lidar.tools.maps.aggregate import aggregate
+from lidar.tools.maps.picture import (
     class_colors,
     cloud_picture,
     depth_picture,
@@ -31,10 +35,6 @@ from lidar.maps.picture import (
     sweep_picture,
     with_legend,
 )
-from lidar.options import DriveOptions, MapOptions
-from lidar.pipeline import drive
-from lidar.rig.specs import load_rig
-from lidar.rig.vehicle import load_vehicle
 from lidar.traffic.populate import TrafficOptions
 from lidar.world.world import World
 

@@ -18,21 +18,21 @@ from cyclopts import Group, Parameter, Token
 from geoscene.classes import Class
 from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
-from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import FORMATS, LABELS
+from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
-from lidar.rig.imu_grades import PRESETS
+from lidar.sensors.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
     from geoscene.pipeline.reach import RoadMap
     from geoscene.scene import Scene
-    from lidar.dataset.recording import Contents
-    from lidar.planning.road_conditions import RoadConditions
-    from lidar.planning.route import Side, Spec
+    from lidar.motion.road_conditions import RoadConditions
+    from lidar.motion.route import Side, Spec
+    from lidar.settings import Contents
     from lidar.signal.registry import NamedStage
+    from lidar.signal.weather.setting import WeatherSetting
     from lidar.traffic.fcd import TrafficFile
     from lidar.traffic.populate import TrafficOptions
-    from lidar.weather.setting import WeatherSetting
 
     WeatherList = tuple[WeatherSetting, ...]
     Traffic = TrafficOptions | TrafficFile
@@ -59,7 +59,7 @@ RASTERS = ("dsm", "dtm", "density", "intensity")
 """Rasters of a map."""
 
 ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
-"""Origins of returns, `lidar.physics.echoes.Origin` in lower case."""
+"""Origins of returns, `lidar.sensors.physics.echoes.Origin` in lower case."""
 
 SHOWN = ("all", "sweep", "cameras", "map")
 """What a film can show."""
@@ -192,7 +192,7 @@ def _attacks(_: object, tokens: Sequence[Token]) -> Any:
 
 
 def _weather(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.weather.setting import read_weather  # noqa: PLC0415
+    from lidar.signal.weather.setting import read_weather  # noqa: PLC0415
 
     return tuple(setting for token in tokens for setting in read_weather(token.value))
 
@@ -422,18 +422,18 @@ class DriveOptions:
 
     def road_conditions(self) -> RoadConditions:
         """Grip and visibility that vehicles drive with."""
-        from lidar.planning.road_conditions import ROADS  # noqa: PLC0415
+        from lidar.motion.road_conditions import ROADS  # noqa: PLC0415
 
         if self.road != "by-weather":
             return ROADS[self.road]
-        from lidar.weather.road import road_conditions  # noqa: PLC0415
+        from lidar.signal.weather.road import road_conditions  # noqa: PLC0415
 
         ground = self.contents().world
         return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)
 
     def _weather(self) -> WeatherList:
         """Weather among the stages."""
-        from lidar.weather.setting import WeatherSetting  # noqa: PLC0415
+        from lidar.signal.weather.setting import WeatherSetting  # noqa: PLC0415
 
         stages = (named.stage for named in self.all_stages)
         return tuple(stage for stage in stages if isinstance(stage, WeatherSetting))
@@ -458,8 +458,7 @@ class DriveOptions:
 
     def contents(self) -> Contents:
         """Files and settings of every frame; raises InputError for unknown names."""
-        from lidar.dataset.recording import Contents  # noqa: PLC0415  (a second, not needed for --help)
-        from lidar.settings import settings_of  # noqa: PLC0415
+        from lidar.settings import Contents, settings_of  # noqa: PLC0415  (a second, not needed for --help)
         from lidar.signal.registry import Stages  # noqa: PLC0415
 
         stages = self.all_stages
@@ -475,7 +474,7 @@ class DriveOptions:
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""
-        from lidar.rig.specs import load_rig, rig_digest  # noqa: PLC0415
+        from lidar.sensors.rig.specs import load_rig, rig_digest  # noqa: PLC0415
 
         route, side = self.route or "random", self.side_in(scene)
         traffic = None if self.traffic is None else asdict(replace(self.traffic, side=side))

@@ -9,14 +9,20 @@ from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple
 
-from lidar.camera import settings as camera_settings
-from lidar.camera.settings import CameraSettings
+from lidar.dataset.deskew import MOMENTS
+from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
 from lidar.errors import InputError
-from lidar.physics import settings as scanner_settings
-from lidar.physics.reflect import INCIDENCE_LAWS
-from lidar.physics.settings import ScannerSettings
 from lidar.raycast import PRECISIONS
+from lidar.sensors.camera import settings as camera_settings
+from lidar.sensors.camera.settings import PLAIN as PLAIN_CAMERA
+from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.physics import settings as scanner_settings
+from lidar.sensors.physics.reflect import INCIDENCE_LAWS
+from lidar.sensors.physics.settings import PLAIN as PLAIN_SCANNER
+from lidar.sensors.physics.settings import ScannerSettings
+from lidar.signal.registry import NO_STAGES, Stages
 from lidar.world.settings import ORIGINS, RELIEFS, WorldSettings
+from lidar.world.settings import PLAIN as PLAIN_WORLD
 
 _SWITCH = {"on": True, "yes": True, "true": True, "1": True}
 _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
@@ -128,3 +134,61 @@ def _parsed(name: str, text: str, *, former: object) -> dict[str, Any]:
     except ValueError:
         wanted = "a whole number" if kind is int else "a number"
         raise InputError(f"`settings` {name}={text}: give {wanted}") from None
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """Which files are written of every frame, and how its measurements are simulated.
+
+    formats : of clouds, names in `lidar.dataset.formats.FORMATS`
+    labels  : of label files, names in `lidar.dataset.formats.LABELS`
+    deskew  : moment of `deskew.MOMENTS` to which clouds in the sensor frame are de-skewed in further files
+    seed    : of the random number generators
+    scanner : settings of scanners
+    camera  : settings of cameras
+    world   : settings of the scene around the vehicle
+    stages  : that change echoes, clouds or images, see `lidar.signal`
+    """
+
+    formats: tuple[str, ...] = ("pcd",)
+    labels: tuple[str, ...] = ()
+    deskew: str = ""
+    seed: int = 0
+    scanner: ScannerSettings = PLAIN_SCANNER
+    camera: CameraSettings = PLAIN_CAMERA
+    world: WorldSettings = PLAIN_WORLD
+    stages: Stages = NO_STAGES
+
+    def __post_init__(self) -> None:
+        """Validate the names."""
+        if not self.formats:
+            raise InputError(f"`formats`: give one or more of {', '.join(FORMATS)}")
+        if unknown := sorted(set(self.formats) - set(FORMATS)):
+            raise InputError(f"`formats` {','.join(unknown)}: unknown; there are {', '.join(FORMATS)}")
+        for form in self.cloud_formats:
+            form.require()
+        if unknown := sorted(set(self.labels) - set(LABELS)):
+            raise InputError(f"`labels` {','.join(unknown)}: unknown; there are {', '.join(LABELS)}")
+        if self.deskew and self.deskew not in MOMENTS:
+            raise InputError(f"`deskew` {self.deskew}: one of {', '.join(MOMENTS)}")
+        if self.deskew and all(form.frame == "world" for form in self.cloud_formats):
+            sensor = ", ".join(form.name for form in FORMATS.values() if form.frame == "sensor")
+            raise InputError(
+                f"`deskew`: {','.join(self.formats)} files hold points in the world frame; add a format of"
+                f" the sensor frame to `formats` ({sensor})"
+            )
+
+    @property
+    def cloud_formats(self) -> list[Format]:
+        """The formats of clouds."""
+        return [FORMATS[name] for name in self.formats]
+
+    @property
+    def label_formats(self) -> list[LabelFormat]:
+        """The formats of label files."""
+        return [LABELS[name] for name in self.labels]
+
+    @property
+    def kitti(self) -> bool:
+        """Whether scanners' folders are KITTI sequences."""
+        return any(f.kitti for f in self.cloud_formats) or any(f.kitti for f in self.label_formats)

@@ -24,17 +24,17 @@ import geoscene.cli
 import geoscene.sources
 import geoscene.tradeoff.engine
 import lidar.cli
-import lidar.pipeline
-import lidar.rig.specs
-import lidar.simulation
-import lidar.tradeoff.accuracy
-import lidar.tradeoff.costs
-import lidar.tradeoff.engine
-import lidar.tradeoff.profile
+import lidar.sensors.rig.specs
+import lidar.simulation.drive
+import lidar.simulation.frames
+import lidar.tools.tradeoff.accuracy
+import lidar.tools.tradeoff.costs
+import lidar.tools.tradeoff.engine
+import lidar.tools.tradeoff.profile
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
-from lidar.tradeoff.images import coarse
+from lidar.tools.tradeoff.images import coarse
 from lidar.traffic.populate import TrafficOptions
 
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
@@ -133,11 +133,11 @@ def inputs(tmp_path_factory):
     for name in ("scene", "city"):
         scene = build(osm, folder / name)
     options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
-    recorded = lidar.pipeline.drive(scene, folder / "recorded", options=options).path / "top"
+    recorded = lidar.simulation.drive.drive(scene, folder / "recorded", options=options).path / "top"
     shutil.copytree(recorded, folder / "kitti" / "sequences" / "00")
     traffic = TrafficOptions(vehicles=60.0, parked=1.0)
     options = replace(options, duration=1.0, formats=("pcd",), route="random", traffic=traffic)
-    trained = lidar.pipeline.drive(scene, folder / "drive1", options=options).path
+    trained = lidar.simulation.drive.drive(scene, folder / "drive1", options=options).path
     for name in ("drive", "drive2", "drive3"):
         shutil.copytree(trained, folder / name)
     return folder
@@ -150,7 +150,7 @@ def folder(inputs, tmp_path, monkeypatch):
     shutil.copytree(inputs, folder)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(geoscene.sources, "demo_path", lambda: folder / "city.osm.pbf")
-    drive, record_all = lidar.pipeline.drive, lidar.pipeline.record_all
+    drive, record_all = lidar.simulation.drive.drive, lidar.simulation.drive.record_all
 
     def short(scene, out, *, options, **more):
         relief = "" if "relief" in dict(options.settings) else "off"  # images take half the time
@@ -160,7 +160,7 @@ def folder(inputs, tmp_path, monkeypatch):
     def first(recording, jobs, **more):
         record_all(recording, jobs[:20], **more)
 
-    compare = lidar.tradeoff.engine.tradeoff
+    compare = lidar.tools.tradeoff.engine.tradeoff
 
     def small(scene, options, *, compared, **more):
         compared = replace(compared, frames=2, pulses=100, pixels=256, reference_rays=7)
@@ -172,21 +172,21 @@ def folder(inputs, tmp_path, monkeypatch):
         "tradeoff",
         lambda *args, **more: builds(*args, **more | {"settings": ("lod",)}),
     )
-    plan, peaks = lidar.tradeoff.accuracy.plan_drive, lidar.tradeoff.costs.peaks
-    camera = lidar.rig.specs._camera
+    plan, peaks = lidar.tools.tradeoff.accuracy.plan_drive, lidar.tools.tradeoff.costs.peaks
+    camera = lidar.sensors.rig.specs._camera
     monkeypatch.setattr(
-        lidar.tradeoff.accuracy,
+        lidar.tools.tradeoff.accuracy,
         "plan_drive",
         lambda scene, options, **more: plan(scene, replace(options, duration=0.2), **more),
     )
-    monkeypatch.setattr(lidar.tradeoff.profile, "RAYS", (1, 7, 19, 127))
+    monkeypatch.setattr(lidar.tools.tradeoff.profile, "RAYS", (1, 7, 19, 127))
     # each takes a process: one stands for all
-    monkeypatch.setattr(lidar.tradeoff.costs, "peaks", lambda tasks: peaks(tasks[:1]) * len(tasks))
-    monkeypatch.setattr(lidar.rig.specs, "_camera", lambda table: coarse(camera(table), 4))
+    monkeypatch.setattr(lidar.tools.tradeoff.costs, "peaks", lambda tasks: peaks(tasks[:1]) * len(tasks))
+    monkeypatch.setattr(lidar.sensors.rig.specs, "_camera", lambda table: coarse(camera(table), 4))
     measure_little(monkeypatch, folder=tmp_path / "profiles")
-    monkeypatch.setattr(lidar.tradeoff.engine, "tradeoff", small)
-    monkeypatch.setattr(lidar.pipeline, "drive", short)
-    monkeypatch.setattr(lidar.pipeline, "record_all", first)
+    monkeypatch.setattr(lidar.tools.tradeoff.engine, "tradeoff", small)
+    monkeypatch.setattr(lidar.simulation.drive, "drive", short)
+    monkeypatch.setattr(lidar.simulation.drive, "record_all", first)
     return folder
 
 
@@ -249,8 +249,8 @@ def test_examples_in_python_succeed(page, folder, monkeypatch):
     for name in ("scene", "drive"):  # the examples write them
         shutil.rmtree(folder / name)
     monkeypatch.setattr(geoscene, "demo_path", geoscene.sources.demo_path)
-    monkeypatch.setattr(lidar, "drive", lidar.pipeline.drive)
-    simulate = lidar.simulation.simulate
+    monkeypatch.setattr(lidar, "drive", lidar.simulation.drive.drive)
+    simulate = lidar.simulation.frames.simulate
     monkeypatch.setattr(
         lidar, "simulate", lambda scene, options: simulate(scene, replace(options, duration=0.2))
     )

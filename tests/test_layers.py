@@ -20,4 +20,4 @@ def test_the_table_of_layers_is_that_of_the_checker(package, column):
         "contracts"
     ]
     (layers,) = (contract["layers"] for contract in contracts if contract.get("containers") == [package])
-    assert rows_of_page(column) == [set(row.split(" | ")) for row in layers]
+    assert rows_of_page(column) == [set(re.split(" [|:] ", row)) for row in layers]

@@ -4,9 +4,9 @@ import pytest
 
 import geoscene
 import lidar
-from lidar.apply import apply_stages
 from lidar.options import ApplyOptions
 from lidar.signal.registry import read_stages
+from lidar.tools.apply import apply_stages
 
 
 @pytest.mark.parametrize("package", [geoscene, lidar])

@@ -22,12 +22,12 @@ from bench.scenes import Setup, boxes_on_hills
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
-from lidar.physics.settings import ScannerSettings
-from lidar.pipeline import drive
-from lidar.plan import plan_drive
 from lidar.raycast import Caster
-from lidar.sensors.scan import scan
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.physics.settings import ScannerSettings
 from lidar.settings import settings_of
+from lidar.simulation.drive import drive
+from lidar.simulation.plan import plan_drive
 from lidar.world.actor_shapes import catalogue
 from lidar.world.world import World
 

@@ -11,16 +11,16 @@ import numpy as np
 from bench.measure import Case
 from bench.scenes import RIGS, Setup
 from geoscene.typing import Ints
-from lidar.camera.render import exposure_times, render
-from lidar.camera.sun import sun_direction
 from lidar.geometry.poses import Poses
-from lidar.pipeline import drive
-from lidar.plan import DrivePlan
-from lidar.random_streams import generator
-from lidar.rig.devices import Camera, Scanner
-from lidar.rig.patterns.beams import Firings
-from lidar.rig.scanner import firings
-from lidar.sensors.scan import scan
+from lidar.geometry.random_streams import generator
+from lidar.sensors.camera.render import exposure_times, render
+from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.sensors.rig.patterns.beams import Firings
+from lidar.sensors.rig.scanner import firings
+from lidar.simulation.drive import drive
+from lidar.simulation.plan import DrivePlan
 from lidar.world.world import World
 
 Work = Callable[[], object]

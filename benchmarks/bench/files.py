@@ -18,9 +18,9 @@ from lidar.dataset.formats.las import SCALE, LasInfo
 from lidar.dataset.formats.pcd import pcd_header
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import open_dataset
-from lidar.maps.aggregate import aggregate
 from lidar.options import MapOptions
-from lidar.pipeline import drive
+from lidar.simulation.drive import drive
+from lidar.tools.maps.aggregate import aggregate
 
 _EXTRA = ("ring", "label", "instance", "range", "incidence", "true_range")
 _KINDS = {"ring": "uint16", "label": "uint8", "instance": "int32", "frame": "uint32"}

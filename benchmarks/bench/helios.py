@@ -23,9 +23,9 @@ import numpy as np
 from bench.measure import BenchError, Case, Spent, command, difference
 from bench.scenes import Setup, rig_file
 from geoscene.export.triangles import write_obj
-from lidar.plan import DrivePlan
-from lidar.rig.devices import Scanner
-from lidar.rig.scanner import firings
+from lidar.sensors.rig.devices import Scanner
+from lidar.sensors.rig.scanner import firings
+from lidar.simulation.plan import DrivePlan
 
 _QUALITY = {1: 1, 7: 2, 19: 3, 61: 5}
 """HELIOS++'s beamSampleQuality by rays per pulse."""

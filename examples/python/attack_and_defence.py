@@ -9,11 +9,11 @@ from pathlib import Path
 
 import geoscene
 import lidar
-from lidar.defences.calibration import read_calibration
-from lidar.defences.defend import defend, score_rows
-from lidar.defences.registry import read_defences
-from lidar.physics.echoes import Origin
-from lidar.rig.catalog import columns
+from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.rig.catalog import columns
+from lidar.tools.defences.calibration import read_calibration
+from lidar.tools.defences.defend import defend, score_rows
+from lidar.tools.defences.registry import read_defences
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "attacked")
 centre = geoscene.read_osm(geoscene.demo_path(), bounds=(24.9405, 60.1655, 24.9475, 60.1690))

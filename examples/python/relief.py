@@ -12,9 +12,9 @@ import numpy as np
 import geoscene
 import lidar
 from geoscene.classes import class_codes
-from lidar.camera.png import counts_to_depth, read_png, write_png
 from lidar.dataset.formats import read_table
-from lidar.maps.picture import View, cloud_picture, depth_picture, with_key
+from lidar.sensors.camera.png import counts_to_depth, read_png, write_png
+from lidar.tools.maps.picture import View, cloud_picture, depth_picture, with_key
 
 RIG = """
 name = "street"

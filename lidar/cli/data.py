@@ -56,8 +56,8 @@ def map_(
         Directory or URL of the dataset.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.maps.aggregate import aggregate  # noqa: PLC0415
-    from lidar.maps.compare import LIMIT  # noqa: PLC0415
+    from lidar.tools.maps.aggregate import aggregate  # noqa: PLC0415
+    from lidar.tools.maps.compare import LIMIT  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -148,7 +148,7 @@ def convert(
     out
         Directory to make.
     """
-    from lidar.conversion import convert as converted  # noqa: PLC0415
+    from lidar.tools.convert import convert as converted  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -190,7 +190,7 @@ def apply(
     out
         Directory to write to.
     """
-    from lidar.apply import apply_stages  # noqa: PLC0415
+    from lidar.tools.apply import apply_stages  # noqa: PLC0415
 
     options = options or ApplyOptions()
     note_new_folder(out)
@@ -230,9 +230,9 @@ def denoise(
     out
         Directory to write the clouds to that the only method leaves.
     """
-    from lidar.denoise.denoise import denoise as denoised  # noqa: PLC0415
-    from lidar.denoise.filters import read_methods  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.denoise.denoise import denoise as denoised  # noqa: PLC0415
+    from lidar.tools.denoise.filters import read_methods  # noqa: PLC0415
 
     methods = read_methods(options.methods)
     if out is not None:
@@ -276,7 +276,7 @@ def odometry(
     out
         Directory to write to.
     """
-    from lidar.odometry.run import estimate_motion  # noqa: PLC0415
+    from lidar.tools.odometry.run import estimate_motion  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:

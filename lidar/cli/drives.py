@@ -27,8 +27,8 @@ from lidar.errors import InputError, LidarError
 from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
 
 if TYPE_CHECKING:
-    from lidar.pipeline import Live
-    from lidar.scene_source import OpenedScene
+    from lidar.simulation.drive import Live
+    from lidar.simulation.scene_source import OpenedScene
 
 
 def drive(
@@ -81,14 +81,14 @@ def drive(
     from geoscene.scene.layout import using  # noqa: PLC0415
     from geoscene.support.storage import published, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
-    from lidar.tradeoff.accuracy import driven, picked  # noqa: PLC0415
+    from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
+    from lidar.tools.tradeoff.accuracy import driven, picked  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
     shows: AbstractContextManager[Live | None] = nullcontext()
     if live is not None:
-        from lidar.view.live import live_target, opened_live  # noqa: PLC0415
+        from lidar.tools.view.live import live_target, opened_live  # noqa: PLC0415
 
         shows = opened_live(live_target(live, overwrite=report.overwrite))
     if not url_of(out):
@@ -201,7 +201,7 @@ def sweep(
         Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers record the drives instead;
         they need the scenes and the output folder under the same paths.
     """
-    from lidar.sweep import sweep as run_sweep  # noqa: PLC0415
+    from lidar.tools.sweep import sweep as run_sweep  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -250,10 +250,10 @@ def redteam(
     workers
         Processes; each records or judges one drive at a time.
     """
-    from lidar.redteam import redteam as run_matrix  # noqa: PLC0415
-    from lidar.redteam.report import detection_tables, success_rows  # noqa: PLC0415
-    from lidar.redteam.run import failed_drives  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.redteam import redteam as run_matrix  # noqa: PLC0415
+    from lidar.tools.redteam.report import detection_tables, success_rows  # noqa: PLC0415
+    from lidar.tools.redteam.run import failed_drives  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -304,9 +304,9 @@ def tradeoff(
         Folder to write tradeoff.json, tradeoff.html and a plot of each sensor to.
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
-    from lidar.scene_source import open_scene_or_map  # noqa: PLC0415
-    from lidar.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
-    from lidar.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+    from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
+    from lidar.tools.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
+    from lidar.tools.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
     from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
 
     options = options or DriveOptions()

@@ -48,10 +48,10 @@ def evaluate(
     out
         Folder to make: figures, tables, aligned trajectory and a page.
     """
-    from lidar.evaluation.objects import kind_of  # noqa: PLC0415
-    from lidar.evaluation.report import report_folder, tables, write_trajectory_report  # noqa: PLC0415
-    from lidar.evaluation.trajectory import evaluate_trajectory, method_of  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.evaluation.objects import kind_of  # noqa: PLC0415
+    from lidar.tools.evaluation.report import report_folder, tables, write_trajectory_report  # noqa: PLC0415
+    from lidar.tools.evaluation.trajectory import evaluate_trajectory, method_of  # noqa: PLC0415
 
     if kind_of(estimate):
         return _evaluate_objects(estimate, against, options=options, out=out, report=report)
@@ -79,9 +79,9 @@ def _evaluate_objects(
     estimate: Path, against: Path, *, options: EvaluateOptions, out: Path | None, report: Report
 ) -> int:
     """Measure detections or tracks."""
-    from lidar.evaluation.objects import evaluate_objects  # noqa: PLC0415
-    from lidar.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.evaluation.objects import evaluate_objects  # noqa: PLC0415
+    from lidar.tools.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
 
     if replace(options, sensor="") != EvaluateOptions():
         raise InputError(f"{estimate}: detections and tracks take no options of trajectories; leave them out")
@@ -133,9 +133,9 @@ def detect(
         Folder to make: NNNNNN.txt of each frame, or results.json.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.detection.registry import read_detector  # noqa: PLC0415
-    from lidar.evaluation.detect import LAYOUTS  # noqa: PLC0415
-    from lidar.evaluation.detect import detect as detected  # noqa: PLC0415
+    from lidar.tools.detection.registry import read_detector  # noqa: PLC0415
+    from lidar.tools.evaluation.detect import LAYOUTS  # noqa: PLC0415
+    from lidar.tools.evaluation.detect import detect as detected  # noqa: PLC0415
 
     if to not in LAYOUTS:
         raise InputError(f"`to` {to}: one of {', '.join(LAYOUTS)}")

@@ -17,7 +17,7 @@ def stages(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.signal.registry import stage_rows  # noqa: PLC0415
 
     rows = stage_rows()
@@ -49,7 +49,7 @@ def rigs(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON, with all their values.
     """
-    from lidar.rig.catalog import columns, rig_rows  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns, rig_rows  # noqa: PLC0415
 
     rows = rig_rows()
     if json:
@@ -72,7 +72,7 @@ def sensors(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON, with the source of every number.
     """
-    from lidar.rig.catalog import columns, sensor_rows  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns, sensor_rows  # noqa: PLC0415
 
     rows = sensor_rows()
     if json:
@@ -100,7 +100,7 @@ def classes(*, json: JsonFlag = False) -> int:
         Print them as JSON.
     """
     from geoscene.classes import class_rows, materials  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
 
     rows, surfaces = class_rows(), {m.name: m.code for m in materials().values()}
     if json:
@@ -119,7 +119,7 @@ def settings(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.settings import levels, list_settings  # noqa: PLC0415
 
     rows = list_settings()
@@ -170,7 +170,7 @@ def selftest(
     quiet
         Show no progress bars.
     """
-    from lidar.selftest import run as extremes  # noqa: PLC0415
+    from lidar.tools.selftest import run as extremes  # noqa: PLC0415
 
     with progress_bar(quiet=quiet) as progress:
         done = list(extremes.outcomes(only, full=full, progress=progress))

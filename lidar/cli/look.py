@@ -13,7 +13,7 @@ from geoscene.support.console import Report, note_new_folder, print_json, progre
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app
 from lidar.errors import InputError
 from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
-from lidar.plots import FIGURES
+from lidar.tools.plots import FIGURES
 
 _FIGURES = "; ".join(
     [
@@ -53,8 +53,8 @@ def info(
     quiet
         Show no progress bars.
     """
-    from lidar.dataset.info import describe  # noqa: PLC0415
-    from lidar.dataset.info_text import info_text  # noqa: PLC0415
+    from lidar.tools.info import describe  # noqa: PLC0415
+    from lidar.tools.info_text import info_text  # noqa: PLC0415
 
     with progress_bar(quiet=quiet) as progress:
         document = describe(dataset, full=full, progress=progress)
@@ -104,12 +104,12 @@ def view(
         Write no file; open the first frame, or a file of points, in a window of Open3D (extra open3d).
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.view.page import view_drive  # noqa: PLC0415
+    from lidar.tools.view.page import view_drive  # noqa: PLC0415
 
     if (out is not None) + serve + open3d != 1:
         raise InputError("give one of `out`, `serve` and `open3d`")
     if open3d:
-        from lidar.view.window import show_window  # noqa: PLC0415
+        from lidar.tools.view.window import show_window  # noqa: PLC0415
 
         show_window(dataset, options=options)
         return 0
@@ -136,7 +136,7 @@ def view(
 def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
     """Serve the player until interrupted."""
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.view.server import DriveServer  # noqa: PLC0415
+    from lidar.tools.view.server import DriveServer  # noqa: PLC0415
 
     with DriveServer(open_dataset(dataset), options=options, port=port) as server:
         print(f"{server.address} plays {len(server.drive)} frames of {dataset}; Ctrl+C ends it", flush=True)
@@ -172,7 +172,7 @@ def plot(
         PNG or SVG to write.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.plots import plot as drawn  # noqa: PLC0415
+    from lidar.tools.plots import plot as drawn  # noqa: PLC0415
 
     if what == "weather":
         if dataset is not None:
@@ -200,9 +200,9 @@ def plot(
 def _plot_weather(options: PlotOptions, out: Path, *, report: Report) -> int:
     """Plot models of weather against published values."""
     from geoscene.support.files import write_atomically  # noqa: PLC0415
-    from lidar.plots import check_out  # noqa: PLC0415
-    from lidar.rig.scanner import load_sensor  # noqa: PLC0415
-    from lidar.weather.figures import weather_figure  # noqa: PLC0415
+    from lidar.sensors.rig.scanner import load_sensor  # noqa: PLC0415
+    from lidar.signal.weather.figures import weather_figure  # noqa: PLC0415
+    from lidar.tools.plots import check_out  # noqa: PLC0415
 
     if options.frames or options.resolution is not None:
         raise InputError("`frames` and `resolution` are of drives; leave them out for weather")
@@ -244,7 +244,7 @@ def animate(
         MP4 (extra video) or GIF to write.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.films.film import film  # noqa: PLC0415
+    from lidar.tools.films.film import film  # noqa: PLC0415
 
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:

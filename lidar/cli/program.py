@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
+from geoscene import __version__
 from geoscene.support.console import DEFAULTS, Report
-from lidar import __version__
 from lidar.options import OUTPUT
 
 if TYPE_CHECKING:

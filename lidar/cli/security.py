@@ -54,11 +54,11 @@ def defend(
     """
     from geoscene.scene import open_scene  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.defences.calibration import read_calibration  # noqa: PLC0415
-    from lidar.defences.defend import calibrate, score_rows  # noqa: PLC0415
-    from lidar.defences.defend import defend as judged  # noqa: PLC0415
-    from lidar.defences.registry import read_defences  # noqa: PLC0415
-    from lidar.detection.registry import read_detector  # noqa: PLC0415
+    from lidar.tools.defences.calibration import read_calibration  # noqa: PLC0415
+    from lidar.tools.defences.defend import calibrate, score_rows  # noqa: PLC0415
+    from lidar.tools.defences.defend import defend as judged  # noqa: PLC0415
+    from lidar.tools.defences.registry import read_defences  # noqa: PLC0415
+    from lidar.tools.detection.registry import read_detector  # noqa: PLC0415
 
     if not datasets:
         raise InputError("`datasets`: give one or more")
@@ -107,7 +107,7 @@ def defend(
     if report.json:
         print_json(found.document())
     else:
-        from lidar.rig.catalog import columns  # noqa: PLC0415
+        from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
 
         print(columns(score_rows(found)))
     return 0
@@ -145,8 +145,8 @@ def train(
     workers
         Processes that read the clouds. The model does not depend on it.
     """
-    from lidar.rig.catalog import columns  # noqa: PLC0415
-    from lidar.train import train as trained  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.train import train as trained  # noqa: PLC0415
 
     if not datasets:
         raise InputError("`datasets`: give one or more")
@@ -171,8 +171,8 @@ def defences(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
-    from lidar.defences.registry import defence_rows  # noqa: PLC0415
-    from lidar.rig.catalog import columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from lidar.tools.defences.registry import defence_rows  # noqa: PLC0415
 
     rows = defence_rows()
     if json:
@@ -229,8 +229,8 @@ def tamper(
     out
         Directory to write to.
     """
-    from lidar.tamper import read_replacement, read_shift  # noqa: PLC0415
-    from lidar.tamper import tamper as tampered  # noqa: PLC0415
+    from lidar.tools.tamper import read_replacement, read_shift  # noqa: PLC0415
+    from lidar.tools.tamper import tamper as tampered  # noqa: PLC0415
 
     note_new_folder(out)
     done = tampered(
@@ -275,9 +275,9 @@ def sign(
     out
         Directory to write to; without it, the hash chain is added to the dataset itself.
     """
-    from lidar.integrity.keys import read_secret, read_signer  # noqa: PLC0415
-    from lidar.integrity.watermark import Watermark  # noqa: PLC0415
-    from lidar.sign import sign_dataset  # noqa: PLC0415
+    from lidar.tools.integrity.keys import read_secret, read_signer  # noqa: PLC0415
+    from lidar.tools.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.tools.sign import sign_dataset  # noqa: PLC0415
 
     if out is not None:
         note_new_folder(out)
@@ -332,9 +332,9 @@ def verify(
     quiet
         Show no progress bars.
     """
-    from lidar.integrity.keys import read_secret, read_signer  # noqa: PLC0415
-    from lidar.integrity.watermark import Watermark  # noqa: PLC0415
-    from lidar.verify import verify_dataset  # noqa: PLC0415
+    from lidar.tools.integrity.keys import read_secret, read_signer  # noqa: PLC0415
+    from lidar.tools.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.tools.verify import verify_dataset  # noqa: PLC0415
 
     mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
     signer = None if options.chain is None else read_signer(options.chain)

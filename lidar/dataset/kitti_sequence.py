@@ -16,8 +16,8 @@ from geoscene.typing import Float
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.rig.camera_model import intrinsic_matrix
-from lidar.rig.specs import Rig
+from lidar.sensors.rig.camera_model import intrinsic_matrix
+from lidar.sensors.rig.specs import Rig
 
 
 def write_sequence(

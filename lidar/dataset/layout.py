@@ -42,7 +42,7 @@ from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
-from lidar.rig.specs import names_folder
+from lidar.sensors.rig.specs import names_folder
 
 log = logging.getLogger(__name__)
 

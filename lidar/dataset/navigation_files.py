@@ -3,35 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from datetime import datetime
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.geometry.frames import Frame
-from geoscene.scene import Scene
-from geoscene.support.csv_tables import BLOCK_ROWS, table_blocks, write_blocks, write_columns
-from geoscene.support.files import atomic_path
+from geoscene.support.csv_tables import BLOCK_ROWS
 from geoscene.typing import Float
 from lidar.dataset.layout import Paths, opened_rows, read_rows, reading_file
-from lidar.geometry.poses import Trajectory
-from lidar.navigation.geoid import geoid_at
-from lidar.navigation.gnss import NAMES, STATES, Fixes, antenna_motion, epochs, gnss_columns, observe_gnss
-from lidar.navigation.imu import Inertial, imu_columns
-from lidar.navigation.nmea import HEIGHTS, height_note, nmea, satellites_used
-from lidar.navigation.satellite_visibility import sky_view
-from lidar.rig.specs import GnssSpec
-from lidar.signal.navigation import altered_fixes, altered_samples, fixes_truth, samples_truth
-from lidar.signal.registry import Stages
-from lidar.signal.situation import Situation
-from lidar.time_scales import iso_times
-from lidar.world.world import World
+from lidar.sensors.navigation.gnss import (
+    NAMES,
+    STATES,
+    Fixes,
+)
+from lidar.sensors.navigation.imu import Inertial
+from lidar.sensors.navigation.nmea import satellites_used
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,81 +35,6 @@ class Heights:
     vertical: str
     separation: Float | None = None
     geoid: str = ""
-
-
-def heights_of(frame: Frame, fixes: Fixes) -> Heights:
-    """What the heights of fixes in a scene are above."""
-    geoid = None if frame.vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
-    return Heights(frame.vertical, geoid.separation, geoid.name) if geoid else Heights(frame.vertical)
-
-
-def observed_fixes(
-    scene: Scene, spec: GnssSpec, *, trajectory: Trajectory, start: datetime, seed: int
-) -> Fixes:
-    """The fixes of a receiver among the scene's buildings, without stages."""
-    times = epochs(spec, trajectory.duration_ns)
-    antenna, _ = antenna_motion(trajectory, scene.frame, spec=spec, time_ns=times)
-
-    world = World(scene)
-
-    def world_at(region: tuple[float, float, float, float]) -> World:
-        world.follow(region)
-        return world
-
-    sky = sky_view(
-        scene.frame,
-        antenna,
-        start=start,
-        time_ns=times,
-        world_at=world_at,
-        mask_deg=spec.mask_deg,
-        systems=spec.constellations,
-    )
-    return observe_gnss(trajectory, scene.frame, spec=spec, seed=seed, start=start, sky=sky)
-
-
-def record_fixes(
-    paths: Paths,
-    fixes: Fixes,
-    *,
-    at: Situation,
-    stages: Stages,
-    start: datetime,
-    heights: Heights,
-    past: Path | None = None,
-) -> None:
-    """Write the fixes of the receiver ``at.sensor`` after the stages on them, with the truth of changes.
-
-    past : truth file of the fixes, if stages changed them already
-    """
-    if stages.at("fixes", at.sensor):
-        original, fixes = fixes, altered_fixes(fixes, stages, at=at)
-        with _opened_past(past) as rows:
-            before = _next_past(rows, past, count=len(fixes))
-        write_columns(paths.measurements_truth(at.sensor), fixes_truth(fixes, original, past=before))
-    _write_fixes(paths, at.sensor, fixes=fixes, start=start, heights=heights)
-
-
-def _write_fixes(paths: Paths, name: str, *, fixes: Fixes, start: datetime, heights: Heights) -> None:
-    columns = gnss_columns(fixes) | {"h_above": np.full(len(fixes), HEIGHTS[heights.vertical].split()[-1])}
-    if heights.separation is not None:
-        columns["geoid"] = heights.separation
-    write_blocks(
-        paths.measurements(name),
-        (
-            {
-                "timestamp": iso_times(start, fixes.time_ns[rows]),
-                **{name: column[rows] for name, column in columns.items()},
-            }
-            for rows in table_blocks(len(fixes))
-        ),
-    )
-    with (
-        atomic_path(paths.measurements(name, ".nmea")) as part,
-        part.open("w", encoding="ascii", newline="") as file,
-    ):
-        file.write(height_note(heights.vertical, heights.geoid))
-        file.writelines(nmea(fixes, start, vertical=heights.vertical, separation=heights.separation))
 
 
 def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, Heights]:
@@ -178,70 +92,6 @@ def _state(quality: NDArray[np.int8]) -> NDArray[np.int8]:
     """Rows (n,) of `NAMES` of the states with a quality, the first of several."""
     table = [next(k for k, name in enumerate(NAMES) if STATES[name].quality == q) for q in (0, 1, 2, 4, 5)]
     return np.array(table, np.int8)[np.searchsorted((0, 1, 2, 4, 5), quality)]
-
-
-@contextmanager
-def _opened_past(path: Path | None) -> Iterator[Iterator[dict[str, str]]]:
-    """Yield the rows of a truth file of earlier stages, if there is one."""
-    if path is None:
-        yield iter(())
-        return
-    with opened_rows(path) as rows:
-        yield rows
-
-
-def _next_past(
-    rows: Iterator[dict[str, str]], path: Path | None, *, count: int
-) -> dict[str, NDArray[Any]] | None:
-    """The measurements in the next rows of a truth file; None without one.
-
-    Raises DatasetError for fewer rows.
-    """
-    if path is None:
-        return None
-    block = list(islice(rows, count))
-    with reading_file(path):
-        if len(block) < count:
-            raise ValueError("is of fewer measurements")
-        kinds = {"time_ns": np.int64, "quality": np.int8, "satellites": np.int8}
-        names = [name for name in (block[0] if block else ()) if name != "changed"]
-        return {
-            name: np.array([row[name] for row in block]).astype(kinds.get(name, np.float64)) for name in names
-        }
-
-
-def record_samples(
-    paths: Paths,
-    samples: Callable[[], Iterator[Inertial]],
-    *,
-    at: Situation,
-    stages: Stages,
-    start: datetime,
-    past: Path | None = None,
-) -> None:
-    """Write the samples of the inertial unit ``at.sensor`` after the stages, with the truth of changes.
-
-    samples : the unit's samples in blocks, as without stages; called twice if there are stages
-    past    : truth file of the samples, if stages changed them already
-    """
-    path = paths.measurements(at.sensor)
-    if not stages.at("samples", at.sensor):
-        write_blocks(path, (_sample_columns(rows, start) for rows in samples()))
-        return
-    with _opened_past(past) as rows:
-        write_blocks(
-            paths.measurements_truth(at.sensor),
-            (
-                samples_truth(*pair, past=_next_past(rows, past, count=len(pair[0])))
-                for pair in altered_samples(samples(), stages, at=at)
-            ),
-        )
-    again = altered_samples(samples(), stages, at=replace(at, effects=None))  # which are counted already
-    write_blocks(path, (_sample_columns(rows, start) for rows, _ in again))
-
-
-def _sample_columns(rows: Inertial, start: datetime) -> dict[str, Any]:
-    return {"timestamp": iso_times(start, rows.time_ns), **imu_columns(rows)}
 
 
 def read_samples(path: Path) -> Iterator[Inertial]:

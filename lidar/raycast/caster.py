@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
-from lidar.gpu.device import CPU
-from lidar.gpu.device import device as warp_device
 from lidar.raycast.columns import Rays
+from lidar.raycast.device import CPU
+from lidar.raycast.device import device as warp_device
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
 from lidar.raycast.hits import Hits

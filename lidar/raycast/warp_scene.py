@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import BackendError
-from lidar.gpu.device import Device
 from lidar.raycast import warp_kernels
 from lidar.raycast.columns import Rays
 from lidar.raycast.columns import Target as Tables
+from lidar.raycast.device import Device
 from lidar.raycast.geometry import Instances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share

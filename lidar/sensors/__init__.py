@@ -1,1 +1,1 @@
-"""Laser scanners: rays of a moving sensor, echoes of surfaces, detection and point clouds."""
+"""What a vehicle carries: rigs, laser scanners, cameras, GNSS receivers and inertial units."""

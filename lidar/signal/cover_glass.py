@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar.physics.echoes import TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, Stage, parameter
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar.sensors.cloud import TracedCloud
+from lidar.sensors.laser.cloud import TracedCloud
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter
 

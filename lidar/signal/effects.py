@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lidar.physics.echoes import TracedEchoes
-from lidar.sensors.cloud import TracedCloud
+from lidar.sensors.laser.cloud import TracedCloud
+from lidar.sensors.physics.echoes import TracedEchoes
 
 Counts = dict[str, dict[str, int]]
 """Numbers by stage, and by what was added, removed or changed, such as ``returns added``."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar.camera.render import Frame
+from lidar.sensors.camera.render import Frame
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter
 

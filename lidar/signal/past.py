@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.physics.echoes import Origin
-from lidar.sensors.cloud import Cloud
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.physics.echoes import Origin
 from lidar.signal.run import Altered, cloud_truth, unaltered
 
 _OF_RETURNS = ("origin", "source", "hidden")

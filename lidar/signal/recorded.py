@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.physics.echoes import Echoes, Origin, TracedEchoes, numbered, reported, traced
-from lidar.physics.intensity import apparent_of_code, reflectivity_code
-from lidar.physics.range_error import quantised
-from lidar.rig.patterns.beams import Firings, T
-from lidar.rig.scanner import Sensor
-from lidar.sensors.cloud import Cloud
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, numbered, reported, traced
+from lidar.sensors.physics.intensity import apparent_of_code, reflectivity_code
+from lidar.sensors.physics.range_error import quantised
+from lidar.sensors.rig.patterns.beams import Firings, T
+from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.recorded_pulses import recorded_pulses
 from lidar.signal.registry import Stages
 from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked, unaltered

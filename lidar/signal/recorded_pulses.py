@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.rig.patterns.beams import Firings, unit_vectors
-from lidar.rig.scanner import Sensor, firings
-from lidar.sensors.cloud import Cloud
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.rig.patterns.beams import Firings, unit_vectors
+from lidar.sensors.rig.scanner import Sensor, firings
 from lidar.signal.stage import Pulses, pulses_of
 
 Rows = NDArray[np.int64]

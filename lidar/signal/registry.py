@@ -14,7 +14,7 @@ import numpy as np
 
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
-from lidar.random_streams import generator
+from lidar.geometry.random_streams import generator
 from lidar.signal.effects import Counts
 from lidar.signal.stage import Stage, parameter_rows
 
@@ -22,22 +22,22 @@ _STAGES = {
     "cover_glass": "signal.cover_glass.CoverGlass",
     "dropped_packets": "signal.dropped_packets.DroppedPackets",
     "lost_rows": "signal.lost_rows.LostRows",
-    "inject": "attacks.inject.Inject",
-    "replay": "attacks.replay.Replay",
-    "relay": "attacks.relay.Relay",
-    "remove": "attacks.remove.Remove",
-    "placed_object": "attacks.placed_object.PlacedObject",
-    "high_frequency_removal": "attacks.high_frequency_removal.HighFrequencyRemoval",
-    "perturb": "attacks.points.Perturb",
-    "insert": "attacks.points.Insert",
-    "delete": "attacks.points.Delete",
-    "move": "attacks.points.Move",
-    "false_weather": "attacks.points.FalseWeather",
-    "gnss_spoof": "attacks.poses.GnssSpoof",
-    "camera_blind": "attacks.images.CameraBlind",
-    "patch": "attacks.images.Patch",
-    "weather": "weather.stage.Weather",
-    "weather_model": "weather.model_stage.WeatherModel",
+    "inject": "signal.attacks.inject.Inject",
+    "replay": "signal.attacks.replay.Replay",
+    "relay": "signal.attacks.relay.Relay",
+    "remove": "signal.attacks.remove.Remove",
+    "placed_object": "signal.attacks.placed_object.PlacedObject",
+    "high_frequency_removal": "signal.attacks.high_frequency_removal.HighFrequencyRemoval",
+    "perturb": "signal.attacks.points.Perturb",
+    "insert": "signal.attacks.points.Insert",
+    "delete": "signal.attacks.points.Delete",
+    "move": "signal.attacks.points.Move",
+    "false_weather": "signal.attacks.points.FalseWeather",
+    "gnss_spoof": "signal.attacks.poses.GnssSpoof",
+    "camera_blind": "signal.attacks.images.CameraBlind",
+    "patch": "signal.attacks.images.Patch",
+    "weather": "signal.weather.stage.Weather",
+    "weather_model": "signal.weather.model_stage.WeatherModel",
 }
 """Module within `lidar` and class, by name."""
 
@@ -168,7 +168,7 @@ def stage_class(name: str) -> type[Stage]:
 
 def attack_names() -> list[str]:
     """Names of the stages that are attacks."""
-    return [name for name, place in _STAGES.items() if place.startswith("attacks.")]
+    return [name for name, place in _STAGES.items() if place.startswith("signal.attacks.")]
 
 
 def read_stage(table: Mapping[str, Any]) -> NamedStage:

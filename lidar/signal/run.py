@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import LidarError
-from lidar.physics.detector import added_noise
-from lidar.physics.echoes import Echoes, Origin, TracedEchoes, mixed, traced
-from lidar.random_streams import generator
-from lidar.sensors.cloud import Cloud, TracedCloud
-from lidar.sensors.scan import Sweep, detect, deviates_of, report
+from lidar.geometry.random_streams import generator
+from lidar.sensors.laser.cloud import Cloud, TracedCloud
+from lidar.sensors.laser.scan import Sweep, detect, deviates_of, report
+from lidar.sensors.physics.detector import added_noise
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, mixed, traced
 from lidar.signal.effects import row_changes
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
 
 if TYPE_CHECKING:
-    from lidar.camera.render import Frame
+    from lidar.sensors.camera.render import Frame
 
 _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
 

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
-from lidar.camera.light import Light
 from lidar.geometry.poses import Poses
-from lidar.rig.specs import CameraSpec
-from lidar.sensors.cloud import Cloud
+from lidar.sensors.camera.light import Light
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.effects import Effects
 from lidar.world.world import World
 

@@ -13,18 +13,18 @@ from geoscene.classes import Class
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.physics.detector import received
-from lidar.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, traced
-from lidar.physics.link import apparent_of
-from lidar.rig.patterns.beams import Firings
-from lidar.rig.scanner import Sensor
-from lidar.sensors.cloud import TracedCloud
+from lidar.sensors.laser.cloud import TracedCloud
+from lidar.sensors.physics.detector import received
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, traced
+from lidar.sensors.physics.link import apparent_of
+from lidar.sensors.rig.patterns.beams import Firings
+from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 
 if TYPE_CHECKING:
-    from lidar.camera.render import Frame
-    from lidar.navigation.gnss import Fixes
-    from lidar.navigation.imu import Inertial
+    from lidar.sensors.camera.render import Frame
+    from lidar.sensors.navigation.gnss import Fixes
+    from lidar.sensors.navigation.imu import Inertial
 
 POSES = "poses and time"
 ROAD_USERS = "road users (lidar drive --traffic)"
@@ -183,7 +183,7 @@ def added_echoes(
     klass: Class = Class.NOISE,
     feature: int = -1,
 ) -> TracedEchoes:
-    """Echoes that a stage adds; join them to others with `lidar.physics.echoes.joined`.
+    """Echoes that a stage adds; join them to others with `lidar.sensors.physics.echoes.joined`.
 
     pulse    : (k,) row of the pulse
     distance : (k,) metres from the beam's start

@@ -10,11 +10,11 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
-from lidar.planning.motion import ended_at_rest, motion_along, poses_along
-from lidar.planning.path import Path
-from lidar.planning.road_conditions import DRY, RoadConditions
-from lidar.planning.speed_profile import motion_within
-from lidar.rig.vehicle import Vehicle
+from lidar.motion.motion import ended_at_rest, motion_along, poses_along
+from lidar.motion.path import Path
+from lidar.motion.road_conditions import DRY, RoadConditions
+from lidar.motion.speed_profile import motion_within
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.planning.blockwise import even, interpolated, rowwise
-from lidar.planning.path import Path
-from lidar.planning.road_conditions import DRY, RoadConditions
-from lidar.planning.speed_profile import desired_speed
-from lidar.rig.vehicle import Vehicle
+from lidar.motion.blockwise import even, interpolated, rowwise
+from lidar.motion.path import Path
+from lidar.motion.road_conditions import DRY, RoadConditions
+from lidar.motion.speed_profile import desired_speed
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, ActorPath
 from lidar.traffic.trips import Course, Driver, driver_on
 

@@ -16,17 +16,17 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
-from lidar.random_streams import generator
-from lidar.rig.vehicle import Vehicle
+from lidar.geometry.random_streams import generator
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
-from lidar.traffic.populate import TrafficOptions, TrafficSetup, first_feature, parked_vehicles, traffic_setup
+from lidar.traffic.populate import TrafficOptions, TrafficSetup, parked_vehicles, traffic_setup
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import Tracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import Shape
-from lidar.world.actors import KNOTS, Actors, existing_actors, joined, states
+from lidar.world.actors import KNOTS, Actors, existing_actors, first_feature, joined, states
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "passenger": ("sedan", "hatchback", "suv"),

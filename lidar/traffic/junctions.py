@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.support.compiled import njit
 from geoscene.typing import Float, Ints
-from lidar.random_streams import generator
+from lidar.geometry.random_streams import generator
 from lidar.traffic.lanes import Lanes
 
 _ROUND = 3.0  # metres by which a junction reaches beyond half the width of its widest street

@@ -15,8 +15,8 @@ from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import turn_states
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.planning.route import HEADING_REACH
-from lidar.planning.steering import relaxed
+from lidar.motion.route import HEADING_REACH
+from lidar.motion.steering import relaxed
 
 STEP = 0.5
 """True metres between the stations of a path."""

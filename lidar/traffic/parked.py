@@ -13,7 +13,7 @@ from geoscene.geometry import polylines
 from geoscene.scene import Scene
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
-from lidar.random_streams import generator
+from lidar.geometry.random_streams import generator
 from lidar.traffic.lanes import Lanes, edge_name, lane_shift
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import Knots, actor_table, poses_on_ground

@@ -10,7 +10,7 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float
 from lidar.geometry.poses import release
-from lidar.planning.blockwise import rowwise
+from lidar.motion.blockwise import rowwise
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.typing import Float
-from lidar.random_streams import generator
+from lidar.geometry.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
 from lidar.traffic.surroundings import Surroundings
 from lidar.traffic.trips import Course, Drawings, Driver, Trip, random_shape, random_stretch

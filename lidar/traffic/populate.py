@@ -19,8 +19,8 @@ from geoscene.scene.geopackage import Layer
 from geoscene.support.columns import row_blocks
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
-from lidar.planning.road_conditions import DRY, RoadConditions
-from lidar.rig.vehicle import Vehicle
+from lidar.motion.road_conditions import DRY, RoadConditions
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
 from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
@@ -30,7 +30,7 @@ from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import moving_actors
 from lidar.traffic.trips import Trip, vehicle_trips
-from lidar.world.actors import Actors, joined
+from lidar.world.actors import Actors, first_feature, joined
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
@@ -203,11 +203,6 @@ def simulated_actors(
         ],
         first_feature=first_feature(scene),
     )
-
-
-def first_feature(scene: Scene) -> int:
-    """The first unused feature number of a scene."""
-    return max((stop for _, stop in scene.layers.values()), default=0)
 
 
 def parked_vehicles(

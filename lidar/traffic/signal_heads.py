@@ -15,7 +15,7 @@ from geoscene.scene import Scene
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
-from lidar.rig.vehicle import Vehicle
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.junctions import (
     JunctionPlan,
     Signals,

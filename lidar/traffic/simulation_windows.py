@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import release
-from lidar.planning.blockwise import rowwise
+from lidar.motion.blockwise import rowwise
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, Signals
 from lidar.traffic.lanes import STEP

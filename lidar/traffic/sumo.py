@@ -29,12 +29,12 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.errors import LidarError, RouteError
 from lidar.geometry.poses import Trajectory
-from lidar.planning.motion import ended_at_rest, poses_along
-from lidar.planning.path import Path as VehiclePath
-from lidar.planning.road_conditions import DRY, GRAVITY, RoadConditions
-from lidar.planning.speed_profile import motion_within
-from lidar.random_streams import generator
-from lidar.rig.vehicle import Vehicle
+from lidar.geometry.random_streams import generator
+from lidar.motion.motion import ended_at_rest, poses_along
+from lidar.motion.path import Path as VehiclePath
+from lidar.motion.road_conditions import DRY, GRAVITY, RoadConditions
+from lidar.motion.speed_profile import motion_within
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.fcd import Fcd, network_projection, read_fcd
 from lidar.traffic.fcd_replay import replay_fcd, scene_positions
 from lidar.traffic.populate import TrafficOptions

@@ -12,13 +12,13 @@ from geoscene.scene import Scene
 from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import BLOCK_POSES, release, room
-from lidar.traffic.ground import ground_heights
 from lidar.traffic.lanes import STEP
 from lidar.traffic.simulation import SimulatedTrips
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
 from lidar.world.actor_shapes import STRIDE, Shape, catalogue
 from lidar.world.actors import Actors
+from lidar.world.ground import ground_heights
 
 _POSES = {"cyclist": STRIDE, "adult": STRIDE, "small_adult": STRIDE, "child": STRIDE}
 _STRIDE = {"cyclist": 5.6, "adult": 1.45, "small_adult": 1.35, "child": 1.05}

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 
 from geoscene.typing import Float
-from lidar.planning.road_conditions import DRY, GRAVITY, RoadConditions
-from lidar.random_streams import generator
+from lidar.geometry.random_streams import generator
+from lidar.motion.road_conditions import DRY, GRAVITY, RoadConditions
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
 from lidar.traffic.surroundings import Surroundings, entrances
 from lidar.traffic.sweep import body_poses, rectangles

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.geometry.mesh import Mesh
+from geoscene.scene import Scene
 from geoscene.support.columns import Columns, row_blocks
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
@@ -250,3 +251,8 @@ def _end_to_end(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
             release(out, part)
         to += len(part)
     return out
+
+
+def first_feature(scene: Scene) -> int:
+    """The first unused feature number of a scene."""
+    return max((stop for _, stop in scene.layers.values()), default=0)

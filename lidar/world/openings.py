@@ -11,7 +11,7 @@ from geoscene.buildings.facades import WallRelief
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import WALL
 from geoscene.typing import Float
-from lidar.relief import PARTS, WallTables, pairs_of, tables_of
+from lidar.raycast.relief import PARTS, WallTables, pairs_of, tables_of
 from lidar.world.surfaces import Surfaces
 
 _ROOM = "plaster"

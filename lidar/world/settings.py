@@ -11,7 +11,7 @@ import numpy as np
 from geoscene.pipeline.limits import Limit
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.gpu.device import CPU, name_fault
+from lidar.raycast.device import CPU, name_fault
 
 if TYPE_CHECKING:
     from geoscene.scene import Scene

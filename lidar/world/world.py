@@ -19,7 +19,7 @@ from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, Instances
 from lidar.raycast.geometry import split
 from lidar.raycast.refine import Refiner
-from lidar.relief import (
+from lidar.raycast.relief import (
     NO_WALLS,
     GroundRefiner,
     GroundTables,

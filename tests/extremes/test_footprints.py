@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.buildings.roofs import RoofSpec, roof_shell
-from lidar.selftest.footprints import CASES, built, house
-from lidar.selftest.run import outcome
+from lidar.tools.selftest.footprints import CASES, built, house
+from lidar.tools.selftest.run import outcome
 
 POINTS = st.tuples(st.floats(-50, 50), st.floats(-50, 50))
 

@@ -10,9 +10,9 @@ from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.options import DriveOptions
-from lidar.plan import plan_drive
-from lidar.selftest.places import CASES, write_elevation, write_hamlet
-from lidar.selftest.run import outcome
+from lidar.simulation.plan import plan_drive
+from lidar.tools.selftest.places import CASES, write_elevation, write_hamlet
+from lidar.tools.selftest.run import outcome
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

@@ -7,11 +7,11 @@ import pytest
 from helpers import ROOT
 from helpers.programs import ENVIRONMENT, command
 
-from lidar.selftest import run
-from lidar.selftest.case import Case
-from lidar.selftest.cases import CASES, GROUPS
-from lidar.selftest.regions import CASES as REGIONS
-from lidar.selftest.scale import CASES as SCALE
+from lidar.tools.selftest import run
+from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.cases import CASES, GROUPS
+from lidar.tools.selftest.regions import CASES as REGIONS
+from lidar.tools.selftest.scale import CASES as SCALE
 
 PAGE = ROOT / "docs" / "extremes.md"
 

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar.random_streams import generator, normal_of, uniform_of
-from lidar.selftest.run import outcome
-from lidar.selftest.statistics import CASES
+from lidar.geometry.random_streams import generator, normal_of, uniform_of
+from lidar.tools.selftest.run import outcome
+from lidar.tools.selftest.statistics import CASES
 
 WORDS = st.tuples(st.integers(0, 2**31), st.text(max_size=8), st.integers(0, 10**6), st.text(max_size=8))
 

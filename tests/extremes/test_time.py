@@ -11,16 +11,16 @@ import pytest
 from geoscene.geometry.frames import Frame
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
-from lidar.navigation.gnss import epochs, observe_gnss
-from lidar.navigation.imu import observe_imu
-from lidar.navigation.nmea import nmea
-from lidar.plan import schedule
-from lidar.rig.devices import cameras, scanners
-from lidar.rig.patterns.beams import frame_window_ns
-from lidar.rig.specs import GnssSpec, ImuSpec, load_rig
-from lidar.selftest.run import outcome
-from lidar.selftest.times import CASES
-from lidar.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, iso_times, leap_seconds
+from lidar.geometry.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, iso_times, leap_seconds
+from lidar.sensors.navigation.gnss import epochs, observe_gnss
+from lidar.sensors.navigation.imu import observe_imu
+from lidar.sensors.navigation.nmea import nmea
+from lidar.sensors.rig.devices import cameras, scanners
+from lidar.sensors.rig.patterns.beams import frame_window_ns
+from lidar.sensors.rig.specs import GnssSpec, ImuSpec, load_rig
+from lidar.simulation.plan import schedule
+from lidar.tools.selftest.run import outcome
+from lidar.tools.selftest.times import CASES
 
 FRAME = Frame.at(9.52, 47.14)
 DAY_S = 86400

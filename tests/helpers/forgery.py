@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.sensor_worlds import driven
-from lidar.defences.observation import Observation
 from lidar.geometry.mounts import Mount
-from lidar.physics.settings import PLAIN
-from lidar.rig.scanner import load_sensor
-from lidar.sensors.scan import scan
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.physics.settings import PLAIN
+from lidar.sensors.rig.scanner import load_sensor
+from lidar.tools.defences.observation import Observation
 
 ROOF = Mount((0.76, 0.0, 1.73))
 CAR = np.array([4.3, 1.8, 1.5])

@@ -13,8 +13,8 @@ from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.layout import open_dataset
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
+from lidar.geometry.time_scales import gps_seconds
 from lidar.geometry.trajectory_csv import write_trajectory
-from lidar.time_scales import gps_seconds
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 FRAME = Frame.at(24.945, 60.167)

@@ -1,6 +1,6 @@
 """Small samples for stored profiles and spot checks, which then take a second."""
 
-from lidar.tradeoff import profile, profile_costs, profile_errors, sampling
+from lidar.tools.tradeoff import profile, profile_costs, profile_errors, sampling
 
 
 def measure_little(patch, *, folder=None):

@@ -10,7 +10,7 @@ from geoscene.geometry.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.raycast.geometry import split
-from lidar.relief import NO_WALLS, WallRefiner, joined
+from lidar.raycast.relief import NO_WALLS, WallRefiner, joined
 from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidar.rig.vehicle import load_vehicle
+from lidar.motion.vehicle import load_vehicle
 from lidar.traffic.lanes import STEP
 from lidar.traffic.sweep import rectangles
 

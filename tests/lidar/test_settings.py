@@ -8,13 +8,13 @@ import pytest
 from cyclopts import CoercionError
 from helpers.programs import run_program
 
-from lidar.camera.settings import CameraSettings
 from lidar.cli import app
 from lidar.errors import InputError
-from lidar.physics.settings import ScannerSettings
-from lidar.rig.catalog import rig_rows, sensor_rows
-from lidar.rig.scanner import load_sensor, sensor_names
-from lidar.rig.specs import load_rig, rig_names
+from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.physics.settings import ScannerSettings
+from lidar.sensors.rig.catalog import rig_rows, sensor_rows
+from lidar.sensors.rig.scanner import load_sensor, sensor_names
+from lidar.sensors.rig.specs import load_rig, rig_names
 from lidar.settings import levels, list_settings, settings_of
 from lidar.world.settings import WorldSettings
 

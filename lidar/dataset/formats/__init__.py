@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from lidar.dataset.formats.las import LasInfo
     from lidar.dataset.formats.table import FrameInfo, PointLabels, Table
-    from lidar.sensors.cloud import Cloud
+    from lidar.sensors.laser.cloud import Cloud
 
 ALL = (
     *("x", "y", "z", "intensity", "time_ns", "ring", "column", "range", "label", "instance", "incidence"),

@@ -26,7 +26,7 @@ from geoscene.typing import Float
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import NO_FRAME, FrameInfo, Table, rows
 from lidar.errors import FormatError
-from lidar.time_scales import gps_seconds
+from lidar.geometry.time_scales import gps_seconds
 
 EXTENSION = "geoscene", "urn:geoscene:e57:1"
 """Prefix and name of the namespace of columns that E57 has no field for."""

@@ -34,7 +34,7 @@ from geoscene.support.files import append, atomic_file, spool
 from geoscene.typing import Float
 from lidar.errors import FormatError, LidarError
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.cloud import Cloud
+from lidar.sensors.laser.cloud import Cloud
 from lidar.world.actors import Actors
 
 Table = dict[str, NDArray[Any]]

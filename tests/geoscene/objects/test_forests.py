@@ -22,7 +22,7 @@ from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.view import view_scene
-from lidar.traffic.ground import ground_heights
+from lidar.world.ground import ground_heights
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 

@@ -12,8 +12,8 @@ from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.view import view_scene
-from lidar.planning.road_drive import edges_on_tiles
-from lidar.traffic.ground import ground_heights
+from lidar.motion.road_drive import edges_on_tiles
+from lidar.world.ground import ground_heights
 from lidar.world.world import World
 
 HOUSES = [(60.002, 24.003), (60.21, 24.2), (60.21, 24.61)]

@@ -28,8 +28,8 @@ from geoscene.support.progress import silent
 from geoscene.view import view_scene
 from lidar.errors import RouteError
 from lidar.options import DriveOptions
-from lidar.pipeline import drive
-from lidar.plan import plan_drive
+from lidar.simulation.drive import drive
+from lidar.simulation.plan import plan_drive
 from lidar.traffic.populate import TrafficOptions
 
 

@@ -15,7 +15,7 @@ from geoscene.roadgraph.driving_side import Side
 from geoscene.roadgraph.lanes import WIDEST_LANE, graph_lanes, lane_layout
 from geoscene.roadgraph.markings import _offsets, painted_stretches
 from geoscene.sources.data import OsmData, Way
-from lidar.planning.route import lane_route
+from lidar.motion.route import lane_route
 from lidar.traffic.lanes import lane_shift, lanes_of
 
 

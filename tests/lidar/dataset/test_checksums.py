@@ -11,7 +11,6 @@ from helpers.programs import run_program
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from lidar.apply import apply_stages
 from lidar.dataset.checksums import (
     CHECKSUMS,
     add_to_checksums,
@@ -19,20 +18,21 @@ from lidar.dataset.checksums import (
     read_checksums,
     write_checksums,
 )
-from lidar.dataset.export import EXPORTERS
 from lidar.dataset.layout import open_dataset
-from lidar.denoise.denoise import denoise
-from lidar.denoise.filters import read_methods
+from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import DatasetError
-from lidar.integrity.keys import Hmac
-from lidar.integrity.watermark import Watermark
-from lidar.maps.aggregate import aggregate
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.pipeline import drive
-from lidar.sign import sign_dataset
 from lidar.signal.registry import read_stages
-from lidar.tamper import read_replacement, tamper
-from lidar.verify import verify_dataset
+from lidar.simulation.drive import drive
+from lidar.tools.apply import apply_stages
+from lidar.tools.denoise.denoise import denoise
+from lidar.tools.denoise.filters import read_methods
+from lidar.tools.integrity.keys import Hmac
+from lidar.tools.integrity.watermark import Watermark
+from lidar.tools.maps.aggregate import aggregate
+from lidar.tools.sign import sign_dataset
+from lidar.tools.tamper import read_replacement, tamper
+from lidar.tools.verify import verify_dataset
 
 KEY, MARK = Hmac(b"fedcba9876543210"), Watermark(b"0123456789abcdef")
 OPTIONS = DriveOptions(rig="vlp16", duration=0.3, seed=3, formats=("pcd", "kitti"), workers=1)

@@ -17,8 +17,8 @@ from geoscene.errors import MissingExtraError
 from lidar.dataset.formats import FORMATS, npz, parquet, pcd_compressed, read_table
 from lidar.dataset.formats.lzf import compressed, decompressed
 from lidar.dataset.formats.table import FrameInfo
-from lidar.dataset.recording import Contents
 from lidar.errors import FormatError
+from lidar.settings import Contents
 
 
 def table(n=400, seed=0):

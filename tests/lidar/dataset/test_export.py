@@ -15,12 +15,12 @@ from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_json
 from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.checksums import CHECKSUMS
-from lidar.dataset.export import EXPORTERS
-from lidar.dataset.export.kitti_drive import KittiDrive
-from lidar.dataset.export.kitti_objects import truncation
-from lidar.dataset.export.kitti_raw import oxts_columns
 from lidar.dataset.formats import FORMATS
 from lidar.dataset.layout import Paths, open_dataset
+from lidar.dataset.layouts import EXPORTERS
+from lidar.dataset.layouts.kitti_drive import KittiDrive
+from lidar.dataset.layouts.kitti_objects import truncation
+from lidar.dataset.layouts.kitti_raw import oxts_columns
 from lidar.dataset.recorded import Stream
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import OPTICAL

@@ -31,7 +31,7 @@ from lidar.dataset.formats import (
 from lidar.dataset.formats.las import LasInfo, open_las, read_chunks
 from lidar.dataset.formats.table import PointLabels, cloud_table, table_cloud
 from lidar.errors import FormatError, InputError
-from lidar.time_scales import gps_seconds
+from lidar.geometry.time_scales import gps_seconds
 
 INFO = LasInfo(CRS.from_epsg(32618), (383_000.0, 4_082_000.0, 0.0), datetime(2026, 6, 1, 10, tzinfo=UTC))
 CSV = {"x": 5.1e-5, "range": 5.1e-5, "true_range": 5.1e-5, "velocity": 5.1e-5, "intensity": 5.1e-3}

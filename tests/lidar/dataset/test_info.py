@@ -11,14 +11,14 @@ from helpers.programs import run_program
 
 from geoscene.classes import Class
 from geoscene.support.files import write_json
-from lidar.dataset.export import EXPORTERS
 from lidar.dataset.formats import read_cloud
-from lidar.dataset.info import describe
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
-from lidar.pipeline import drive
 from lidar.signal.registry import read_stages
+from lidar.simulation.drive import drive
+from lidar.tools.info import describe
 from lidar.traffic.populate import TrafficOptions
 
 STAGES = read_stages(["dropped_packets:loss=0.1", "weather:kind=fog"]).stages

@@ -20,22 +20,22 @@ from scipy.spatial.transform import Rotation, Slerp
 from geoscene.classes import Class
 from geoscene.errors import MissingExtraError
 from geoscene.support.files import write_json
-from lidar.camera.png import counts_to_depth, image_to_feature, read_png
 from lidar.dataset.boxes import COLUMNS, read_boxes
-from lidar.dataset.export import EXPORTERS, ros_topics
-from lidar.dataset.export.ros_drive import RosDrive, ros_name
-from lidar.dataset.export.ros_messages import laser_scan, point_cloud, typestore
-from lidar.dataset.export.ros_topics import topics_of
 from lidar.dataset.formats import FORMATS, read_table
 from lidar.dataset.layout import open_dataset, read_rows
+from lidar.dataset.layouts import EXPORTERS, ros_topics
+from lidar.dataset.layouts.ros_drive import RosDrive, ros_name
+from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
+from lidar.dataset.layouts.ros_topics import topics_of
 from lidar.dataset.navigation_files import Heights, read_fixes
 from lidar.errors import DatasetError, FormatError
-from lidar.navigation.gnss import fix_variances
 from lidar.options import DriveOptions
-from lidar.pipeline import drive
-from lidar.rig.camera_model import project
-from lidar.rig.patterns.scanner2d import Scan2d
-from lidar.rig.specs import load_rig
+from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png
+from lidar.sensors.navigation.gnss import fix_variances
+from lidar.sensors.rig.camera_model import project
+from lidar.sensors.rig.patterns.scanner2d import Scan2d
+from lidar.sensors.rig.specs import load_rig
+from lidar.simulation.drive import drive
 from lidar.traffic.populate import TrafficOptions
 
 RIG = """

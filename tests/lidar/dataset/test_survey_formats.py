@@ -16,7 +16,7 @@ from lidar.dataset.formats import FORMATS, MAPS, copc, e57, las, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import FrameInfo
 from lidar.errors import FormatError
-from lidar.time_scales import gps_seconds
+from lidar.geometry.time_scales import gps_seconds
 
 INFO = LasInfo(CRS.from_epsg(32618), (583_000.0, 4_507_000.0, 0.0), datetime(2026, 6, 1, 10, tzinfo=UTC))
 COLUMNS = ("x", "y", "z", "intensity", "gps_time", "ring", "label", "instance", "source")

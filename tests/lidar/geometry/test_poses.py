@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
-from lidar.dataset.metadata import pose_columns
 from lidar.geometry.attitude import (
     body_rates,
     euler_from_quat,
@@ -19,6 +18,7 @@ from lidar.geometry.attitude import (
     quat_from_euler_intrinsic,
 )
 from lidar.geometry.poses import Trajectory
+from lidar.simulation.metadata import pose_columns
 
 angles = st.one_of(st.floats(-np.pi, np.pi), st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1e-9]))
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from lidar.apply import apply_stages
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.physics.echoes import Origin
-from lidar.pipeline import drive
+from lidar.sensors.physics.echoes import Origin
 from lidar.signal.registry import read_stages
+from lidar.simulation.drive import drive
+from lidar.tools.apply import apply_stages
 
 RIG = """
 name = "small"

@@ -5,15 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from lidar.apply import apply_stages
 from lidar.dataset.layout import Paths, open_dataset, read_rows
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.errors import InputError, LidarError
-from lidar.navigation.nmea import height_note, nmea
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.pipeline import drive
+from lidar.sensors.navigation.nmea import height_note, nmea
 from lidar.signal.registry import NamedStage
 from lidar.signal.stage import Stage, parameter
+from lidar.simulation.drive import drive
+from lidar.tools.apply import apply_stages
 
 RIG = """
 name = "navigation"

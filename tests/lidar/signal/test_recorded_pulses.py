@@ -7,8 +7,8 @@ import pytest
 from helpers.sensor_worlds import box, driven, world
 
 from lidar.geometry.mounts import Mount
-from lidar.rig.scanner import firings, load_sensor
-from lidar.sensors.scan import scan
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.recorded_pulses import completed, recorded_pulses
 
 ROAD = box((-60, -60, -1), (60, 60, 0))

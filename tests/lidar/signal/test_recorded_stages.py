@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from lidar import frame_loop
-from lidar.apply import apply_stages
-from lidar.camera.png import read_png
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
-from lidar.frame_loop import chunks, recording_chunks
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.physics.echoes import Origin
-from lidar.pipeline import drive
-from lidar.plan import plan_drive
+from lidar.sensors.camera.png import read_png
+from lidar.sensors.physics.echoes import Origin
 from lidar.signal.registry import NamedStage, numbered, read_stage, read_stages
 from lidar.signal.stage import Stage, parameter
+from lidar.signal.weather.setting import read_weather
+from lidar.simulation import frame_loop
+from lidar.simulation.drive import drive
+from lidar.simulation.frame_loop import chunks, recording_chunks
+from lidar.simulation.plan import plan_drive
+from lidar.tools.apply import apply_stages
 from lidar.traffic.populate import TrafficOptions
-from lidar.weather.setting import read_weather
 
 RIG = """
 name = "small"

@@ -10,7 +10,7 @@ from lidar.options import ApplyOptions, DriveOptions
 from lidar.signal import registry
 from lidar.signal.registry import NamedStage, read_attacks, read_stages
 from lidar.signal.stage import Stage, parameter
-from lidar.weather.setting import WeatherSetting, read_weather
+from lidar.signal.weather.setting import WeatherSetting, read_weather
 
 LOSSY = read_stages(["dropped_packets:loss=0.1"]).stages
 

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from lidar.camera.render import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.physics.echoes import Origin, joined
-from lidar.physics.settings import LEVELS, PLAIN, ScannerSettings
-from lidar.rig.scanner import firings, load_sensor
-from lidar.sensors.cloud import Cloud
-from lidar.sensors.scan import cast, scan
+from lidar.sensors.camera.render import Frame
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.laser.scan import cast, scan
+from lidar.sensors.physics.echoes import Origin, joined
+from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
+from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.dropped_packets import DroppedPackets
 from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_stage, read_stages, stage_rows, stages_of

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from helpers.programs import run_program
 
-from lidar.apply import apply_stages
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
-from lidar.denoise.denoise import denoise
-from lidar.denoise.filters import read_methods
 from lidar.errors import DatasetError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.physics.echoes import Origin
-from lidar.pipeline import drive
+from lidar.sensors.physics.echoes import Origin
 from lidar.signal.registry import numbered, read_stage, read_stages
-from lidar.weather.setting import read_weather
+from lidar.signal.weather.setting import read_weather
+from lidar.simulation.drive import drive
+from lidar.tools.apply import apply_stages
+from lidar.tools.denoise.denoise import denoise
+from lidar.tools.denoise.filters import read_methods
 
 RIG = """
 name = "small"

@@ -12,16 +12,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
-from lidar.camera.render import RenderOptions, render
-from lidar.dataset.boxes import COLUMNS, box_rows, count_points, image_boxes, merge_box_files
+from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.layout import Paths
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
-from lidar.planning.road_drive import plan_road_drive
-from lidar.rig.scanner import load_sensor
-from lidar.rig.specs import CameraSpec
-from lidar.rig.vehicle import load_vehicle
-from lidar.sensors.scan import scan
+from lidar.motion.road_drive import plan_road_drive
+from lidar.motion.vehicle import load_vehicle
+from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.scanner import load_sensor
+from lidar.sensors.rig.specs import CameraSpec
+from lidar.simulation.boxes import box_rows, count_points, image_boxes, merge_box_files
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.populate import TrafficOptions, populate
 from lidar.traffic.sweep import rectangles

@@ -8,10 +8,10 @@ import shapely
 from helpers.roadgrids import grid, road_graph
 from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
 
-from lidar.planning.motion import drive_path, poses_along
-from lidar.planning.path import plan_path
-from lidar.planning.route import RouteOptions, plan_route
-from lidar.planning.speed_profile import motion_within
+from lidar.motion.motion import drive_path, poses_along
+from lidar.motion.path import plan_path
+from lidar.motion.route import RouteOptions, plan_route
+from lidar.motion.speed_profile import motion_within
 from lidar.traffic.ego_drive import drive_with_signals
 from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at

@@ -14,11 +14,11 @@ from geoscene.geometry.polylines import parallel
 from lidar.cli import app
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
-from lidar.rig.vehicle import load_vehicle
+from lidar.motion.vehicle import load_vehicle
 from lidar.traffic.fcd import TrafficFile, read_fcd
 from lidar.traffic.fcd_replay import replay
-from lidar.traffic.ground import ground_heights
 from lidar.world.actors import existing_actors, rotations, states
+from lidar.world.ground import ground_heights
 
 CAR = load_vehicle("car")
 UTM = "+proj=utm +zone=35 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"

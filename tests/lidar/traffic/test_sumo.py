@@ -10,9 +10,9 @@ from cyclopts import CoercionError
 
 from geoscene.errors import MissingExtraError
 from lidar.cli import app
-from lidar.planning.motion import drive_path
-from lidar.planning.road_drive import plan_road_drive
-from lidar.rig.vehicle import load_vehicle
+from lidar.motion.motion import drive_path
+from lidar.motion.road_drive import plan_road_drive
+from lidar.motion.vehicle import load_vehicle
 from lidar.traffic.sumo import SumoOptions, drive_in_sumo
 from lidar.traffic.sweep import rectangles
 from lidar.world.actors import existing_actors, states

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from lidar.geometry import poses
 from lidar.geometry.poses import Trajectory
-from lidar.planning.motion import drive_path
-from lidar.planning.path import plan_path
-from lidar.planning.road_conditions import DRY, ROADS
-from lidar.planning.route import RouteOptions, plan_route
+from lidar.motion.motion import drive_path
+from lidar.motion.path import plan_path
+from lidar.motion.road_conditions import DRY, ROADS
+from lidar.motion.route import RouteOptions, plan_route
 from lidar.traffic import simulation_windows
 from lidar.traffic import trips as trips_module
 from lidar.traffic.ego_trip import ego_trip

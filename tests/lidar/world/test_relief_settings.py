@@ -8,7 +8,7 @@ from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.options import DriveOptions
-from lidar.plan import plan_drive
+from lidar.simulation.plan import plan_drive
 from lidar.world.settings import WorldSettings
 from lidar.world.tile_selection import selected_tile
 from lidar.world.world import World

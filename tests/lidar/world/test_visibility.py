@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from lidar.camera.outline import outline
-from lidar.sensors.doppler import surface_velocity
+from lidar.sensors.camera.outline import outline
+from lidar.sensors.laser.doppler import surface_velocity
 from lidar.world.actor_shapes import Shape
 from lidar.world.actors import Actors
 from lidar.world.visibility import Visibility

@@ -1,0 +1,198 @@
+"""A recorded drive as KITTI's layouts hold it: a scanner, up to four cameras, and one index for all.
+
+Frames are those of the scanner; a frame's images are the nearest in time. Clouds are without the ego
+vehicle's motion, in the frame of the scanner at the frame's start.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import shutil
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.support.files import write_atomically
+from geoscene.typing import Float, Ints
+from lidar.dataset.boxes import COLUMNS, read_boxes
+from lidar.dataset.formats import FORMATS, LABELS, kitti
+from lidar.dataset.kitti_sequence import looking_ahead, projection
+from lidar.dataset.layout import Dataset
+from lidar.dataset.recorded import (
+    Stream,
+    clouds_in,
+    color_images,
+    labelled_clouds,
+    labelled_formats,
+    mount_of,
+    nearest,
+    recorded_labels,
+    still_points,
+)
+from lidar.errors import DatasetError
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.time_scales import iso_times
+
+log = logging.getLogger(__name__)
+
+CAMERAS = 4
+"""Cameras of KITTI."""
+
+_NUMBERS = (2, 3, 0, 1)
+"""Numbers of cameras not called image_<number>, in order: that of KITTI's left colour camera first."""
+
+Boxes = dict[int, dict[int, dict[str, Any]]]
+"""Rows of boxes by frame and road user."""
+
+
+@dataclass(frozen=True)
+class KittiDrive:
+    """A drive.
+
+    clouds  : of the scanner; in KITTI's format if they were not recorded with all their columns
+    cameras : streams of the cameras by their numbers, 0 to 3
+    """
+
+    dataset: Dataset
+    clouds: Stream
+    cameras: dict[int, Stream]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.clouds.files)
+
+    @functools.cached_property
+    def trajectory(self) -> Trajectory:
+        """The ego vehicle's poses."""
+        return self.dataset.trajectory()
+
+    @functools.cached_property
+    def reference(self) -> Mount:
+        """Mount of the camera in whose frame poses are; without cameras, at the scanner and looking ahead."""
+        return self.cameras[min(self.cameras)].mount if self.cameras else looking_ahead(self.clouds.mount)
+
+    @functools.cached_property
+    def inertial_unit(self) -> Mount:
+        """Mount of the first inertial unit, or else GNSS receiver, or else the vehicle's frame."""
+        sensors = {**self.dataset.sensors("imu"), **self.dataset.sensors("gnss")}
+        return mount_of(next(iter(sensors.values()))) if sensors else Mount()
+
+    @property
+    def camera_from_lidar(self) -> Float:
+        """Transformation (4, 4) from the scanner's frame to the reference camera's."""
+        return np.asarray(np.linalg.inv(self.reference.matrix) @ self.clouds.mount.matrix, float)
+
+    @property
+    def lidar_from_imu(self) -> Float:
+        """Transformation (4, 4) from the inertial unit's frame to the scanner's."""
+        return np.asarray(np.linalg.inv(self.clouds.mount.matrix) @ self.inertial_unit.matrix, float)
+
+    @functools.cached_property
+    def projections(self) -> list[Float]:
+        """Projections (3, 4) of cameras 0 to 3 from the reference camera's frame; else those of the first."""
+        own = {
+            number: projection(np.array(stream.sensor["K"]), stream.mount, reference=self.reference)
+            for number, stream in self.cameras.items()
+        }
+        some = own[min(own)] if own else np.eye(3, 4)
+        return [own.get(number, some) for number in range(CAMERAS)]
+
+    @functools.cached_property
+    def images(self) -> dict[int, Ints]:
+        """Row (n,) of the image of each frame in its camera's stream, by camera."""
+        return {number: nearest(s.time_ns, self.clouds.time_ns) for number, s in self.cameras.items()}
+
+    @functools.cached_property
+    def boxes(self) -> Boxes:
+        """3D boxes as seen from the scanner; none without traffic."""
+        path = self.dataset.paths.sensor_boxes(self.clouds.name)
+        return _by_frame(path, (*COLUMNS, "points", "visibility")) if path.exists() else {}
+
+    def image_boxes(self, number: int) -> Boxes:
+        """2D boxes in a camera's images; none without traffic."""
+        path = self.dataset.paths.sensor_boxes(self.cameras[number].name)
+        columns = ("frame", "id", "left", "top", "right", "bottom", "pixels", "visibility")
+        return _by_frame(path, columns) if path.exists() else {}
+
+    def write_cloud(self, path: Path, *, row: int, labels: Path | None = None) -> None:
+        """Write a frame's cloud and, if wanted and recorded, SemanticKITTI's labels of its points."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        source = self.clouds.files[row]
+        if source.name.endswith(FORMATS["kitti"].suffix):
+            shutil.copyfile(source, path)
+            folder, frame = self.dataset.paths.sensor(self.clouds.name), int(self.clouds.frames[row])
+            recorded = LABELS["semantickitti"].path(folder, frame)
+            if labels is not None and self.dataset.frame_file(recorded).exists():
+                labels.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(recorded, labels)
+            return
+        table = still_points(self.clouds, self.trajectory, row=row)
+        kitti.write(path, table)
+        if labels is not None:
+            found = recorded_labels(table, self.boxes.get(int(self.clouds.frames[row]), {}).values())
+            labels.parent.mkdir(parents=True, exist_ok=True)
+            kitti.write_labels(labels, found)
+
+    def write_image(self, path: Path, *, number: int, row: int) -> None:
+        """Write the image of a frame from a camera."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(self.cameras[number].files[self.images[number][row]], path)
+
+
+def write_stamps(path: Path, dataset: Dataset, *, times: Ints) -> None:
+    """Write UTC time stamps with nanoseconds, a line each."""
+    lines = [f"{stamp[:-1].replace('T', ' ')}\n" for stamp in iso_times(dataset.start, times)]
+    write_atomically(path, "".join(lines).encode("ascii"))
+
+
+def read_drive(dataset: Dataset, *, numbers: Sequence[int] = _NUMBERS) -> KittiDrive:
+    """The drive of a dataset, of its first scanner with clouds.
+
+    numbers : of cameras; those not called ``image_<number>`` get the first free ones
+
+    Raises DatasetError for a dataset without clouds in the sensor frame.
+    """
+    names = dataset.sensors("lidar")
+    found = (
+        labelled_clouds(dataset, name) or clouds_in(dataset, name, form=FORMATS["kitti"]) for name in names
+    )
+    clouds = next((stream for stream in found if stream is not None), None)
+    if clouds is None:
+        formats = ", ".join(form.name for form in [*labelled_formats(), FORMATS["kitti"]])
+        raise DatasetError(
+            f"{dataset.path}: holds no clouds in the sensor frame; drive with `formats` {formats}"
+        )
+    streams = [color_images(dataset, name) for name in dataset.sensors("camera")]
+    cameras = [s for s in streams if s is not None and _rectified(s)]
+    return KittiDrive(dataset, clouds, _numbered(cameras, numbers))
+
+
+def _rectified(camera: Stream) -> bool:
+    """Whether a camera's images have no distortion, for which KITTI's projections have no place."""
+    if camera.sensor["model"] == "pinhole" and not any(camera.sensor["distortion"]):
+        return True
+    log.warning("%s: left out: KITTI has no fisheye cameras of this model and no distortion", camera.name)
+    return False
+
+
+def _numbered(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[int, Stream]:
+    """Cameras by numbers: that of their name, or else free ones in order; those beyond are left out."""
+    own = {int(s.name[-1]): s for s in cameras if s.name in {f"image_{k}" for k in numbers}}
+    others = [s for s in cameras if s.name not in {camera.name for camera in own.values()}]
+    free = [number for number in numbers if number not in own]
+    for camera in others[len(free) :]:
+        log.warning("%s: left out: there are %d cameras in this layout", camera.name, len(numbers))
+    return dict(sorted({**own, **dict(zip(free, others, strict=False))}.items()))
+
+
+def _by_frame(path: Path, columns: Sequence[str]) -> Boxes:
+    rows: Boxes = defaultdict(dict)
+    for row in read_boxes(path, columns):
+        rows[row["frame"]][row["id"]] = row
+    return rows

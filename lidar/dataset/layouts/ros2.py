@@ -1,0 +1,108 @@
+"""A recorded drive as a ROS 2 recording: ``metadata.yaml`` and one file of messages, MCAP by default."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Callable, Iterator
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from geoscene.errors import need
+from geoscene.support.progress import Progress
+from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.layouts.ros_drive import MAP, RosDrive, Topic
+from lidar.dataset.layouts.ros_messages import encoded, typestore
+from lidar.dataset.layouts.ros_topics import topics_of
+
+NAME = "drive"
+"""Name of the file of messages."""
+
+_VERSION = 8
+"""Of the metadata: the newest that writes qualities of service as ROS 2 Humble reads them."""
+
+
+def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
+    """Write ``metadata.yaml`` and ``drive.mcap``; return the numbers of messages by what they are.
+
+    Raises DatasetError for damaged files, and MissingExtraError without rosbags.
+    """
+    return message_counts(write_recording(dataset, folder, storage="MCAP", progress=progress))
+
+
+def write_recording(dataset: Dataset, folder: Path, *, storage: str, progress: Progress) -> list[Topic]:
+    """Write the topics of a dataset, one message after the other, into an empty folder; return them.
+
+    storage : of rosbags: MCAP, with chunks compressed by zstd, or SQLITE3
+    """
+    rosbag2 = need("rosbags.rosbag2", "ros")
+    drive = RosDrive(dataset)
+    topics = topics_of(drive)
+    bag = rosbag2.Writer(folder / NAME, version=_VERSION, storage_plugin=rosbag2.StoragePlugin[storage])
+    if storage == "MCAP":
+        bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    for key, text in _about(drive).items():
+        bag.set_custom_data(key, text)
+    total = sum(topic.count for topic in topics)
+    with bag:
+        connections = [_connection(bag, topic) for topic in topics]
+        for done, (time_ns, k, make) in enumerate(merged(topics)):
+            bag.write(connections[k], drive.stamp(time_ns), encoded(make()))
+            progress("ROS 2", done + 1, total=total)
+    for path in list((folder / NAME).iterdir()):
+        path.rename(folder / path.name)
+    (folder / NAME).rmdir()
+    return topics
+
+
+def merged(topics: list[Topic]) -> Iterator[tuple[int, int, Callable[[], Any]]]:
+    """Messages in order of time, of equal times in the order of the topics."""
+
+    def numbered(k: int, topic: Topic) -> Iterator[tuple[int, int, Callable[[], Any]]]:
+        for time_ns, make in topic.messages:
+            yield time_ns, k, make
+
+    return heapq.merge(*(numbered(k, topic) for k, topic in enumerate(topics)), key=itemgetter(0, 1))
+
+
+def _connection(bag: Any, topic: Topic) -> Any:
+    """Register a topic; subscribers of a latched one get its last message whenever they come."""
+    qos = need("rosbags.interfaces", "ros")
+    never = qos.QosTime(2147483647, 4294967295)
+    durability = qos.QosDurability.TRANSIENT_LOCAL if topic.latched else qos.QosDurability.VOLATILE
+    offered = qos.Qos(
+        history=qos.QosHistory.KEEP_LAST,
+        depth=1 if topic.latched else 10,
+        reliability=qos.QosReliability.RELIABLE,
+        durability=durability,
+        deadline=never,
+        lifespan=never,
+        liveliness=qos.QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=never,
+        avoid_ros_namespace_conventions=False,
+    )
+    return bag.add_connection(topic.name, topic.kind, typestore=typestore(), offered_qos_profiles=[offered])
+
+
+def _about(drive: RosDrive) -> dict[str, str]:
+    """What the recording states of itself: where its map frame lies, and whom the map is from."""
+    dataset = drive.dataset
+    with reading_file(dataset.paths.manifest):
+        attribution = str(dataset.manifest["attribution"])
+    east, north = dataset.frame.origin
+    return {
+        "attribution": attribution,
+        f"{MAP}_crs": dataset.frame.wkt,
+        f"{MAP}_origin": f"{east} {north}",
+        f"{MAP}_scale": repr(float(drive.scale[0])),
+    }
+
+
+def message_counts(topics: list[Topic]) -> dict[str, int]:
+    """Numbers of messages by what they are, for the summary."""
+    counts: Counter[str] = Counter()
+    for topic in topics:
+        if topic.counted:
+            counts[topic.counted] += topic.count
+    return {"topics": len(topics), **counts}

@@ -1,1 +1,0 @@
-"""Devices other than the CPU, on which NVIDIA Warp runs kernels (the extra `gpu`)."""

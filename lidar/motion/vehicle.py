@@ -1,0 +1,141 @@
+"""Vehicles: dimensions, limits of motion and body roll and pitch, read from TOML."""
+
+from __future__ import annotations
+
+from dataclasses import MISSING, dataclass, fields
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeGuard, cast
+
+import numpy as np
+
+from lidar.errors import InputError
+from lidar.toml_table import read_table
+
+KINDS = ("road", "foot", "air")
+"""Where a vehicle moves: on the carriageway, on foot, or through the air."""
+
+_POSITIVE = (
+    *("length", "width", "turning_radius", "steering", "max_speed", "pace"),
+    *("acceleration", "deceleration", "jerk", "lateral_acceleration", "lateral_jerk"),
+)
+
+_LARGEST = 1e4
+_SMALLEST_TURN = 0.1  # metres; paths are sampled at a part of the turning radius
+_SIGNED = ("roll_gradient", "pitch_gradient")
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicle:
+    """A vehicle. Its frame has the origin at the rear axle's centre on the ground, x forward, y left, z up.
+
+    kind            : road, foot or air
+    length, width, height : metres, of the bounding box
+    wheelbase, rear_overhang, track : metres; rear_overhang is from the rear axle to the rear end
+    turning_radius  : minimum turning radius of the rear axle's centre, metres
+    steering        : maximum change of curvature per metre of path, 1/m^2
+    max_speed       : m/s
+    acceleration, deceleration, jerk : maxima along the path, m/s^2, m/s^2, m/s^3
+    lateral_acceleration, lateral_jerk : maxima across the path, m/s^2, m/s^3
+    roll_gradient, pitch_gradient : roll and pitch of the body in radians per m/s^2 of lateral and
+                      longitudinal acceleration; positive: out of bends and backwards (suspension), negative:
+                      into bends and forwards (aircraft)
+    pace            : share of the speed limits that it drives at
+    cruise          : at cruising speed from the start of the drive to its end (aircraft)
+    bob             : gait: lateral sway in metres, vertical rise per step in metres, steps per second at full
+                      speed
+    source          : reference for the figures
+    """
+
+    name: str
+    kind: str
+    length: float
+    width: float
+    height: float
+    wheelbase: float
+    rear_overhang: float
+    track: float
+    turning_radius: float
+    steering: float
+    max_speed: float
+    acceleration: float
+    deceleration: float
+    jerk: float
+    lateral_acceleration: float
+    lateral_jerk: float
+    roll_gradient: float
+    pitch_gradient: float
+    source: str
+    pace: float = 1.0
+    cruise: bool = False
+    bob: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def front(self) -> float:
+        """Metres from the rear axle to the front of the bounding box."""
+        return self.length - self.rear_overhang
+
+
+def vehicle_names() -> list[str]:
+    """Names of the built-in vehicles."""
+    folder = resources.files("lidar.motion").joinpath("vehicles")
+    return sorted(p.name.removesuffix(".toml") for p in folder.iterdir() if p.name.endswith(".toml"))
+
+
+def load_vehicle(name: str | Path) -> Vehicle:
+    """A built-in vehicle by name, or one from a TOML file with the keys of `Vehicle`.
+
+    Raises InputError for an unknown name, and one for all unknown or missing keys and values out of range.
+    """
+    path = Path(name)
+    if path.suffix == ".toml":
+        if not path.exists():
+            raise InputError(f"{path} does not exist; built-in vehicles are {', '.join(vehicle_names())}")
+        file: Any = path
+    elif str(name) in vehicle_names():
+        file = resources.files("lidar.motion").joinpath("vehicles", f"{name}.toml")
+    else:
+        raise InputError(f"unknown vehicle {name}; give a .toml file or one of {', '.join(vehicle_names())}")
+    return _checked(read_table(file).data, str(name))
+
+
+def _is_numbers(value: object, count: int) -> TypeGuard[list[float]]:
+    """Whether a value is a list of ``count`` finite numbers of at least 0."""
+    return (
+        isinstance(value, list)
+        and len(value) == count
+        and all(type(v) in (int, float) and 0 <= v < np.inf for v in value)
+    )
+
+
+def _checked(table: dict[str, object], name: str) -> Vehicle:
+    """A vehicle from a table of keys; raises one InputError for all faults."""
+    known = {f.name: f for f in fields(Vehicle)}
+    faults = [
+        f"unknown key {key}; known are {', '.join(known)}" for key in sorted(table.keys() - known.keys())
+    ]
+    missing = [key for key, f in known.items() if f.default is MISSING and key not in table]
+    faults += [f"missing {', '.join(missing)}"] if missing else []
+    values: dict[str, object] = {}
+    for key in known.keys() & table.keys():
+        value, kind = table[key], str(known[key].type)
+        if kind == "float" and isinstance(value, (int, float)) and not isinstance(value, bool):
+            values[key] = float(value)
+            if not np.isfinite(float(value)) or (float(value) < 0 and key not in _SIGNED):
+                faults.append(f"{key} = {value} must be a number of at least 0")
+            elif abs(float(value)) > _LARGEST:
+                faults.append(f"{key} = {value} exceeds {_LARGEST:g}")
+        elif kind.startswith("tuple") and _is_numbers(value, 3):
+            values[key] = tuple(value)
+        elif (kind, type(value)) in (("str", str), ("bool", bool)):
+            values[key] = value
+        else:
+            faults.append(f"{key} = {value!r} must be a {kind}")
+    if values.get("kind", "road") not in KINDS:
+        faults.append(f"kind = {values['kind']!r} must be one of {', '.join(KINDS)}")
+    faults += [f"{key} must be above 0" for key in _POSITIVE if values.get(key) == 0.0]
+    if 0.0 < cast("float", values.get("turning_radius", _SMALLEST_TURN)) < _SMALLEST_TURN:
+        faults.append(f"turning_radius = {values['turning_radius']} is below {_SMALLEST_TURN:g} m")
+    if faults:
+        raise InputError(f"vehicle {name}: " + "; ".join(faults))
+    return Vehicle(**values)  # type: ignore[arg-type]

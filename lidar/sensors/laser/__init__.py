@@ -1,0 +1,1 @@
+"""Laser scanners: rays of a moving sensor, echoes of surfaces, detection and point clouds."""

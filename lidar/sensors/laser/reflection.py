@@ -1,0 +1,261 @@
+"""Reflectance of the surfaces that rays hit, and the echoes of each pulse."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import materials
+from geoscene.support.compiled import njit
+from geoscene.typing import Float
+from lidar.geometry.random_streams import normal_of
+from lidar.raycast import Hits
+from lidar.sensors.physics.echoes import Echoes, depth_of, gather, insert
+from lidar.sensors.physics.footprint import Gap
+from lidar.sensors.physics.fresnel import film, glint, under_film
+from lidar.sensors.physics.reflect import (
+    INCIDENCE_LAWS,
+    RETRO,
+    apparent,
+    covered_reflectance,
+    reflectance_table,
+    sent_back,
+)
+from lidar.sensors.physics.settings import ScannerSettings
+from lidar.world.surfaces import OPEN, Faces
+from lidar.world.world import World
+
+
+@functools.cache
+def glossy_codes() -> tuple[int, int]:
+    """Material codes of glass and water."""
+    known = materials()
+    return known["glass"].code, known["water"].code
+
+
+@functools.lru_cache(maxsize=8)
+def _factors(low: int, high: int, *, spread: float, seed: int) -> Float:
+    """Log-normal factors of the reflectance of features ``low`` to ``high``."""
+    return np.exp(spread * normal_of(np.arange(low, high + 1), seed))
+
+
+class ReflectionTables(NamedTuple):
+    """Reflection properties by material and feature, for compiled code.
+
+    reflectance, specular : (256,) by material code
+    film, soaked : (256,) of wet surfaces, as in `lidar.sensors.physics.reflect.CoveredReflectance`
+    factor : (k,) of the reflectance, by feature number minus ``low``; empty if there is no spread
+    law    : index in `INCIDENCE_LAWS`
+    glossy : (256,) bool, by material code: rays are mirrored or pass through
+    """
+
+    reflectance: Float
+    specular: Float
+    film: Float
+    soaked: Float
+    factor: Float
+    low: int
+    law: int
+    glossy: NDArray[np.bool_]
+
+
+class SurfaceOptics:
+    """Reflection of a scanner's light by the surfaces of a world.
+
+    settings : incidence law, spread of the reflectance, and whether glass and water mirror
+    seed    : of the spread
+    """
+
+    def __init__(self, world: World, wavelength_nm: float, *, settings: ScannerSettings, seed: int) -> None:
+        self.world, self.settings = world, settings
+        self.faces: Faces = world.faces
+        reflectance, specular = reflectance_table(wavelength_nm)
+        films = soaked = np.zeros(256)
+        wetness, snow = world.settings.wetness, world.settings.snow
+        if wetness or snow:
+            covered = covered_reflectance(wavelength_nm, wetness=wetness, snow=snow)
+            reflectance = _with_open(reflectance, covered.open)
+            films, soaked = _with_open(films, covered.film), _with_open(soaked, covered.soaked)
+            specular = _with_open(specular, (1 - snow) * specular)
+        glossy = np.zeros(256, np.bool_)
+        glossy[list(glossy_codes())] = settings.mirrors
+        factor = np.empty(0)
+        if settings.spread:
+            factor = _factors(self.faces.low, self.faces.high, spread=settings.spread, seed=seed)
+        law = INCIDENCE_LAWS.index(settings.law)
+        low = self.faces.low
+        self.tables = ReflectionTables(reflectance, specular, films, soaked, factor, low, law, glossy)
+
+    def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
+        """Surfaces (n,) of hits, with the hit's row as pulse and all on the axis; and their materials."""
+        found, tables = self.world.lookup(hits), self.tables
+        cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
+        rho = tables.reflectance[found.material]
+        wet = np.flatnonzero(tables.film[found.material])
+        code = found.material[wet]
+        rho[wet] += tables.film[code] * under_film(cosine[wet], tables.soaked[code])
+        if len(tables.factor):
+            one_off = rho * tables.factor[np.maximum(found.feature - tables.low, 0)]
+            rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
+        back = apparent(rho, cosine, specular=tables.specular[found.material], law=self.settings.law)
+        if self.settings.mirrors:
+            water = np.flatnonzero(found.material == glossy_codes()[1])
+            back[water] = glint(cosine[water])
+        n = len(hits.range)
+        number, axis = np.arange(n, dtype=np.int32), np.ones(n, bool)
+        rows = Echoes(number, hits.range, back, found.feature, found.klass, cosine, hits.range, axis)
+        return rows, found.material
+
+
+def _with_open(plain: Float, covered: Float) -> Float:
+    """A table by material code with the codes of `OPEN` replaced by what they are when covered."""
+    return np.concatenate([plain[:OPEN], covered[:OPEN]])
+
+
+class EchoCollector:
+    """Collects the echoes of consecutive pulses, batch after batch.
+
+    rays       : rays of equal power per pulse
+    separation : metres; surfaces closer than this give one echo
+    gap        : between neighbouring rays
+    pulses     : number of pulses in all
+    """
+
+    def __init__(self, optics: SurfaceOptics, rays: int, *, separation: float, gap: Gap, pulses: int) -> None:
+        self._optics, self._rays, self._separation, self._gap = optics, rays, separation, gap
+        self._columns, self._glossy, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
+
+    def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
+        """Add the hits of the pulses from number ``first`` on; return the rays that hit glass or water.
+
+        The surfaces of pulses with such rays are collected apart and not yet merged into echoes.
+        """
+        n = len(hits.range)
+        self._make_room(n)
+        start, glossy = self._count, np.empty((2, n if self._optics.settings.mirrors else 0), np.int32)
+        echoes = self._columns.take(slice(start, start + n))
+        count, found = _receive(
+            (hits.range, hits.face, hits.instance, hits.cosine),
+            first,
+            self._rays,
+            self._optics.faces,
+            self._optics.tables,
+            self._separation,
+            self._gap,
+            tuple(echoes.columns().values()),
+            self._glossy[start : start + n],
+            glossy,
+        )
+        self._count += count
+        ray, row = glossy[:, :found]
+        if found:
+            wet = (
+                self._optics.faces.packed[_face_row(self._optics.faces, hits, ray=ray)] & 255
+                == glossy_codes()[1]
+            )
+            echoes.apparent[row[wet]] = glint(echoes.cosine[row[wet]]) / self._rays
+        rays: NDArray[np.int32] = ray
+        return rays
+
+    def echoes(self) -> tuple[Echoes, Echoes]:
+        """Echoes of pulses that hit neither glass nor water, and surfaces of the others."""
+        together, kept = self._columns.take(slice(self._count)), self._glossy[: self._count]
+        return together.where(~kept), together.take(kept)
+
+    def _make_room(self, rows: int) -> None:
+        """Grow the columns so that ``rows`` more echoes fit."""
+        if self._count + rows <= len(self._glossy):
+            return
+        more = len(self._glossy) + rows
+        self._columns = Echoes.concatenate([self._columns, _columns(more)])
+        self._glossy = np.append(self._glossy, np.empty(more, np.bool_))
+
+
+def _columns(n: int) -> Echoes:
+    """Uninitialised columns."""
+    distance, apparent, cosine, true = (np.empty(n) for _ in range(4))
+    number, feature = np.empty(n, np.int32), np.empty(n, np.int32)
+    klass, axis = np.empty(n, np.uint8), np.empty(n, np.bool_)
+    return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
+
+
+def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Row of ``faces.packed`` of each ray's hit."""
+    return hits.face[ray] + faces.start[hits.instance[ray]]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _receive(
+    hits: Any,
+    pulse: Any,
+    rays: Any,
+    faces: Any,
+    tables: Any,
+    separation: Any,
+    gap: Any,
+    out: Any,
+    apart: Any,
+    glossy: Any,
+) -> Any:
+    """Fill ``out`` with echoes; return their number and that of rays that hit glass or water."""
+    distance, face, instance, cosine = hits
+    # Fields of a tuple that are read in a loop cost a reference count each time.
+    starts, named, packed, own = faces.start, faces.named, faces.packed, len(faces.start) - 1
+    reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
+    films, soaked = tables.film, tables.soaked
+    low, law, spread = tables.low, tables.law, len(tables.factor) > 0
+    numbers, ranges, apparents, features, classes, cosines, trues, axes = out
+    back, away, slant, depth = np.empty(rays), np.empty(rays), np.empty(rays), np.empty(rays)
+    axis = np.zeros(rays, np.bool_)
+    axis[0] = True
+    surfaces = np.empty(rays, np.int64)
+    row, bearer = np.empty(rays, np.int64), np.empty(rays, np.int64)
+    place, power = np.empty(rays), np.empty(rays)
+    count = found = 0
+    for first in range(0, len(distance), rays):
+        size, plain, number = 0, True, pulse + first // rays
+        for k in range(rays):
+            i = first + k
+            if face[i] < 0:
+                continue
+            copy = instance[i]
+            surface = packed[face[i] + starts[copy if copy >= 0 else own]]
+            if copy >= 0:
+                surface = (np.int64(named[copy]) << 32) | (surface & 0xFFFFFFFF)
+            material = surface & 255
+            rho = reflectance[material]
+            c = min(abs(np.float64(cosine[i])), 1.0)
+            if films[material] > 0.0:
+                rho += films[material] * film(c, soaked[material])
+            if spread:
+                one_off = rho * factor[max((surface >> 32) - low, 0)]
+                rho = one_off if rho > RETRO else min(one_off, RETRO)
+            surfaces[k], slant[k], away[k] = surface, c, distance[i]
+            depth[k] = depth_of(distance[i], c, gap)
+            back[k] = sent_back(rho, c, specular[material], law) / rays
+            insert(row, size, k, away)
+            size += 1
+            plain &= not mirrors[material]
+        if size == 0:
+            continue
+        if plain:
+            echoes = gather(row, size, away, back, axis, depth, separation, 0, bearer, place, power)
+        else:
+            echoes = size
+            for j in range(size):
+                k = row[j]
+                bearer[j], place[j], power[j] = k, away[k], back[k]
+                if mirrors[surfaces[k] & 255]:
+                    glossy[0, found], glossy[1, found] = first + k, count + j
+                    found += 1
+        for j in range(echoes):
+            k = bearer[j]
+            numbers[count], ranges[count], apparents[count] = number, place[j], power[j]
+            features[count], classes[count] = surfaces[k] >> 32, (surfaces[k] >> 8) & 255
+            cosines[count], trues[count], axes[count] = slant[k], away[k], axis[k]
+            apart[count] = not plain
+            count += 1
+    return count, found

@@ -1,0 +1,118 @@
+"""Injected returns: points, a wall, or the shape of a road user."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geoscene.typing import Float
+from lidar.errors import InputError
+from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
+from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of, sent_back
+from lidar.signal.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges
+from lidar.signal.situation import Situation
+from lidar.signal.stage import POSES, Pulses, parameter
+
+
+@dataclass(frozen=True)
+class Inject(SynchronisedAttacker):
+    """Returns of nothing: random points, a wall, or a road user (Cao 2019, Sun 2020, Jin 2023)."""
+
+    shape: str = parameter(
+        "object",
+        "random points, a wall, a whole road user, a strip of one, the few returns of a far one",
+        among=("random", "wall", "object", "occluded", "far"),
+    )
+    kind: str = parameter("sedan", "road user that the phantom resembles", among=OBJECTS)
+    range: float = parameter(7.0, "metres from the sensor to the phantom", low=0.1, high=1000)
+    closing: float = parameter(0.0, "m/s by which it comes nearer", low=-100, high=100)
+    standing: bool = parameter(
+        False, "stays where it was at start, in the scene; else at the same range and bearing"
+    )
+    offset: float = parameter(
+        0.0, "degrees of azimuth of the phantom from the device to the left", low=-180, high=180
+    )
+    wide: float = parameter(4.0, "metres, width of a wall", low=0.1, high=1000)
+    high: float = parameter(2.0, "metres, height of a wall", low=0.1, high=100)
+    deep: float = parameter(10.0, "metres behind range over which random points lie", low=0, high=1000)
+    strip: float = parameter(
+        0.3, "share of the width of an occluded road user that is seen", low=0.01, high=1
+    )
+    seen_at: float = parameter(40.0, "metres away at which a far road user was recorded", low=1, high=200)
+    predicts: bool = parameter(True, "fires before the sensor does, so that phantoms may be nearer than it")
+    dimmest: float = parameter(0.3, "least apparent reflectance of a point", low=0, high=1)
+    brightest: float = parameter(1.0, "greatest apparent reflectance of a point", low=0, high=1)
+
+    def __post_init__(self) -> None:
+        """Validate the parameters, also against each other."""
+        super().__post_init__()
+        if self.dimmest > self.brightest:
+            raise InputError(f"dimmest = {self.dimmest:g} is over brightest = {self.brightest:g}")
+        if not self.predicts and not self.place and self.range < self.distance:
+            raise InputError(
+                f"range = {self.range:g} is nearer than the device at {self.distance:g} m,"
+                " which needs predicts = true"
+            )
+
+    @property
+    def requires(self) -> tuple[str, ...]:
+        """Poses, for a fixed device and for a phantom that stands in the scene."""
+        return (POSES,) if self.place or self.standing else ()
+
+    def echoes(
+        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
+    ) -> TracedEchoes:
+        """The echoes with those of the phantom."""
+        aim = self.aim(pulses, echoes, at=at)
+        if aim is None:
+            return echoes
+        distance = self._distances(pulses, echoes, aim=aim, at=at, rng=rng)
+        sensor = pulses.sensor
+        away = distance + sensor.pattern.range_offset
+        usable = (away >= sensor.min_range) & (away <= sensor.max_range)
+        if not self.predicts:
+            usable &= distance >= aim.distance
+        known = np.full(len(pulses), np.inf)
+        known[aim.row] = distance
+        aim = self.spent(aim.where(usable), rng=rng)
+        aim = aim.where(has_code(sensor, len(aim.row), rng=rng))
+        distance = known[aim.row] + self.errors(aim, rng=rng)
+        distance += shift_by_delay(sensor, len(aim.row), rng=rng)
+        reflectance = rng.uniform(self.dimmest, self.brightest, len(aim.row))
+        power = np.minimum(power_of(pulses, reflectance, distance=distance), aim.power)
+        return sent_back(pulses, echoes, row=aim.row, distance=distance, power=power, origin=Origin.INJECTED)
+
+    def _distances(
+        self, pulses: Pulses, echoes: TracedEchoes, *, aim: Aim, at: Situation, rng: np.random.Generator
+    ) -> Float:
+        """Distance (k,) of the phantom along each beam, metres; infinite where it has none."""
+        azimuth, distance = self._place_of_phantom(pulses, aim=aim, at=at)
+        azimuth += self.frame_jitter * rng.standard_normal()
+        distance -= self.closing * (at.start_ns * 1e-9 - self.start)
+        if self.shape == "random":
+            return rng.uniform(distance, distance + self.deep, len(aim.row))
+        ground = ground_below(pulses, echoes, azimuth=azimuth)
+        place = {"azimuth": azimuth, "distance": distance, "ground": ground}
+        if self.shape == "wall":
+            return wall_ranges(pulses, aim.row, size=(self.wide, self.high), **place)
+        if self.shape == "far":
+            return far_trace_ranges(pulses, aim.row, kind=self.kind, seen_at=self.seen_at, **place)
+        part = (0.0, self.strip) if self.shape == "occluded" else (0.0, 1.0)
+        return object_ranges(pulses, aim.row, kind=self.kind, part=part, **place)
+
+    def _place_of_phantom(self, pulses: Pulses, *, aim: Aim, at: Situation) -> tuple[float, float]:
+        """Azimuth (degrees) and distance (metres) of the phantom, but for its own motion."""
+        if not self.standing:
+            way = pulses.direction[aim.row[:1]]
+            ahead = np.degrees(np.arctan2(way[:, 1], way[:, 0])) - aim.azimuth[:1]
+            return float(ahead[0]) + self.offset, self.range
+        assert at.poses is not None  # noqa: S101 - see requires
+        first = np.array([round(self.start * 1e9)], np.int64)
+        towards = self.towards(first, at=at)[0]
+        angle = np.arctan2(towards[1], towards[0]) + np.radians(self.offset)
+        point = np.array([[self.range * np.cos(angle), self.range * np.sin(angle), 0.0]])
+        now = np.array([pulses.time_ns[aim.row].mean()], np.int64)
+        x, y, _ = in_body(at.poses(now), point=at.poses(first).place(point)[0])[0]
+        return float(np.degrees(np.arctan2(y, x))), float(np.hypot(x, y))

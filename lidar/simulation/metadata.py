@@ -1,0 +1,173 @@
+"""Metadata files of a dataset: poses, calibration, time stamps, GNSS and IMU measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.geometry.frames import Frame
+from geoscene.scene import Scene
+from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.files import write_json
+from lidar.dataset.kitti_sequence import write_sequence
+from lidar.dataset.layout import Paths
+from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
+from lidar.geometry.mounts import Mount
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.time_scales import iso_times
+from lidar.sensors.navigation.imu import observe_imu
+from lidar.sensors.rig.camera_model import intrinsic_matrix
+from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.sensors.rig.specs import Rig
+from lidar.settings import Contents
+from lidar.signal.effects import Effects
+from lidar.simulation.navigation_files import heights_of, observed_fixes, record_fixes, record_samples
+from lidar.simulation.situations import situation_of_unit
+
+
+def pose_columns(
+    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer], first: int = 0
+) -> dict[str, Any]:
+    """Columns of ``poses.csv``: the vehicle at given times, of frames from number ``first`` on.
+
+    x, y, z in scene metres; alpha, beta, gamma in radians with R = Rz(gamma) Ry(beta) Rx(alpha), scene axes
+    from vehicle axes; lon, lat in degrees (WGS 84) and h in metres as the scene's heights.
+    """
+    poses = trajectory.at(time_ns)
+    x, y, z = poses.position.T
+    quat = quat_from_matrix(poses.rotation)
+    lon, lat = frame.to_geographic(x, y)
+    return {
+        "timestamp": iso_times(start, time_ns),
+        "frame": np.arange(first, first + len(time_ns)),
+        "x": x,
+        "y": y,
+        "z": z,
+        **dict(zip(("alpha", "beta", "gamma"), euler_from_quat(quat).T, strict=True)),
+        **dict(zip(("qx", "qy", "qz", "qw"), quat.T, strict=True)),
+        "lon": lon,
+        "lat": lat,
+        "h": z,
+    }
+
+
+def _mounted(mount: Mount) -> dict[str, Any]:
+    return {
+        "vehicle_from_sensor": mount.matrix.tolist(),
+        "translation": list(mount.translation),
+        "quat_xyzw": list(mount.quat_xyzw),
+    }
+
+
+_SECRETS = ("firing_jitter_ns", "code_bits")
+"""Stated of scanners that have them."""
+
+_SCANNER = ("wavelength_nm", "min_range", "max_range", "range_quantum", "return_mode", "fmcw")
+
+
+def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]:
+    """The document ``calibration.json``: mounts, rates and intrinsics."""
+    out: dict[str, Any] = {}
+    for kind, specs in (("gnss", rig.gnss), ("imu", rig.imus)):
+        for spec in specs:
+            rates = {"rate_hz": spec.rate_hz, "time_offset_ns": spec.time_offset_ns}
+            out[spec.name] = {"kind": kind, **rates, **_mounted(spec.mount)}
+    for sensor in sensors:
+        if isinstance(sensor, Scanner):
+            s = sensor.sensor
+            out[sensor.name] = {
+                "kind": "lidar",
+                "model": f"{s.maker} {s.model}",
+                "rate_hz": s.rate_hz,
+                "time_offset_ns": s.start_ns,
+                **{name: getattr(s, name) for name in _SCANNER},
+                **{name: value for name in _SECRETS if (value := getattr(s, name))},
+                **_mounted(sensor.spec.mount),
+            }
+        else:
+            c = sensor.spec
+            out[sensor.name] = {
+                "kind": "camera",
+                "model": c.model,
+                "rate_hz": c.rate_hz,
+                "time_offset_ns": c.time_offset_ns,
+                "width": c.width,
+                "height": c.height,
+                "K": intrinsic_matrix(c).tolist(),
+                "distortion": list(c.distortion),
+                "depth_counts_per_metre": 256,
+                "exposure_ns": c.exposure_ns,
+                "row_ns": c.row_ns,
+                **_mounted(c.mount),
+            }
+    return {
+        "frames": {
+            "vehicle": "x forward, y left, z up; origin: the rear axle's centre on the ground",
+            "lidar": "x forward, y left, z up",
+            "camera": "x right, y down, z forward; the centre of the top-left pixel is (0, 0)",
+        },
+        "sensors": out,
+    }
+
+
+def write_metadata(
+    out: Path,
+    scene: Scene,
+    *,
+    rig: Rig,
+    sensors: Sequence[Scanner | Camera],
+    trajectory: Trajectory,
+    start: datetime,
+    frames: Mapping[str, int],
+    contents: Contents,
+    effects: Effects | None = None,
+) -> None:
+    """Write all files of a dataset but clouds, images and boxes.
+
+    ``poses.csv`` (a row for each frame of the first sensor), ``calibration.json``, time stamps of each
+    sensor, and ``<name>.csv`` of every receiver (also as NMEA sentences) and inertial unit of the rig; with
+    KITTI's clouds or labels the files that make each scanner's folder a sequence.
+
+    frames : number of frames, by sensor
+    """
+    seed, paths = contents.seed, Paths(out)
+    write_json(paths.calibration, calibration(rig, sensors))
+    for k, sensor in enumerate(sensors):
+        times = np.fromiter(map(sensor.frame_start_ns, range(frames[sensor.name])), np.int64)
+        number = np.arange(len(times))
+        write_blocks(
+            paths.timestamps(sensor.name),
+            (
+                {"frame": number[rows], "time_ns": times[rows], "timestamp": iso_times(start, times[rows])}
+                for rows in table_blocks(len(times))
+            ),
+        )
+        if k == 0:
+            windows = trajectory.windows(times, margin=2) if len(times) else [(slice(0), trajectory)]
+            write_blocks(
+                paths.poses,
+                (
+                    pose_columns(part, scene.frame, start=start, time_ns=times[rows], first=rows.start)
+                    for rows, part in windows
+                ),
+            )
+        if contents.kitti and isinstance(sensor, Scanner):
+            folder, mount = paths.sensor(sensor.name), sensor.spec.mount
+            write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
+    stages = contents.stages
+    situation = partial(situation_of_unit, trajectory=trajectory, start=start, seed=seed, effects=effects)
+    for receiver in rig.gnss:
+        fixes = observed_fixes(scene, receiver, trajectory=trajectory, start=start, seed=seed)
+        at = situation(receiver.name, receiver.mount)
+        heights = heights_of(scene.frame, fixes)
+        record_fixes(paths, fixes, at=at, stages=stages, start=start, heights=heights)
+    for unit in rig.imus:
+        samples = partial(observe_imu, trajectory, scene.frame, spec=unit, seed=seed)
+        at = situation(unit.name, unit.mount)
+        record_samples(paths, samples, at=at, stages=stages, start=start)

@@ -1,0 +1,469 @@
+"""The plan of a drive: everything that is fixed before the first frame is recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from geoscene import __version__
+from geoscene.classes import Class, materials
+from geoscene.pipeline.limits import Limit, height_limit
+from geoscene.pipeline.reach import OFFSET
+from geoscene.scene import Scene
+from geoscene.support.progress import Progress, silent
+from geoscene.typing import Float, Ints
+from lidar.dataset.provenance import scene_provenance, versions
+from lidar.errors import InputError, RouteError
+from lidar.geometry.georeference import Georeference, export_crs
+from lidar.geometry.poses import Trajectory, blocks_of
+from lidar.geometry.time_scales import check_start
+from lidar.motion.flight import Flight
+from lidar.motion.road_conditions import vehicle_on
+from lidar.motion.road_drive import RoadPlan, plan_road_drive
+from lidar.motion.vehicle import Vehicle, load_vehicle
+from lidar.options import DriveOptions
+from lidar.raycast.device import check_device
+from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
+from lidar.sensors.rig.specs import Rig, load_rig
+from lidar.signal.attacks.placed_object import with_objects
+from lidar.signal.stage import LABELS, POSES, ROAD_USERS
+from lidar.simulation.recording import Recording
+from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
+from lidar.world.actors import Actors
+from lidar.world.settings import check_relief, origin_limit
+
+if TYPE_CHECKING:
+    from lidar.simulation.flight_planning import FlightOptions
+    from lidar.traffic.signal_heads import SignalStates
+
+_RANDOM_SECONDS = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One frame of one sensor."""
+
+    start_ns: int
+    order: int
+    frame: int
+    sensor: Scanner | Camera = field(compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Jobs(Sequence[Job]):
+    """Frames of several sensors in order of time; a job is made when it is asked for.
+
+    sensors : the sensors
+    order   : (n,) int16, row of each frame's sensor
+    frame   : (n,) int32, number of each frame
+    """
+
+    sensors: tuple[Scanner | Camera, ...]
+    order: NDArray[np.int16]
+    frame: NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.frame)
+
+    @overload
+    def __getitem__(self, row: int) -> Job: ...
+    @overload
+    def __getitem__(self, row: slice) -> Jobs: ...
+    def __getitem__(self, row: int | slice) -> Job | Jobs:
+        """A job, or the jobs of some rows."""
+        if isinstance(row, slice):
+            return Jobs(self.sensors, self.order[row], self.frame[row])
+        order, frame = int(self.order[row]), int(self.frame[row])
+        sensor = self.sensors[order]
+        return Job(sensor.frame_start_ns(frame), order, frame, sensor)
+
+    def where(self, keep: Callable[[Job], bool]) -> Jobs:
+        """The jobs for which ``keep`` is true."""
+        mask = np.fromiter(map(keep, self), bool, len(self))
+        return Jobs(self.sensors, self.order[mask], self.frame[mask])
+
+
+@dataclass(frozen=True, slots=True)
+class DrivePlan:
+    """All that `drive` records, fixed before the first frame.
+
+    scene       : the scene
+    options     : the options
+    rig         : sensors and their mounts
+    sensors     : scanners and cameras of the rig, in its order
+    start       : UTC time of the drive's start
+    trajectory  : of the ego vehicle
+    actors      : other road users; None without traffic
+    signals     : what signal heads show in images; None without cameras or heads, and where it is not known
+    scanning_ns : (k, 2) times from and until which scanners work; None for always
+    geo         : from the scene frame to the export CRS
+    jobs        : frames of all sensors in order of time
+    """
+
+    scene: Scene
+    options: DriveOptions
+    rig: Rig
+    sensors: tuple[Scanner | Camera, ...]
+    start: datetime
+    trajectory: Trajectory
+    actors: Actors | None
+    signals: SignalStates | None
+    scanning_ns: Ints | None
+    geo: Georeference
+    jobs: Jobs
+
+    @property
+    def max_range(self) -> float:
+        """Metres beyond which no sensor measures."""
+        return max((s.max_range for s in self.sensors), default=0.0)
+
+    @property
+    def length(self) -> float:
+        """True metres that the ego vehicle covers."""
+        metres = 0.0
+        for rows in blocks_of(len(self.trajectory), overlap=1):
+            steps = np.diff(self.trajectory.position[rows], axis=0)
+            steps[:, :2] /= self.trajectory.scale[rows][1:, None]
+            metres += float(np.linalg.norm(steps, axis=1).sum())
+            self.trajectory.release()
+        return metres
+
+    @property
+    def frames(self) -> dict[str, int]:
+        """Number of frames, by sensor."""
+        count = np.bincount(self.jobs.order, minlength=len(self.sensors)).tolist()
+        return dict(zip((s.name for s in self.sensors), count, strict=True))
+
+    @property
+    def limits(self) -> list[Limit]:
+        """Errors that no range is corrected for: of lengths at the trajectory's height, and of its origin.
+
+        And surfaces that are missing, where sensors see farther than a scene along a route was built.
+        """
+        position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)].copy()
+        self.trajectory.release()
+        settings = self.options.contents().world
+        sight = min(self.max_range, settings.reach)
+        return [
+            *height_limit(position[:, 2]),
+            *(origin_limit(position) if settings.origin == "scene" else []),
+            *reach_limit(self.scene, position, sight=sight),
+        ]
+
+    def recording(self, out: Path) -> Recording:
+        """What the frames are recorded from."""
+        return Recording(
+            out,
+            self.scene.frame,
+            trajectory=self.trajectory,
+            start=self.start,
+            geo=self.geo,
+            contents=self.options.contents(),
+            actors=self.actors,
+            signals=self.signals,
+            max_range=self.max_range,
+            scanning_ns=self.scanning_ns,
+        )
+
+    def manifest(self) -> dict[str, Any]:
+        """Contents of ``dataset.json`` but its counts of points and finished frames."""
+        scene, options, frames = self.scene, self.options, self.frames
+        manifest = {
+            "schema": 1,
+            "generator": f"geoscene lidar {__version__}",
+            "versions": versions(),
+            **scene_provenance(scene),
+            "frame": scene.frame.to_json(),
+            "export_crs": self.geo.crs.to_wkt(),
+            "start_time": self.start.isoformat(),
+            "duration_ns": self.trajectory.duration_ns,
+            "length_m": round(self.length, 3),
+            "rig": self.rig.name,
+            "formats": list(options.formats),
+            "labels": list(options.labels),
+            "deskew": options.deskew,
+            "fidelity": options.fidelity,
+            "seed": options.seed,
+            "frames": next(iter(frames.values()), 0),
+            "sensor_frames": frames,
+            "classes": {klass.name.lower(): int(klass) for klass in Class},
+            "materials": {material.name: material.code for material in materials().values()},
+        }
+        if self.scanning_ns is not None:
+            on = np.clip(self.scanning_ns, 0, self.trajectory.duration_ns)
+            manifest["scanners_on_ns"] = on.tolist()
+        manifest["limits"] = [limit.to_json() for limit in self.limits]
+        return manifest | {"recipe": options.recipe(scene)}
+
+
+def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = silent) -> DrivePlan:
+    """The plan of a drive through a scene.
+
+    Raises InputError (also as RouteError, RigError) for what cannot be driven.
+    """
+    settings = options.contents().world
+    check_relief(scene, settings)
+    check_device(settings.device)
+    start = options.start or solar_start(scene)
+    check_start(start, 0)
+    rig = load_rig(options.rig)
+    sensors = sensors_of(rig, options)
+    if any(isinstance(sensor, Camera) for sensor in sensors):
+        scene.require("colors")
+    road = options.road_conditions()
+    vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
+    motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
+    _refuse_elsewhere(scene, motion if isinstance(motion, Trajectory) else motion.trajectory, sensors=sensors)
+    trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
+    stages = options.contents().stages
+    actors = with_objects(actors, stages, scene=scene, trajectory=trajectory)
+    check_start(start, trajectory.duration_ns)
+    jobs = schedule(sensors, trajectory.duration_ns)
+    if sensors and not jobs:
+        raise InputError(f"the drive lasts {trajectory.duration_ns / 1e9:.2f} s, less than one frame")
+    last = dict.fromkeys(sensor_kinds(rig), trajectory.duration_ns / 1e9)
+    last |= {job.sensor.name: job.start_ns / 1e9 for job in jobs}
+    stages.check_start(sensor_kinds(rig), last=last)
+    return DrivePlan(
+        scene,
+        options,
+        rig,
+        sensors,
+        start=start,
+        trajectory=trajectory,
+        actors=actors,
+        signals=_signals(scene, options, vehicle=vehicle, motion=motion, sensors=sensors),
+        scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,
+        geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
+        jobs=jobs,
+    )
+
+
+def _refuse_elsewhere(scene: Scene, trajectory: Trajectory, *, sensors: Sequence[Scanner | Camera]) -> None:
+    """Raise RouteError for a motion from which no sensor ever reaches the scene."""
+    sight = max((sensor.max_range for sensor in sensors), default=0.0)
+    xmin, ymin, xmax, ymax = scene.bounds
+    nearest = np.inf
+    for rows in blocks_of(len(trajectory.time_ns)):
+        xy = trajectory.position[rows, :2]
+        off = np.hypot(*(xy - np.clip(xy, [xmin, ymin], [xmax, ymax])).T)
+        nearest = min(nearest, float(off.min()))
+    if nearest > sight:
+        raise RouteError(
+            f"the route comes no closer than {nearest:,.0f} m to {scene.path}, and the sensors see up to"
+            f" {sight:g} m; give a route through the scene, or the scene of the route"
+        )
+
+
+def reach_limit(scene: Scene, position: Float, *, sight: float) -> list[Limit]:
+    """The limit of what sensors at places (n, 3) see of a scene that was built along a route.
+
+    sight : metres, range of the sensors
+    """
+    if scene.route is None:
+        return []
+    reach = float(scene.manifest["options"]["reach"])
+    off = float(shapely.distance(scene.route, shapely.points(position[:, :2])).max())
+    needed = sight + max(off - OFFSET, 0.0)
+    if needed <= reach:
+        return []
+    where = f" at up to {off:,.0f} m from that route" if off > OFFSET else ""
+    advice = (
+        f"the scene was built along a route for ranges of {reach:g} m; sensors of this drive see up to"
+        f" {sight:g} m{where}, so surfaces that far away may be missing: build the scene with a reach of"
+        f" {needed:.0f} m or as a whole"
+    )
+    return [Limit("reach", round(needed, 1), reach, "m", advice)]
+
+
+def solar_start(scene: Scene) -> datetime:
+    """10:00 mean solar time on 21 June 2026 in a scene's centre, to the minute, in UTC."""
+    xmin, ymin, xmax, ymax = scene.bounds
+    lon_deg, _ = scene.frame.to_geographic((xmin + xmax) / 2, (ymin + ymax) / 2)
+    return datetime(2026, 6, 21, 10, tzinfo=UTC) - timedelta(minutes=round(float(lon_deg) * 4))
+
+
+def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
+    """Scanners and cameras of a rig; raises InputError if it has no sensors, or stages on unknown ones."""
+    sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
+    if not sensors and not rig.gnss:
+        raise InputError(f"rig {rig.name} has no sensors")
+    stages = options.contents().stages
+    known = {POSES: True, ROAD_USERS: options.traffic is not None}
+    known[LABELS] = known[ROAD_USERS] or bool(stages.at("scene", "scene"))
+    stages.check({**sensor_kinds(rig), "scene": "scene"}, known=[need for need, has in known.items() if has])
+    return sensors
+
+
+def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> Jobs:
+    """Frames of all sensors that end within ``duration_ns``, in order of time."""
+    counts = [sensor.frame_count(duration_ns) for sensor in sensors]
+    starts = [
+        np.fromiter(map(sensor.frame_start_ns, range(count)), np.int64, count)
+        for sensor, count in zip(sensors, counts, strict=True)
+    ]
+    order = np.repeat(np.arange(len(counts), dtype=np.int16), counts)
+    frame = np.concatenate([np.empty(0, np.int32), *(np.arange(n, dtype=np.int32) for n in counts)])
+    rows = np.lexsort((frame, order, np.concatenate([np.empty(0, np.int64), *starts])))
+    return Jobs(tuple(sensors), order[rows], frame[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class RoadMotion:
+    """A planned route with its path, and the trajectory along it without other road users."""
+
+    plan: RoadPlan
+    trajectory: Trajectory
+
+
+def plan_motion(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    sensors: Sequence[Scanner | Camera],
+    progress: Progress = silent,
+) -> Trajectory | RoadMotion | Flight:
+    """Trajectory of the ego vehicle alone; on roads with its path, in flight with the times of scanning.
+
+    Raises RouteError for a route that it cannot take.
+    """
+    route = options.route or "random"
+    if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
+        from lidar.motion.replay import read_replay  # noqa: PLC0415
+
+        replayed = read_replay(route, scene.frame)
+        return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
+    if vehicle.kind != "air":
+        options.check_on_roads(vehicle.name)
+        travel = plan_road_drive(
+            scene,
+            route,
+            vehicle=options.vehicle or load_rig(options.rig).vehicle,
+            seed=options.seed,
+            duration=options.duration,
+            side=options.side_in(scene),
+            from_rest=options.from_rest,
+            progress=progress,
+        )
+        trajectory = drive_with_signals(
+            travel.path,
+            vehicle,
+            graph=travel.graph,
+            seed=options.seed,
+            side=options.side_in(scene),
+            bounds=scene.bounds,
+            duration=travel.duration,
+            at_speed=travel.at_speed,
+            road=options.road_conditions(),
+        )
+        if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
+            trajectory = trajectory.until(round(travel.duration * 1e9))
+        return RoadMotion(travel, trajectory)
+    from lidar.simulation.flight_planning import plan_flight  # noqa: PLC0415
+
+    progress("planning", 0, total=0)
+    return plan_flight(scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
+
+
+def flight_options(options: DriveOptions) -> FlightOptions:
+    """How the flight of a drive's options is planned."""
+    from lidar.simulation.flight_planning import FlightOptions  # noqa: PLC0415
+
+    seconds = options.duration
+    if seconds is None and options.route in ("", "random") and not options.survey:
+        seconds = _RANDOM_SECONDS
+    return FlightOptions(
+        survey=options.survey,
+        altitude=options.altitude,
+        overlap=options.overlap,
+        turns=options.turns,
+        seed=options.seed,
+        duration=seconds,
+        from_rest=options.from_rest,
+    )
+
+
+def _signals(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    motion: Trajectory | RoadMotion | Flight,
+    sensors: Sequence[Scanner | Camera],
+) -> SignalStates | None:
+    """What signal heads show: the plan that traffic obeys; None where no image shows them.
+
+    Traffic of SUMO has signals of its own, whose states are not known.
+    """
+    traffic = options.traffic
+    if not any(isinstance(sensor, Camera) and "rgb" in sensor.spec.images for sensor in sensors):
+        return None
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (not for drives without cameras)
+    from lidar.traffic.signal_heads import signal_states  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
+
+    if isinstance(traffic, SumoOptions | TrafficFile):
+        return None
+    road = isinstance(motion, RoadMotion)
+    fixed = None if road or (traffic is None and vehicle.kind == "air") else motion
+    return signal_states(
+        scene,
+        motion.plan.graph if isinstance(motion, RoadMotion) else None,
+        seed=options.seed,
+        side=options.side_in(scene),
+        vehicle=vehicle,
+        fixed=fixed.trajectory if isinstance(fixed, RoadMotion | Flight) else fixed,
+    )
+
+
+def _with_traffic(
+    scene: Scene,
+    options: DriveOptions,
+    *,
+    vehicle: Vehicle,
+    motion: Trajectory | RoadMotion | Flight,
+    progress: Progress,
+) -> tuple[Trajectory, Actors | None]:
+    """Trajectory of the ego vehicle among other road users, and these; None without traffic."""
+    trajectory = motion if isinstance(motion, Trajectory) else motion.trajectory
+    if options.traffic is None:
+        return trajectory, None
+    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (0.1 s)
+    from lidar.traffic.fcd_replay import replay  # noqa: PLC0415
+    from lidar.traffic.populate import populate  # noqa: PLC0415
+    from lidar.traffic.sumo import SumoOptions, drive_in_sumo  # noqa: PLC0415
+
+    progress("traffic", 0, total=0)
+    traffic = replace(options.traffic, side=options.side_in(scene))
+    graph = motion.plan.graph if isinstance(motion, RoadMotion) else scene.road_graph()
+    seed, road = options.seed, options.road_conditions()
+    if isinstance(traffic, TrafficFile):
+        return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
+    if isinstance(motion, RoadMotion):
+        simulate = drive_in_sumo if isinstance(traffic, SumoOptions) else drive_in_traffic
+        return simulate(
+            scene,
+            graph,
+            path=motion.plan.path,
+            vehicle=vehicle,
+            first=trajectory,
+            seed=seed,
+            options=traffic,
+            duration=motion.plan.duration,
+            at_speed=motion.plan.at_speed,
+            road=road,
+        )
+    if isinstance(traffic, SumoOptions):
+        raise InputError("`traffic`: SUMO needs a drive along a route on roads")
+    return trajectory, populate(
+        scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic, road=road
+    )

@@ -1,0 +1,175 @@
+"""A frame of a camera: its images as PNG, with the 2D bounding boxes of road users and signal heads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.classes import Class
+from geoscene.support.csv_tables import write_columns
+from lidar.geometry.poses import Poses
+from lidar.geometry.random_streams import generator
+from lidar.sensors.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
+from lidar.sensors.camera.render import Frame as Image
+from lidar.sensors.camera.render import exposure_times, optical_flow, render
+from lidar.sensors.camera.signal_lamps import Lamps
+from lidar.sensors.rig.devices import Camera
+from lidar.signal.run import altered_image, image_truth, write_truth
+from lidar.simulation.boxes import ImageBoxes, image_boxes
+from lidar.simulation.measured import MeasuredImages
+from lidar.simulation.recording import Recording
+from lidar.simulation.signals import lamps_at, signal_columns
+from lidar.simulation.situations import situation_of, sun_during
+from lidar.world.actors import Actors
+from lidar.world.thread_worlds import Worlds
+from lidar.world.world import World
+
+
+def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
+    """Render one frame and write its images and boxes."""
+    paths, watch = recording.paths(camera, frame), recording.watch
+    measured = measure_images(recording, camera, frame=frame, worlds=worlds)
+    if "boxes" in paths:
+        with watch.stage("boxes"):
+            write_columns(paths["boxes"], measured.boxes)
+    if "signals" in paths:
+        write_columns(paths["signals"], measured.signals)
+    if "truth" in paths:
+        write_truth(paths["truth"], measured.truth)
+    for kind in camera.spec.images:
+        with watch.stage(f"write {kind}"):
+            _write_image(paths[kind], measured, kind=kind)
+    return measured
+
+
+def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
+    """Render one frame."""
+    samples = recording.contents.camera.moments(camera.spec)
+    times = exposure_times(camera.spec, camera.frame_start_ns(frame), samples=samples)
+    rows = len(times) // samples
+    first = (samples // 2) * rows  # of the exposure's middle sample, whose depth and labels are kept
+    start = camera.frame_start_ns(frame)
+    span_ns = start, max(int(times[-1]), start + 1)
+    world = worlds.during(*span_ns)
+    middle = int(times[first + rows // 2])
+    pose = _poses(recording, camera, times=times[[first + rows // 2]])
+    shown = recording.signals
+    lamps = None if shown is None else lamps_at(shown, middle)
+    image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world, lamps=lamps)
+    boxes, truth = dict[str, NDArray[Any]](), dict[str, NDArray[Any]]()
+    signals = dict[str, NDArray[Any]]()
+    if shown is not None:
+        signals = signal_columns(shown, image, pose=pose, frame=frame, time_ns=middle)
+    if recording.actors is not None:
+        with recording.watch.stage("boxes"):
+            found = image_boxes(
+                recording.actors,
+                camera.spec,
+                pose=pose,
+                time_ns=middle,
+                instance=image.feature,
+                span_ns=(start, int(times[-1])),
+            )
+            boxes = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
+    if recording.has_stages(camera):
+        original = image
+        at = situation_of(recording, camera, frame=frame, world=world)
+        image = altered_image(image, recording.contents.stages, at=at)
+        truth = image_truth(image, original)
+    flow = None
+    if "flow" in camera.spec.images:
+        with recording.watch.stage("flow"):
+            flow = _flow(recording, camera, times=times[first : first + rows], worlds=worlds)
+    return MeasuredImages(
+        camera.name,
+        frame,
+        start,
+        camera.spec.mount,
+        recording.trajectory,
+        boxes,
+        truth,
+        camera=camera.spec,
+        image=image,
+        signals=signals,
+        flow=flow,
+    )
+
+
+def _rendered(
+    recording: Recording,
+    camera: Camera,
+    *,
+    frame: int,
+    times: NDArray[np.int64],
+    span_ns: tuple[int, int],
+    world: World,
+    lamps: Lamps | None,
+) -> Image:
+    """A frame of a camera; ``times`` are its exposure times, ``span_ns`` the times of the world's motion."""
+    contents, (start, end) = recording.contents, span_ns
+    with recording.watch.stage("render"):
+        return render(
+            camera.spec,
+            _poses(recording, camera, times=times),
+            world=world,
+            sun=sun_during(recording, start),
+            times=None if recording.actors is None else (times - start) / (end - start),
+            lamps=lamps,
+            random=generator(contents.seed, camera.name, frame, "image"),
+            options=contents.camera.options(camera.spec),
+        )
+
+
+def _write_image(path: Path, measured: MeasuredImages, *, kind: str) -> None:
+    image, flow = measured.image, measured.flow
+    if kind == "flow" and flow is not None:
+        write_png(path, flow_to_image(flow))
+    elif kind == "rgb" and image.rgb is not None:
+        write_png(path, image.rgb)
+    elif kind == "depth":
+        write_png(path, depth_to_counts(image.depth))
+    elif kind == "semantic":
+        write_png(path, image.klass)
+    elif kind == "instance":
+        write_png(path, feature_to_image(image.feature))
+
+
+def _box_columns(actors: Actors, found: ImageBoxes, *, frame: int, time_ns: int) -> dict[str, Any]:
+    """Columns of the 2D boxes of an image."""
+    sides = ("left", "top", "right", "bottom")
+    return {
+        "frame": np.full(len(found.row), frame),
+        "time_ns": np.full(len(found.row), time_ns),
+        "id": found.row,
+        "instance": actors.feature[found.row],
+        "class": np.array([Class(int(k)).name.lower() for k in actors.klass[found.row]], np.str_),
+        "kind": actors.kind[found.row],
+        **{side: np.round(found.box[:, k], 2) for k, side in enumerate(sides)},
+        **{f"seen_{side}": found.seen[:, k] for k, side in enumerate(sides)},
+        "pixels": found.pixels,
+        "visibility": np.round(found.visibility, 4),
+    }
+
+
+def _poses(recording: Recording, camera: Camera, *, times: NDArray[np.int64]) -> Poses:
+    """Poses of a camera at times (k,)."""
+    mount = camera.spec.mount
+    return recording.trajectory.at(times).mounted(mount.translation, mount.rotation)
+
+
+def _flow(
+    recording: Recording, camera: Camera, *, times: NDArray[np.int64], worlds: Worlds
+) -> NDArray[np.float32]:
+    """Optical flow to the next frame. It replaces this thread's world by one that spans both frames.
+
+    times : of the rows in this frame, one for all without a rolling shutter
+    """
+    later = times + camera.period_ns
+    start, end = int(times[0]), int(later[-1])
+    world = worlds.during(start, end)
+    shares = [(t - start) / (end - start) for t in (times, later)]
+    here, there = (_poses(recording, camera, times=t) for t in (times, later))
+    return optical_flow(camera.spec, here, later=there, world=world, times=shares[0], later_times=shares[1])

@@ -1,0 +1,134 @@
+"""Contents of a dataset, and the inputs that every frame is recorded from."""
+
+from __future__ import annotations
+
+import functools
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.geometry.frames import Frame
+from lidar.dataset.formats.las import LasInfo
+from lidar.dataset.journal import digests_of_files
+from lidar.dataset.layout import Paths
+from lidar.geometry.georeference import Georeference
+from lidar.geometry.poses import Trajectory
+from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.settings import Contents
+from lidar.signal.effects import Effects
+from lidar.world.actors import Actors
+from lidar.world.visibility import Visibility
+
+if TYPE_CHECKING:
+    from lidar.traffic.signal_heads import SignalStates
+
+
+class Stopwatch:
+    """Seconds by stage, summed over threads."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Add the time until the block ends to a stage."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.add({name: time.perf_counter() - began})
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add seconds by stage."""
+        with self._lock:
+            for name, spent in seconds.items():
+                self.seconds[name] = self.seconds.get(name, 0.0) + spent
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What frames are recorded from; shared by the threads of a drive.
+
+    out         : dataset directory
+    frame       : scene frame
+    trajectory  : of the ego vehicle
+    start       : UTC time of the drive's start
+    geo         : from the scene frame to the export CRS
+    contents    : which files are written
+    watch       : measures the time of each stage
+    effects     : counts what stages do
+    actors      : other road users; None without traffic, and then without boxes
+    signals     : what signal heads show; None without any, or where it is not known
+    max_range   : metres from the ego vehicle within which road users get 3D boxes
+    scanning_ns : (k, 2) times from and until which scanners work; None for always
+    """
+
+    out: Path
+    frame: Frame
+    trajectory: Trajectory
+    start: datetime
+    geo: Georeference
+    contents: Contents
+    watch: Stopwatch = field(default_factory=Stopwatch)
+    effects: Effects = field(default_factory=Effects)
+    actors: Actors | None = None
+    signals: SignalStates | None = None
+    max_range: float = 0.0
+    scanning_ns: NDArray[np.int64] | None = None
+
+    @functools.cached_property
+    def visibility(self) -> Visibility | None:
+        """How much of each road user can be seen; None without traffic."""
+        return None if self.actors is None else Visibility(self.actors)
+
+    @functools.cached_property
+    def las_info(self) -> LasInfo:
+        """What all LAS and LAZ files of the dataset share."""
+        return LasInfo(self.geo.crs, self.geo.offset, self.start)
+
+    def release(self) -> None:
+        """Let go of the memory of motion in files, see `lidar.geometry.poses.release`."""
+        self.trajectory.release()
+        if self.actors is not None:
+            self.actors.release()
+
+    def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
+        """Files of one frame.
+
+        By image, format, ``deskewed <format>``, ``labels <format>``, boxes, signals, truth.
+        """
+        name, paths = sensor.name, Paths(self.out)
+        files = {} if self.actors is None else {"boxes": paths.frame_boxes(name, frame)}
+        if self.has_stages(sensor):
+            files["truth"] = paths.truth(name, frame)
+        if isinstance(sensor, Camera):
+            if self.signals is not None:
+                files["signals"] = paths.frame_signals(name, frame)
+            return files | {kind: paths.image(name, frame, kind=kind) for kind in sensor.spec.images}
+        for form in self.contents.cloud_formats:
+            files[form.name] = form.path(paths.sensor(name), frame)
+            if self.contents.deskew and form.frame == "sensor":
+                files[f"deskewed {form.name}"] = paths.deskewed(name, frame, suffix=form.suffix)
+        for row in self.contents.label_formats:
+            files[f"labels {row.name}"] = row.path(paths.sensor(name), frame)
+        return files
+
+    def digests(self, sensor: Scanner | Camera, frame: int) -> bytes:
+        """SHA-256 of the files of a frame in the order of `paths`; empty if one is missing."""
+        return digests_of_files(self.paths(sensor, frame).values())
+
+    def has_stages(self, sensor: Scanner | Camera) -> bool:
+        """Whether stages act on a sensor's clouds or colour images."""
+        if isinstance(sensor, Camera) and "rgb" not in sensor.spec.images:
+            return False
+        kind = "camera" if isinstance(sensor, Camera) else "lidar"
+        return self.contents.stages.act_on(sensor.name, kind=kind)

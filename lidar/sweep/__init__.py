@@ -1,4 +1,0 @@
-"""Sweeps: grids of drives as one job."""
-
-from lidar.sweep.run import SweepSummary as SweepSummary
-from lidar.sweep.run import sweep as sweep

@@ -1,0 +1,374 @@
+"""Judges datasets by defences, scores the verdicts where there is truth, and writes both."""
+
+from __future__ import annotations
+
+import io
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.scene import Scene, open_scene
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import atomic_folder, write_atomically, write_json
+from geoscene.support.progress import Progress, silent
+from geoscene.typing import Float
+from lidar.dataset.derived import check_target
+from lidar.dataset.layout import Dataset
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.random_streams import generator
+from lidar.sensors.camera.png import write_png
+from lidar.tools.defences.calibration import Calibration, Joint, calibration_text, tail_of
+from lidar.tools.defences.fusion import FUSED, fused, fused_threshold, joint_of
+from lidar.tools.defences.observation import Observation
+from lidar.tools.defences.reading import Scans, read_scans
+from lidar.tools.defences.registry import NamedDefence
+from lidar.tools.defences.run import Judged, able, judged_frames
+from lidar.tools.defences.scores import FALSE_ALARMS, LEVELS, Samples, Score, score
+from lidar.tools.defences.truth import FrameTruth, attack_truth
+from lidar.tools.defences.verdict import Verdict
+from lidar.tools.detection import RULES, Detector
+
+_MARK = "defend.json"
+"""File of a directory of verdicts: the scores."""
+
+_NAMES = rf"{_MARK}|(frames|objects)\.csv|[^/]+/[^/]+/(\d{{6,}}\.npz|\w+/\d{{6,}}_[^/]+\.png)"
+"""Regular expression of the paths of the files of verdicts."""
+
+_Pairs = list[tuple[Float, NDArray[np.bool_]]]
+
+
+@dataclass
+class Tally:
+    """Suspicions and truth of all frames, by defence and level, and the seconds of each frame."""
+
+    pairs: dict[tuple[str, str], _Pairs] = field(default_factory=lambda: defaultdict(list))
+    seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    frames: int = 0
+
+    def add(self, judged: Judged, truth: FrameTruth) -> None:
+        """Add a frame."""
+        self.frames += 1
+        forged = truth.objects(judged.frame.members)
+        for name, verdict in judged.verdicts.items():
+            if verdict.returns is not None:
+                self.pairs[name, "returns"].append((verdict.returns, truth.returns))
+            if verdict.objects is not None:
+                self.pairs[name, "objects"].append((verdict.objects, forged))
+            self.pairs[name, "frames"].append((np.array([verdict.frame]), np.array([truth.attacked])))
+        for name, seconds in judged.seconds.items():
+            self.seconds[name].append(seconds)
+
+    def samples(self) -> dict[tuple[str, str], Samples]:
+        """Samples by defence and level."""
+        return {key: Samples.of(pairs) for key, pairs in self.pairs.items()}
+
+    def joint(self, calibration: Calibration, *, rng: np.random.Generator) -> dict[str, Joint]:
+        """Suspicions of the same samples by all defences, by level."""
+        found = {}
+        for level in LEVELS:
+            columns = {name: pairs for (name, of), pairs in self.pairs.items() if of == level}
+            if any(len(column) for pairs in columns.values() for column, _ in pairs):
+                frames = ({name: pairs[k][0] for name, pairs in columns.items()} for k in range(self.frames))
+                found[level] = joint_of(frames, calibration, level=level, rng=rng)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Defended:
+    """What defences say of datasets.
+
+    frames  : frames that were judged
+    scores  : by defence and level
+    seconds : median time of a frame, by defence
+    """
+
+    frames: int
+    scores: dict[tuple[str, str], Score]
+    seconds: dict[str, float]
+
+    def document(self) -> dict[str, Any]:
+        """The scores as JSON."""
+        rows: dict[str, Any] = {}
+        for (name, level), found in self.scores.items():
+            rows.setdefault(name, {"seconds_per_frame": self.seconds.get(name)})[level] = found.to_json()
+        return {"frames": self.frames, "false_alarms": FALSE_ALARMS, "defences": rows}
+
+
+def defend(
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    calibration: Calibration,
+    detector: Detector = RULES,
+    rule: str = "",
+    scene: Scene | None = None,
+    out: Path | None = None,
+    overwrite: bool = False,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Defended:
+    """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
+
+    calibration : of the same detector
+    detector  : that gives the boxes
+    rule      : of `fusion.FUSIONS`, by which verdicts of several are also fused; none if empty
+    overwrite : replace a directory with former verdicts; other files there are kept
+
+    Raises InputError if the data lack what a defence needs, before anything is judged.
+    """
+    calibration.check(detector)
+    for dataset in datasets:
+        if out is not None:
+            check_target(out, source=dataset.path, overwrite=overwrite)
+    with nullcontext() if out is None else atomic_folder(out, mark=_MARK, names=_NAMES) as part:
+        return _defended(
+            datasets,
+            defences,
+            calibration=calibration,
+            detector=detector,
+            rule=rule,
+            scene=scene,
+            out=part,
+            seed=seed,
+            progress=progress,
+        )
+
+
+def _defended(
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    calibration: Calibration,
+    detector: Detector,
+    rule: str,
+    scene: Scene | None,
+    out: Path | None,
+    seed: int,
+    progress: Progress,
+) -> Defended:
+    job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+    defences = job.defences
+    rule = rule if len(defences) > 1 else ""
+    for named in defences:
+        calibration.tail(named.name, "frames")
+    thresholds = {
+        (n.name, level): calibration.threshold(n.name, level)
+        for n in defences
+        for level in LEVELS
+        if (n.name, level) in calibration.tails
+    }
+    if rule:
+        names = [named.name for named in defences]
+        thresholds |= {
+            (FUSED, level): fused_threshold(calibration, names, level=level, rule=rule) for level in LEVELS
+        }
+    tally, tables = Tally(), _Tables()
+    for place, scans, judged in job.judged(progress):
+        if rule:
+            judged.verdicts[FUSED] = fused(dict(judged.verdicts), calibration, rule=rule)
+        frame = judged.frame
+        truth = _truth_of(scans, frame)
+        tally.add(judged, truth)
+        if out is not None:
+            tables.add(place, judged, truth=truth, thresholds=thresholds)
+            _write_returns(out / place / f"{frame.number:06d}.npz", judged.verdicts)
+            _write_pictures(out / place, judged, defences=defences, thresholds=thresholds)
+    rng = generator(seed, "bootstrap")
+    found = Defended(
+        tally.frames,
+        {key: score(samples, threshold=thresholds[key], rng=rng) for key, samples in tally.samples().items()},
+        {name: float(np.median(seconds)) for name, seconds in tally.seconds.items()},
+    )
+    if out is not None:
+        tables.write(out)
+        extra: dict[str, Any] = {"datasets": [str(d.path) for d in datasets], "fusion": rule}
+        extra |= {"calibration": calibration.note}
+        extra |= {"detector": {"name": detector.name, "identity": detector.identity}}
+        write_json(out / _MARK, found.document() | extra | {"options": [n.to_json() for n in defences]})
+    return found
+
+
+def score_rows(found: Defended) -> list[list[str]]:
+    """A table of scores as texts, with a head."""
+    rows = [
+        ["defence", "of", "genuine", "attacked", "threshold", "false alarms", "detected", "AUC", "ms/frame"]
+    ]
+    for (name, level), one in found.scores.items():
+        ms = f"{1000 * found.seconds[name]:.1f}" if name in found.seconds else ""
+        shares = [_with_interval(values) for values in (one.fpr, one.tpr, one.auc)]
+        rows.append(
+            [name, level, f"{one.genuine:,}", f"{one.attacked:,}", f"{one.threshold:.3f}", *shares, ms]
+        )
+    return rows
+
+
+def _with_interval(values: tuple[float, float, float]) -> str:
+    value, low, high = values
+    if np.isnan(value):
+        return "-"
+    return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
+
+
+def calibrate(
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    out: Path,
+    detector: Detector = RULES,
+    scene: Scene | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Calibration:
+    """Write the calibration of defences on datasets without attacks to a TOML file.
+
+    Raises DatasetError if a frame was attacked.
+    """
+    job, tally, names = _job(datasets, defences, scene=scene, seed=seed, detector=detector), Tally(), []
+    for _, scans, judged in job.judged(progress):
+        frame = judged.frame
+        truth = _truth_of(scans, frame)
+        if truth.attacked:
+            raise DatasetError(f"{scans.dataset.path}: was attacked; calibrate on genuine data")
+        tally.add(judged, truth)
+        names.append(f"{scans.dataset.path.name} ({scans.sensor.model})")
+    note = f"{tally.frames} frames of {', '.join(dict.fromkeys(names))}"
+    found = Calibration({key: tail_of(samples) for key, samples in tally.samples().items()}, note)
+    joint = tally.joint(found, rng=generator(seed, "calibration"))
+    found = replace(found, joint=joint, detector=detector.identity)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(out, calibration_text(found).encode())
+    return found
+
+
+@dataclass(frozen=True)
+class Job:
+    """Frames to judge: scanners of datasets with the folder of their files, and the defences they allow."""
+
+    scans: tuple[tuple[Path, Scans], ...]
+    defences: tuple[NamedDefence, ...]
+    scene: Scene | None
+    seed: int
+
+    def judged(self, progress: Progress) -> Iterator[tuple[Path, Scans, Judged]]:
+        """The frames in order."""
+        for place, scans in self.scans:
+            scene = self.scene_of(scans.dataset)
+            for one in judged_frames(scans, self.defences, scene=scene, seed=self.seed, progress=progress):
+                yield place, scans, one
+
+    def scene_of(self, dataset: Dataset) -> Scene | None:
+        """The scene that a dataset is compared with; None if no defence needs one."""
+        if not any("scene" in named.defence.needs for named in self.defences):
+            return None
+        return open_scene(dataset.scene_path) if self.scene is None else self.scene
+
+
+def _job(
+    datasets: Sequence[Dataset],
+    defences: Sequence[NamedDefence],
+    *,
+    scene: Scene | None,
+    seed: int,
+    detector: Detector,
+) -> Job:
+    """The frames of all scanners of datasets; raises InputError as `able` does."""
+    scans = []
+    for k, dataset in enumerate(datasets):
+        name = dataset.path.name if len(datasets) == 1 else f"{k}_{dataset.path.name}"
+        scans += [(Path(name) / each.sensor.name, each) for each in read_scans(dataset, detector=detector)]
+    job = Job(tuple(scans), tuple(able([each for _, each in scans], defences, scene=scene)), scene, seed)
+    for _, each in scans:
+        if (seen := job.scene_of(each.dataset)) is not None and seen.frame != each.dataset.frame:
+            raise InputError(
+                f"{seen.path}: is in another frame (CRS and origin) than {each.dataset.path};"
+                " give the scene that was driven in, or one in its frame"
+            )
+    return job
+
+
+def _truth_of(scans: Scans, frame: Observation) -> FrameTruth:
+    """What attacks did to a frame."""
+    seconds = frame.start_ns * 1e-9
+    name, count = scans.sensor.name, len(frame)
+    return attack_truth(scans.dataset, name, frame=frame.number, count=count, seconds=seconds)
+
+
+def _write_returns(path: Path, verdicts: dict[str, Verdict]) -> None:
+    """Suspicions of the returns of a frame by defence, and places of missing ones, as a NumPy archive."""
+    columns: dict[str, NDArray[Any]] = {}
+    for name, verdict in verdicts.items():
+        if verdict.returns is not None:
+            columns[name] = verdict.returns.astype(np.float32)
+        if len(verdict.gaps):
+            gaps = verdict.gaps
+            columns[f"{name}_gaps"] = np.column_stack([gaps.xy, gaps.radius, gaps.suspicion]).astype(
+                np.float32
+            )
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **columns)  # type: ignore[arg-type]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, buffer.getvalue())
+
+
+def _write_pictures(
+    folder: Path,
+    judged: Judged,
+    *,
+    defences: Sequence[NamedDefence],
+    thresholds: dict[tuple[str, str], float],
+) -> None:
+    for named in defences:
+        threshold = thresholds.get((named.name, "objects"), 1.0)
+        shown = named.defence.pictures(judged.frame, judged.verdicts[named.name], threshold=threshold)
+        for name, image in shown.items():
+            path = folder / named.name / f"{judged.frame.number:06d}_{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_png(path, image)
+
+
+class _Tables:
+    """Rows of ``frames.csv`` and ``objects.csv``."""
+
+    def __init__(self) -> None:
+        self.frames: list[dict[str, Any]] = []
+        self.objects: list[dict[str, Any]] = []
+
+    def add(
+        self, place: Path, judged: Judged, *, truth: FrameTruth, thresholds: dict[tuple[str, str], float]
+    ) -> None:
+        """Add a frame."""
+        frame, boxes = judged.frame, judged.frame.objects
+        forged = truth.objects(frame.members)
+        for name, verdict in judged.verdicts.items():
+            known = {"data": str(place), "frame": frame.number, "defence": name}
+            self.frames.append(
+                known
+                | {
+                    "suspicion": round(verdict.frame, 5),
+                    "alarm": int(verdict.frame > thresholds[name, "frames"]),
+                    "attacked": int(truth.attacked),
+                    "attacked_returns": int(truth.returns.sum()),
+                    "removed_returns": len(truth.removed_xyz),
+                }
+            )
+            for k, suspicion in enumerate(() if verdict.objects is None else verdict.objects):
+                box = dict(zip(("x", "y", "z"), boxes.centre[k].round(3).tolist(), strict=True))
+                box |= dict(zip(("length", "width", "height"), boxes.size[k].round(3).tolist(), strict=True))
+                alarm = int(suspicion > thresholds[name, "objects"])
+                self.objects.append(
+                    known
+                    | {"object": k, **box, "yaw": round(float(boxes.yaw[k]), 4), "kind": str(boxes.kind[k])}
+                    | {"suspicion": round(float(suspicion), 5), "alarm": alarm, "forged": int(forged[k])}
+                )
+
+    def write(self, out: Path) -> None:
+        """Write the tables that have rows."""
+        for name, rows in (("frames", self.frames), ("objects", self.objects)):
+            if rows:
+                write_columns(out / f"{name}.csv", {key: [row[key] for row in rows] for key in rows[0]})

@@ -1,0 +1,148 @@
+"""Errors of poses: absolute, relative over frames and metres, and KITTI's over segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from geoscene.support.columns import Columns
+from geoscene.typing import Float, Ints
+from lidar.geometry.attitude import quat_from_matrix
+from lidar.tools.evaluation.matching import Pairs
+
+KITTI_LENGTHS = tuple(range(100, 900, 100))
+"""Metres of the segments of KITTI's odometry benchmark."""
+
+SHORT_LENGTHS = tuple(range(10, 90, 10))
+"""Metres of segments of ways too short for it."""
+
+KITTI_STEP = 10
+"""Poses from the start of a segment to that of the next in KITTI's benchmark; 1 for short segments."""
+
+_TOLERANCE = 0.1
+"""Share by which the length of a pair of poses may differ from the one that is asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Relative(Columns):
+    """Errors of motion between pairs of poses.
+
+    first, last : (k,) rows of the poses
+    shift       : (k,) metres, length of the error's translation
+    turn        : (k,) radians of its rotation
+    """
+
+    first: Ints
+    last: Ints
+    shift: Float
+    turn: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Segments(Columns):
+    """Errors of KITTI's benchmark, a row a segment.
+
+    first    : (k,) row of its first pose
+    length   : (k,) metres
+    shift    : (k,) share of the length, error of the translation
+    turn     : (k,) radians per metre
+    speed    : (k,) m/s; NaN without times
+    """
+
+    first: Ints
+    length: Float
+    shift: Float
+    turn: Float
+    speed: Float
+
+
+def angles(rotation: Float) -> Float:
+    """Angles (n,) of rotations (n, 3, 3), radians."""
+    quat = quat_from_matrix(rotation)
+    return np.asarray(2 * np.arctan2(np.linalg.norm(quat[:, :3], axis=1), np.abs(quat[:, 3])), float)
+
+
+def absolute(pairs: Pairs) -> tuple[Float, Float]:
+    """Distances (n,) in metres and angles (n,) in radians between the poses of each pair."""
+    off = pairs.estimate.position - pairs.truth.position
+    turn = pairs.truth.rotation.swapaxes(1, 2) @ pairs.estimate.rotation
+    return np.linalg.norm(off, axis=1), angles(turn)
+
+
+def by_axis(pairs: Pairs) -> tuple[Float, Float]:
+    """Errors (n, 3) forward, left and up, metres, and roll, pitch and yaw (n, 3), radians, in true axes."""
+    back = pairs.truth.rotation.swapaxes(1, 2)
+    off = np.einsum("nij,nj->ni", back, pairs.estimate.position - pairs.truth.position)
+    turn = back @ pairs.estimate.rotation
+    roll = np.arctan2(turn[:, 2, 1], turn[:, 2, 2])
+    pitch = np.arcsin(np.clip(-turn[:, 2, 0], -1, 1))
+    yaw = np.arctan2(turn[:, 1, 0], turn[:, 0, 0])
+    return off, np.column_stack([roll, pitch, yaw])
+
+
+def over_frames(pairs: Pairs, count: int) -> Relative:
+    """Relative errors of all pairs of poses that are a number of poses apart (Sturm et al. 2012)."""
+    first = np.arange(max(len(pairs) - count, 0))
+    return _relative(pairs, first=first, last=first + count)
+
+
+def over_metres(pairs: Pairs, length: float) -> Relative:
+    """Relative errors from each pose to that whose true way from it is nearest to a length.
+
+    Pairs whose way differs by more than a tenth of the length are left out.
+    """
+    way = pairs.truth.distance()
+    first = np.arange(len(way) - 1)
+    after = np.searchsorted(way, way[first] + length)
+    before = np.searchsorted(way, way[np.maximum(after - 1, 0)])  # of poses at rest the first
+    ends = np.stack([np.clip(row, first + 1, len(way) - 1) for row in (before, after)])
+    off = np.abs(way[ends] - way[first] - length)
+    best = off.argmin(axis=0)
+    last, off = ends[best, first], off[best, first]
+    good = off <= _TOLERANCE * length
+    return _relative(pairs, first=first[good], last=last[good])
+
+
+def _relative(pairs: Pairs, *, first: Ints, last: Ints) -> Relative:
+    """Errors of the motion between rows of pairs."""
+    true = _motion(pairs.truth.position, pairs.truth.rotation, first=first, last=last)
+    found = _motion(pairs.estimate.position, pairs.estimate.rotation, first=first, last=last)
+    off = np.linalg.norm(found[0] - true[0], axis=1)
+    return Relative(first, last, off, angles(true[1].swapaxes(1, 2) @ found[1]))
+
+
+def _motion(position: Float, rotation: Float, *, first: Ints, last: Ints) -> tuple[Float, Float]:
+    """Translations (k, 3) and rotations (k, 3, 3) from poses to others, in the frames of the first."""
+    back = rotation[first].swapaxes(1, 2)
+    return np.einsum("nij,nj->ni", back, position[last] - position[first]), back @ rotation[last]
+
+
+def lengths_for(way: float) -> tuple[int, ...]:
+    """Lengths of segments for a way: those of KITTI that fit if two do, else the short ones that fit."""
+    kitti = tuple(length for length in KITTI_LENGTHS if length < way)
+    return kitti if len(kitti) > 1 else tuple(length for length in SHORT_LENGTHS if length < way)
+
+
+def segments(pairs: Pairs, lengths: tuple[int, ...]) -> Segments:
+    """Errors of segments of the true way, as KITTI's development kit computes them (Geiger et al. 2012).
+
+    A segment ends at the first pose whose way is longer than its length; errors are per metre of it. Speeds
+    are those of the true way.
+    """
+    way, n = pairs.truth.distance(), len(pairs)
+    step = KITTI_STEP if lengths[:1] and lengths[0] >= KITTI_LENGTHS[0] else 1
+    starts = np.arange(0, n, step)
+    parts = []
+    for length in lengths:
+        last = np.searchsorted(way, way[starts] + length, side="right")
+        first, last = starts[last < n], last[last < n]
+        found = _relative(pairs, first=first, last=last)
+        lasted = (pairs.truth.time_ns[last] - pairs.truth.time_ns[first]) * 1e-9
+        speed = length / lasted if pairs.truth.timed else np.full(len(first), np.nan)
+        size = np.full(len(first), float(length))
+        parts.append(Segments(first, size, found.shift / length, found.turn / length, speed))
+    if not parts:
+        return Segments(np.empty(0, np.int64), *(np.empty(0),) * 4)
+    joined = Segments.concatenate(parts)
+    return joined.take(np.lexsort((joined.length, joined.first)))

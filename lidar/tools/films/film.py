@@ -1,0 +1,209 @@
+"""Films of recorded drives: which pictures, where in the frame, and when."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from geoscene.support.files import atomic_path
+from geoscene.support.progress import Progress, silent
+from geoscene.typing import Ints
+from lidar.dataset.layout import Dataset
+from lidar.dataset.recorded import Images, Stream, frames_within, images_of, scanner_clouds
+from lidar.errors import DatasetError, InputError
+from lidar.geometry.poses import Trajectory
+from lidar.motion.vehicle import Vehicle, load_vehicle
+from lidar.options import FilmOptions
+from lidar.tools.films.encode import SHORTEST_NS, check_film, write_film
+from lidar.tools.films.panes import TEXT, CameraPane, MapPane, Pane, Pixels, SweepPane, Sweeps
+from lidar.tools.maps.picture import BACKGROUND
+
+Placed = list[tuple[Pane, tuple[int, int]]]
+
+_STATUS = 28
+"""Height in pixels of the line of text below the pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class FilmSummary:
+    """Figures of a film.
+
+    path     : the file
+    images   : number of its images
+    seconds  : its length
+    size     : width and height, pixels
+    shown    : what it shows
+    notes    : what of the dataset it does not show
+    """
+
+    path: Path
+    images: int
+    seconds: float
+    size: tuple[int, int]
+    shown: list[str]
+    notes: list[str]
+
+
+def film(
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    options: FilmOptions = FilmOptions(),
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> FilmSummary:
+    """Write a film of a dataset as MP4 or GIF, by the suffix of ``out``.
+
+    Raises InputError for what cannot be shown, DatasetError for a dataset without it, and MissingExtraError
+    for an MP4 without PyAV.
+    """
+    out = Path(out)
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    check_film(out)
+    clouds, cameras = _chosen(dataset, options)
+    lead = frames_within(clouds[0] if clouds else cameras[0].stream, options.limits, every=options.every)
+    lead, notes = _slow_enough(lead, speed=options.speed, shortest_ns=SHORTEST_NS[out.suffix.lower()])
+    shown_ns = _shown_ns(lead, speed=options.speed)
+    names = [*(one.name for one in clouds), *(one.stream.name for one in cameras)]
+    kinds = {"cameras": ("camera",), "all": ("lidar", "camera")}.get(options.show, ("lidar",))
+    if left := [name for name in dataset.sensors(*kinds) if name not in names]:
+        notes.append(f"sensors left out: {', '.join(left)} (name them by `sensors`)")
+    trajectory = dataset.trajectory()
+    sweeps = None
+    if clouds:
+        sweeps = Sweeps(dataset, [lead, *clouds[1:]], trajectory=trajectory, options=options)
+    panes = _laid_out(dataset, sweeps, cameras=cameras, time_ns=lead.time_ns, options=options)
+
+    def images() -> Iterator[Pixels]:
+        for row in range(len(lead.frames)):
+            progress("drawing", row, total=len(lead.frames))
+            picture = Image.new("RGB", options.size, BACKGROUND)
+            for pane, corner in panes:
+                picture.paste(Image.fromarray(pane.draw(row)), corner)
+            _write_status(picture, dataset, lead=lead, row=row, trajectory=trajectory)
+            yield np.asarray(picture)
+
+    with atomic_path(out, keep_suffix=True) as part:
+        write_film(part, images(), shown_ns=shown_ns, size=options.size)
+    seconds = float(shown_ns.sum()) / 1e9
+    return FilmSummary(out, len(lead.frames), seconds, options.size, names, notes)
+
+
+def _chosen(dataset: Dataset, options: FilmOptions) -> tuple[list[Stream], list[Images]]:
+    """Clouds of the scanners and images of the cameras to show.
+
+    Raises InputError for unknown sensors and those that cannot be shown, and DatasetError if there are none.
+    """
+    kinds = {name: sensor["kind"] for name, sensor in dataset.sensors("lidar", "camera").items()}
+    if unknown := sorted(set(options.sensors) - set(kinds)):
+        raise InputError(
+            f"`sensors`: no scanner or camera {', '.join(unknown)} in {dataset.path}; there are"
+            f" {', '.join(kinds)}"
+        )
+    named = {kind: [name for name in options.sensors if kinds[name] == kind] for kind in ("lidar", "camera")}
+    clouds: list[Stream] = []
+    cameras: list[Images] = []
+    if options.show != "cameras":
+        clouds = [scanner_clouds(dataset, name) for name in named["lidar"] or [""]]
+    if options.show in ("cameras", "all"):
+        names = named["camera"] or [name for name, kind in kinds.items() if kind == "camera"]
+        cameras = [found for name in names if (found := images_of(dataset, name)) is not None]
+        if not cameras and (options.show == "cameras" or named["camera"]):
+            which = ", ".join(named["camera"]) or "any camera"
+            raise DatasetError(f"{dataset.path}: no colour or depth images of {which}")
+    return clouds, cameras
+
+
+def _slow_enough(lead: Stream, *, speed: float, shortest_ns: int) -> tuple[Stream, list[str]]:
+    """The frames that a viewer can show, and a note if these are not all."""
+    if len(lead.frames) < 2:
+        return lead, []
+    step = math.ceil(shortest_ns * speed / float(np.median(np.diff(lead.time_ns))) - 1e-6)
+    if step <= 1:
+        return lead, []
+    note = f"each {_nth(step)} frame only: at this speed all would be {step} times too many a second"
+    return frames_within(lead, (0, math.inf), every=step), [note]
+
+
+def _nth(number: int) -> str:
+    return f"{number}{ {2: 'nd', 3: 'rd'}.get(number, 'th') }"
+
+
+def _shown_ns(lead: Stream, *, speed: float) -> Ints:
+    """Nanoseconds (n,) for which each frame is shown: until the next one."""
+    period = 1e9 / float(lead.sensor["rate_hz"])
+    steps = np.diff(lead.time_ns)
+    last = float(np.median(steps)) if len(steps) else period
+    found: Ints = np.rint(np.append(steps, last) / speed).astype(np.int64)
+    return found
+
+
+def _laid_out(
+    dataset: Dataset,
+    sweeps: Sweeps | None,
+    *,
+    cameras: list[Images],
+    time_ns: Ints,
+    options: FilmOptions,
+) -> Placed:
+    """The panes and their upper left corners."""
+    width, height = options.size[0], options.size[1] - _STATUS
+
+    def images(size: tuple[int, int], columns: int) -> Pane:
+        return CameraPane(dataset, cameras, time_ns=time_ns, size=size, columns=columns)
+
+    def sweep(size: tuple[int, int]) -> Pane:
+        assert sweeps is not None  # noqa: S101
+        return SweepPane(sweeps, view=options.view, size=size, vehicle=_vehicle(dataset))
+
+    if sweeps is None:
+        return [(images((width, height), math.ceil(math.sqrt(len(cameras)))), (0, 0))]
+    if options.show == "sweep":
+        return [(sweep((width, height)), (0, 0))]
+    if options.show == "map":
+        return [(MapPane(sweeps, size=(width, height), legend=True), (0, 0))]
+    left = round(0.62 * width)
+    if len(cameras) in (1, 2):  # above the map
+        upper = height // 2
+        beside = images((width - left, upper), 1)
+        below = MapPane(sweeps, size=(width - left, height - upper), legend=False)
+        return [(sweep((left, height)), (0, 0)), (beside, (left, 0)), (below, (left, upper))]
+    upper = height
+    if cameras:  # in a row below
+        sensor = cameras[0].stream.sensor
+        upper -= round(min(width / len(cameras) * sensor["height"] / sensor["width"], 0.4 * height))
+    beside = MapPane(sweeps, size=(width - left, upper), legend=False)
+    panes: Placed = [(sweep((left, upper)), (0, 0)), (beside, (left, 0))]
+    if cameras:
+        panes.append((images((width, height - upper), len(cameras)), (0, upper)))
+    return panes
+
+
+def _vehicle(dataset: Dataset) -> Vehicle | None:
+    """The vehicle of a drive; None if its file is not here."""
+    with suppress(InputError, OSError):
+        return load_vehicle(str(dataset.manifest["recipe"].get("vehicle", "")))
+    return None
+
+
+def _write_status(
+    picture: Image.Image, dataset: Dataset, *, lead: Stream, row: int, trajectory: Trajectory
+) -> None:
+    """Write the time, the frame and the speed below the panes."""
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
+    seconds, at = lead.time_ns[row] / 1e9, lead.time_ns[row : row + 1]
+    steps = trajectory.time_ns.astype(float)
+    speed = float(np.linalg.norm([np.interp(at[0], steps, trajectory.velocity[:, k]) for k in range(3)]))
+    middle = picture.height - _STATUS / 2
+    fast = f"{speed:.1f} m/s ({3.6 * speed:.0f} km/h)"
+    words = f"{seconds:7.2f} s    {lead.name} frame {lead.frames[row]}    {fast}"
+    pen.text((10, middle), words, fill=TEXT, font=font, anchor="lm")
+    name = dataset.path.resolve().name
+    pen.text((picture.width - 10, middle), name, fill=TEXT, font=font, anchor="rm")

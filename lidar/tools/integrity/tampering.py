@@ -1,0 +1,235 @@
+"""Where a cloud's watermark is broken: returns that were added or moved, and gaps of removed ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.typing import Float, Ints
+from lidar.tools.integrity.blocks import SECTORS, BlockTest, block_of, block_test
+from lidar.tools.integrity.linkage import joined, linked_clusters
+from lidar.tools.integrity.watermark import CHAINED, Cells, Decoded, Watermark, earlier
+
+NOISE = 0.001
+"""Default standard deviation in metres of noise since the watermark was embedded, such as of rounding."""
+
+_FINEST = 2e-4
+"""Metres of noise that is always allowed for: float32 and text with 4 decimals."""
+
+_OFF = 5.0
+"""Standard deviations from the lattice from which a coordinate counts as wrong."""
+
+_LINK = 1.0
+"""Metres between returns of the same place."""
+
+_TURN, _DEPTH = 1.0, 3.0
+"""Degrees and metres of range between returns of neighbouring beams of the same place."""
+
+_FEWEST = 3
+"""Returns of a place; fewer are left to the blocks' counts."""
+
+_NEIGHBOURS = 6
+"""Returns, with itself, that decide together whether one is genuine where noise is strong."""
+
+_ABSENT = 0.4
+"""Share of wrong bits from which a cloud has no watermark; without one it is a half."""
+
+_WIDEST = 170.0
+"""Degrees of a gap that is filled with the directions of removed returns."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where returns were added, moved or removed.
+
+    kind    : ``added or moved``, or ``removed``; a moved cluster is both, at its two places
+    low, high : (3,) corners of the box in the sensor frame, metres; of removed returns in the directions of
+              the gap, at the range of the returns beside it
+    returns : number of returns, for a gap that of the pulses in it
+    rings   : lowest and highest
+    """
+
+    kind: str
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    returns: int
+    rings: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FrameVerdict:
+    """What a watermark says of a frame.
+
+    bits, wrong : of all returns
+    blocks      : the test of each block
+    forged      : (n,) bool, returns that do not bear the watermark, in tampered blocks and beside them
+    places      : boxes of those, and of gaps
+    suspicion   : (n,) 0 to 1, probability that a return is forged, if half of all were
+    """
+
+    bits: int
+    wrong: int
+    blocks: BlockTest
+    forged: NDArray[np.bool_]
+    places: tuple[Place, ...]
+    suspicion: Float
+
+    @property
+    def absent(self) -> bool:
+        """Whether the cloud has no watermark of this key, sensor and frame; it has no places then."""
+        return self.wrong > _ABSENT * self.bits
+
+
+def frame_verdict(
+    watermark: Watermark,
+    xyz: NDArray[np.floating],
+    *,
+    cells: Cells,
+    noise: float = NOISE,
+    false_alarms: float = 0.01,
+) -> FrameVerdict:
+    """The verdict on a frame.
+
+    xyz          : (n, 3) coordinates in the sensor frame
+    noise        : standard deviation in metres that coordinates got since the watermark was embedded
+    false_alarms : blocks a frame that may be reported without tampering
+    """
+    decoded = watermark.decoded(xyz, cells)
+    within = _OFF * max(noise, _FINEST)
+    rate = watermark.error_rate(max(noise, _FINEST), within=within)
+    block, bad = block_of(xyz, cells.ring), decoded.wrong | (np.abs(decoded.off) > within)
+    test = block_test(block, bad, error_rate=rate, false_alarms=false_alarms)
+    evidence = _evidence(watermark, decoded, noise=noise)
+    bits, wrong = decoded.wrong.size, int(decoded.wrong.sum())
+    suspicion = 1 / (1 + np.exp(-np.clip(evidence, -50, 50)))
+    if wrong > _ABSENT * bits:
+        return FrameVerdict(bits, wrong, test, np.ones(len(xyz), bool), (), suspicion)
+    near = np.isin(block, _with_neighbours(test.tampered))
+    noisy = noise > watermark.step / 40
+    forged = _forged(evidence, xyz, among=near, noisy=noisy)
+    places = _places("added or moved", xyz[forged], ring=cells.ring[forged])
+    if near.any():
+        places += _gaps(watermark, xyz[~forged], cells=cells.where(~forged), near=near[~forged], noisy=noisy)
+    return FrameVerdict(bits, wrong, test, forged, places, suspicion)
+
+
+def _evidence(watermark: Watermark, decoded: Decoded, *, noise: float) -> Float:
+    """Logarithm (n,) of how much likelier the coordinates of a return are if it is forged than if genuine."""
+    half, sigma = watermark.step / 2, max(noise, _FINEST)
+    wraps = np.arange(-2, 3)[:, None, None] * half
+    density = np.exp(-0.5 * ((decoded.off + wraps) / sigma) ** 2).sum(axis=0) / (np.sqrt(2 * np.pi) * sigma)
+    floor = 1e-12
+    found: Float = -np.log(np.maximum(density * half, floor)).sum(axis=1)
+    return found
+
+
+def _forged(
+    evidence: Float, xyz: NDArray[np.floating], *, among: NDArray[np.bool_], noisy: bool
+) -> NDArray[np.bool_]:
+    """Returns (n,) that are forged: by their own evidence, or that of most of their neighbours.
+
+    noisy : where noise is strong, the evidence of a return and its neighbours is summed instead
+    """
+    if not among.any():
+        return among
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (0.2 s)
+
+    rows = np.flatnonzero(among)
+    nearest = cKDTree(xyz[rows]).query(xyz[rows], k=min(_NEIGHBOURS, len(rows)))[1].reshape(len(rows), -1)
+    own = evidence[rows]
+    out = np.zeros(len(evidence), bool)
+    out[rows] = own[nearest].sum(axis=1) > 0 if noisy else (own > 0) | ((own[nearest] > 0).mean(axis=1) > 0.6)
+    return out
+
+
+def _with_neighbours(blocks: Ints) -> Ints:
+    """Blocks and those beside them: a ring below and above, a sector to the left and right."""
+    ring, sector = np.divmod(blocks, SECTORS)
+    around = [(ring + up) * SECTORS + (sector + left) % SECTORS for up in (-1, 0, 1) for left in (-1, 0, 1)]
+    return np.unique(np.concatenate(around))
+
+
+def _gaps(
+    watermark: Watermark,
+    xyz: NDArray[np.floating],
+    *,
+    cells: Cells,
+    near: NDArray[np.bool_],
+    noisy: bool,
+) -> tuple[Place, ...]:
+    """Places of removed returns: after a gap, the next returns do not fit those before them."""
+    if not len(xyz):
+        return ()
+    order = cells.order()
+    ring, column, points = cells.ring[order], cells.column[order].astype(np.int64), xyz[order]
+    broken = watermark.decoded(xyz, cells).wrong.sum(axis=1)[order]
+    before = earlier(ring, 1)
+    after = np.empty_like(before)
+    after[before] = np.arange(len(before))
+    following = broken + broken[after] + broken[after[after]]
+    begins = (broken >= 1) & (following >= (2 if noisy else 1)) & near[order]
+    begins &= ~(begins[before] | begins[before[before]])  # those after the first are of the same gap
+    missing = np.maximum((column - column[before]) % (int(column.max()) + 1) - 1, 0)  # 0 of the same pulse
+    row = np.flatnonzero(begins)
+    for _ in range(CHAINED - 1):  # one time in eight the first return after a gap fits by chance
+        row = np.unique(np.where(missing[row] == 0, before[row], row))
+    fill, gap = _between(points[before[row]], points[row], count=missing[row])
+    return _places("removed", fill, ring=ring[row[gap]])
+
+
+def _between(first: NDArray[np.floating], last: NDArray[np.floating], *, count: Ints) -> tuple[Float, Ints]:
+    """Points (n, 3) in equal steps of direction and range between k pairs of points, and the pair of each.
+
+    count : (k,) points of each pair; none of pairs that are far apart
+    """
+    ends = np.stack([first, last]).astype(np.float64)
+    away = np.linalg.norm(ends, axis=2)
+    unit = ends / np.maximum(away[..., None], 1e-9)
+    angle = np.arccos(np.clip((unit[0] * unit[1]).sum(axis=1), -1, 1))
+    count = np.where((angle <= np.radians(_WIDEST)) & (angle >= 1e-9), count, 0)
+    gap = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(gap)) - np.repeat(np.cumsum(count) - count, count)
+    share = ((number + 1) / (count[gap] + 1))[:, None]
+    turn, (begin, end) = angle[gap, None], unit[:, gap]
+    turned = (np.sin((1 - share) * turn) * begin + np.sin(share * turn) * end) / np.sin(turn)
+    filled: Float = turned * ((1 - share) * away[0, gap, None] + share * away[1, gap, None])
+    return filled, gap
+
+
+def _places(kind: str, xyz: NDArray[np.floating], *, ring: NDArray[np.integer]) -> tuple[Place, ...]:
+    """Boxes of clusters of linked points; the largest first."""
+    if not len(xyz):
+        return ()
+    cluster = _clusters(xyz, ring)
+    order = np.argsort(cluster, kind="stable")
+    count = np.bincount(cluster)
+    first = np.cumsum(count) - count
+    points, rings = xyz[order].astype(np.float64), ring[order]
+    low, high, lowest, highest = (
+        least.reduceat(column, first) for column in (points, rings) for least in (np.minimum, np.maximum)
+    )
+    large = np.flatnonzero(count >= _FEWEST)
+    return tuple(
+        Place(
+            kind,
+            tuple(low[k].tolist()),
+            tuple(high[k].tolist()),
+            int(count[k]),
+            (int(lowest[k]), int(highest[k])),
+        )
+        for k in large[np.argsort(-count[large], kind="stable")].tolist()
+    )
+
+
+def _clusters(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
+    """Cluster (n,) of points: linked are those within `_LINK`, or on neighbouring beams at a like range."""
+    n, away = len(xyz), np.linalg.norm(xyz, axis=1)
+    level = np.maximum(np.hypot(xyz[:, 0], xyz[:, 1]), 1e-9)
+    turn = xyz[:, :2] / level[:, None] / np.radians(_TURN)
+    near = linked_clusters(xyz / _LINK, p=2)
+    beside = linked_clusters(np.column_stack([turn, 0.9 * ring, away / _DEPTH]), p=np.inf)
+    rows = np.arange(n)
+    links = np.column_stack([np.append(rows, rows), np.append(n + near, n + near.max() + 1 + beside)])
+    return joined(links, count=int(links.max()) + 1)[:n]

@@ -1,0 +1,276 @@
+"""LiDAR odometry by packages: KISS-ICP, GenZ-ICP and small_gicp.
+
+All get the same sweeps: in the vehicle's frame at the end of the sweep, without the motion that the vehicle
+has if it moves on as in the sweep before (the motion compensation of Vizzo et al. 2023).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import metadata
+from typing import Any, Protocol
+
+import numpy as np
+
+from geoscene.errors import need
+from geoscene.support.progress import Progress
+from geoscene.typing import Float, Ints
+from lidar.tools.odometry.deskewing import still
+from lidar.tools.odometry.estimate import Estimate, propagated
+from lidar.tools.odometry.local_map import LocalMap
+from lidar.tools.odometry.scans import Scans
+from lidar.tools.odometry.settings import OdometrySettings
+
+_LEAST = 50  # points of a sweep, below which the vehicle moves on as before
+_SPEEDS = np.arange(0.0, 41.0, 10.0)  # m/s ahead, from which the first motion is sought
+_ROUNDS = 4  # of de-skewing and alignment from each, at most
+_SAME = 0.02  # metres between motions that are the same
+_FIRST_VOXEL = 0.25  # metres: in larger ones, rings of two sweeps match wherever the vehicle is
+_CLEARLY = 1.05  # times as many points match at a greater speed that is preferred
+_OPEN = (0.1, 10.0)  # rad/s and m/s: standard deviations of the motion about these
+_UNSURE = 0.3  # metres: error of the expected motion with which KISS-ICP and GenZ-ICP begin
+_GENZ_POINTS = 4000  # of a sweep, which GenZ-ICP aligns: its 2000 are too few for the 64 rings of a street
+
+
+class _Registration(Protocol):
+    """Aligns sweeps one after the other."""
+
+    def __call__(self, points: Float, last: Float, *, step: Float) -> tuple[Float, Float | None]:
+        """The pose (4, 4) of the next sweep, and its information (6, 6) if it is stated.
+
+        points : (n, 3) of the sweep without motion
+        last   : (4, 4) pose of the sweep before
+        step   : (4, 4) expected motion since then
+        """
+
+
+class _Method(Protocol):
+    """Begins the alignment of sweeps.
+
+    first : (4, 4) motion of the vehicle in the first sweep
+    """
+
+    def __call__(self, scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration: ...
+
+
+def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, progress: Progress) -> Estimate:
+    """Poses of the vehicle at the ends of sweeps, relative to the first.
+
+    method : of `LIDAR_METHODS`
+
+    Sweeps with few points move on as before, and are counted. Runs give the same bytes.
+
+    Raises MissingExtraError without the package, and FormatError or DatasetError for damaged clouds.
+    """
+    first = first_motion(scans)
+    register = LIDAR_METHODS[method](scans, settings, first=first)
+    poses, information, counts, step = [np.eye(4)], [], [], first
+    for k in range(len(scans)):
+        points = _still_sweep(scans, k, motion=step)
+        counts.append(len(points))
+        pose, found = poses[-1] @ step if k else poses[-1], None
+        if len(points) >= _LEAST:
+            pose, found = register(points, poses[-1], step=step if k else np.eye(4))
+        if k:
+            step = np.linalg.inv(poses[-1]) @ pose
+            poses.append(pose)
+            information.append(found)
+        progress("aligning sweeps", k + 1, total=len(scans))
+    covered = np.array(poses)
+    sigma = step_sigma = None
+    if any(one is not None for one in information):
+        free = np.diag(_usual(scans, settings) ** 2)
+        covariance = [free if one is None else np.linalg.inv(one) for one in information]
+        sigma = propagated(covered, np.array(covariance))
+        step_sigma = np.sqrt(np.einsum("nii->ni", np.array(covariance)))
+    points_of = np.array(counts, np.int64)
+    return Estimate(
+        scans.time_ns,
+        covered,
+        sigma,
+        step_sigma,
+        {"points": points_of},
+        _report(scans, method, counts=points_of),
+    )
+
+
+def _report(scans: Scans, method: str, *, counts: Ints) -> dict[str, object]:
+    return {
+        "method": method,
+        "package": f"{method} {metadata.version(method)}",
+        "sensors": [stream.name for stream in scans.streams],
+        "frames": len(scans),
+        "pose_of_a_frame": "at its end" if scans.period_ns else "at its start",
+        "times_of_points": bool(scans.period_ns),
+        "frames_without_alignment": int(np.count_nonzero(counts < _LEAST)),
+    }
+
+
+def first_motion(scans: Scans) -> Float:
+    """Motion (4, 4) of the vehicle in the first sweep.
+
+    The second sweep is aligned to the first with the motion by which both are de-skewed; what is found
+    de-skews them again, until it is the motion that it was found with. Such motions are sought from several
+    speeds ahead. That with which most points match counts, and of about equal ones the slowest: on a plane
+    all match.
+
+    An alignment without de-skewing errs by the skew of the sweeps, which is as long as the way.
+
+    Raises MissingExtraError without small_gicp, and FormatError or DatasetError for damaged clouds.
+    """
+    seconds = _seconds(scans)
+    sigma = np.repeat(_OPEN, 3) * seconds
+    best, most, known = np.eye(4), 0.0, list[Float]()
+    for speed in _SPEEDS:
+        motion, matched = np.eye(4), 0.0
+        motion[0, 3] = speed * seconds
+        for _ in range(_ROUNDS):
+            local = LocalMap("odometry", source_voxel=_FIRST_VOXEL, target_voxel=_FIRST_VOXEL)
+            first, second = (local.thinned(_still_sweep(scans, row, motion=motion)) for row in (0, 1))
+            local.add(first, np.eye(4))
+            found = local.aligned(second, motion, sigma=sigma)
+            if found is None:
+                break
+            known.append(motion[:3, 3])
+            motion, matched = found.pose, found.matched
+            if np.linalg.norm(motion[:3, 3] - known, axis=1).min() < _SAME:
+                break
+        if matched > _CLEARLY * most:
+            best, most = motion, matched
+    return best
+
+
+def _still_sweep(scans: Scans, row: int, *, motion: Float) -> Float:
+    """Points (n, 3) of a sweep in the vehicle's frame at the time of its pose.
+
+    motion : (4, 4) of the vehicle in a sweep
+    """
+    points, share = scans.sweep(row)
+    return still(points, share, motion=motion) if scans.period_ns else points
+
+
+def _kiss_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+    """Point to point with an adaptive threshold (Vizzo et al. 2023).
+
+    The threshold begins at what is open once the first motion is known. The package's own, 2 m, holds as
+    long as a vehicle moves evenly, and draws sweeps to the rings of the one before.
+    """
+    del first  # each sweep has its expected motion
+    package, config_of = need("kiss_icp.kiss_icp", "odometry"), need("kiss_icp.config", "odometry")
+    config = config_of.KISSConfig()
+    config.data.max_range, config.data.min_range, config.data.deskew = scans.farthest, 0.0, False
+    config.mapping.voxel_size = settings.voxel or scans.farthest / 100
+    config.adaptive_threshold.initial_threshold = _UNSURE
+    config.registration.max_num_threads = 1  # sums of several threads differ from run to run
+    odometry = package.KissICP(config)
+
+    def register(points: Float, last: Float, *, step: Float) -> tuple[Float, None]:
+        odometry.last_pose, odometry.last_delta = last, step
+        odometry.register_frame(points, np.empty(0))
+        return np.array(odometry.last_pose), None
+
+    return register
+
+
+def _genz_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+    """Point to point and point to plane, weighted by what surfaces are planar (Lee et al. 2025).
+
+    Its motion model is within it and begins at rest. So the first sweep goes before itself, as seen from
+    where the vehicle was a sweep earlier.
+    """
+    package, config_of = need("genz_icp.genz_icp", "odometry"), need("genz_icp.config", "odometry")
+    config = config_of.GenZConfig()
+    config.data.max_range, config.data.min_range, config.data.deskew = scans.farthest, 0.0, False
+    config.mapping.map_cleanup_radius = scans.farthest
+    config.mapping.desired_num_voxelized_points = _GENZ_POINTS
+    config.adaptive_threshold.initial_threshold = _UNSURE
+    if settings.voxel:
+        config.mapping.voxel_size = settings.voxel
+    _set_voxel(package.GenZICP, config_of.GenZConfig(), metres=config.mapping.voxel_size)
+    odometry = package.GenZICP(config)
+    begin: list[Float] = []  # pose of the package's map
+
+    def register(points: Float, last: Float, *, step: Float) -> tuple[Float, None]:
+        with _one_core():
+            if not begin:
+                odometry.register_frame(points @ first[:3, :3].T + first[:3, 3], np.empty(0))
+            odometry.register_frame(points, np.empty(0))
+        found = np.array(odometry.last_pose)
+        if not begin:
+            begin.append(last @ step @ np.linalg.inv(found))
+        return begin[0] @ found, None
+
+    return register
+
+
+def _set_voxel(odometry_of: Any, config: Any, *, metres: float) -> None:
+    """Let GenZ-ICP begin with voxels of a size.
+
+    The package keeps their size in the process (a static variable), so that a run would depend on those
+    before it. It multiplies the size by the occupied voxels over those wanted, and keeps it above 2 cm: a
+    single point brings it there, and a lattice of points to where it should be.
+    """
+    least, wanted = 0.02, 50
+    config.data.min_range, config.data.deskew = 0.0, False
+    config.mapping.desired_num_voxelized_points = wanted
+    count = round(metres / least * wanted)
+    lattice = np.stack(np.unravel_index(np.arange(count), (20, 20, 1 + count // 400)), axis=1) * 0.05
+    with _one_core():
+        odometry = odometry_of(config)
+        for points in (lattice[:1], lattice[:1], lattice):
+            odometry.register_frame(points, np.empty(0))
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """Let this thread and those that it starts run on one core, where the system can tell them to.
+
+    GenZ-ICP has as many threads as there are cores when it first runs, and no setting for it. Sums of several
+    threads differ from run to run.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(cores)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, cores)
+
+
+def _small_gicp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+    """Point to plane to a map of planes, with the motion before as a prior (`local_map`)."""
+    del first  # each sweep has its expected motion
+    side = settings.voxel or 0.25
+    local = LocalMap("odometry", source_voxel=2 * side, target_voxel=side)
+    sigma = _usual(scans, settings)
+
+    def register(points: Float, last: Float, *, step: Float) -> tuple[Float, Float | None]:
+        sweep, pose = local.thinned(points), last @ step
+        found = local.aligned(sweep, pose, sigma=sigma)
+        if found is not None:
+            pose = found.pose
+        local.add(sweep, pose)
+        return pose, None if found is None else found.information
+
+    return register
+
+
+def _usual(scans: Scans, settings: OdometrySettings) -> Float:
+    """Standard deviations (6,) of the motion from a sweep to the next about that of the sweep before."""
+    return np.repeat([settings.turn_acceleration, settings.acceleration], 3) * _seconds(scans) ** 2
+
+
+def _seconds(scans: Scans) -> float:
+    return 1.0 / float(scans.streams[0].sensor["rate_hz"])
+
+
+LIDAR_METHODS: dict[str, _Method] = {
+    "kiss-icp": _kiss_icp,
+    "genz-icp": _genz_icp,
+    "small_gicp": _small_gicp,
+}
+"""Methods by their names."""

@@ -1,0 +1,102 @@
+"""Figures of recorded drives: one function and one row in `FIGURES` each."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
+from lidar.errors import InputError
+from lidar.options import PlotOptions
+
+if TYPE_CHECKING:
+    from lidar.dataset.layout import Dataset
+    from lidar.tools.plots.drawn import Drawn
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A row of `FIGURES`.
+
+    name     : by which users choose it
+    function : module and function in this folder; called with a dataset, options and ``progress``
+    meaning  : what is drawn, one line
+    takes    : options of `PlotOptions` that it uses
+    """
+
+    name: str
+    function: str
+    meaning: str
+    takes: tuple[str, ...]
+
+
+FIGURES = {
+    row.name: row
+    for row in (
+        Figure(
+            "range-image",
+            "sweeps.range_image",
+            "range, intensity and class of a sweep by azimuth and ring",
+            ("sensor", "frames"),
+        ),
+        Figure("intensity", "sweeps.intensity", "histogram of intensities by class", ("sensor", "frames")),
+        Figure("returns", "sweeps.returns", "returns by range, class and origin", ("sensor", "frames")),
+        Figure("speed", "motion.speed", "speed and acceleration of the vehicle over time", ()),
+        Figure(
+            "coverage",
+            "coverage.coverage",
+            "returns per square metre on a plan, with the path",
+            ("sensor", "frames", "resolution"),
+        ),
+        Figure(
+            "gnss",
+            "fixes.gnss",
+            "errors of a receiver east, north and up over time, with the stated standard deviation",
+            ("sensor",),
+        ),
+    )
+}
+"""The figures of a dataset by name."""
+
+
+def plot(
+    dataset: Dataset,
+    what: str,
+    *,
+    out: str | Path,
+    options: PlotOptions = PlotOptions(),
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> Drawn:
+    """Write a figure of a dataset as PNG or SVG, by the suffix of ``out``.
+
+    what : name in `FIGURES`
+
+    Raises InputError for an unknown figure and options that it does not take, and DatasetError for a dataset
+    that lacks what it shows.
+    """
+    if what not in FIGURES:
+        raise InputError(f"no figure {what}; there are {', '.join(FIGURES)}")
+    row, out = FIGURES[what], Path(out)
+    for name in ("sensor", "frames", "resolution"):
+        if name not in row.takes and getattr(options, name) != getattr(PlotOptions(), name):
+            raise InputError(f"`{name}`: {what} does not take it; leave it out")
+    check_out(out, overwrite=overwrite)
+    module, name = row.function.split(".")
+    function = getattr(importlib.import_module(f"lidar.tools.plots.{module}"), name)
+    drawn: Drawn = function(dataset, options, progress=progress)
+    write_atomically(out, drawn.canvas.encoded(out.suffix.lower()))
+    return drawn
+
+
+def check_out(out: Path, *, overwrite: bool) -> None:
+    """Raise InputError for a name that is not of a PNG or SVG, or that is taken."""
+    from geoscene.drawing.canvas import SUFFIXES  # noqa: PLC0415  (0.1 s)
+
+    if out.suffix.lower() not in SUFFIXES:
+        raise InputError(f"`out` {out}: plots are PNG or SVG; give a name that ends with .png or .svg")
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: exists already; set `overwrite` to replace it")

@@ -1,0 +1,203 @@
+"""Description of a matrix of attacks and defences: a TOML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from geoscene.errors import reading
+from geoscene.support.untrusted import read_toml
+from lidar.errors import InputError
+from lidar.tools.defences.registry import NamedDefence, read_defences
+from lidar.tools.detection import RULES
+from lidar.tools.detection.registry import read_detector
+from lidar.tools.redteam.published import ATTACKS as PUBLISHED
+from lidar.tools.sweep.grid import GridDrive, drives_of
+from lidar.tools.sweep.words import naming, text_of
+
+GOALS = ("forge", "hide", "mislead")
+"""What an attack is for: an object that is not there, one that is not found, or a false position."""
+
+_TABLES = ("drive", "grid", "map", "attack", "defences", "measure")
+_POOLED = ("seed", "attack")
+"""Options of the grid that are no conditions: seeds are repetitions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Attack:
+    """An attack of the matrix.
+
+    name      : as in the report
+    option    : the value of ``--attack``
+    goal      : of `GOALS`
+    published : key of `lidar.tools.redteam.published.ATTACKS`; empty for none
+    """
+
+    name: str
+    option: str
+    goal: str
+    published: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """How the matrix is evaluated.
+
+    score        : of a detection from which on it counts
+    false_alarms : share of the genuine frames that may be alarmed
+    false_objects: share of the genuine objects that may be alarmed
+    deviation    : metres of a fix from the genuine one from which on the vehicle is misled; a car that is
+                   1.8 m wide in the middle of a lane of 3.5 m is 0.85 m from its edge
+    block        : seconds of a drive that count as one independent trial
+    detector     : what reports road users, as for `lidar.tools.detection.registry.read_detector`; several are
+                   measured on the same drives and stand side by side
+    """
+
+    score: float = 0.3
+    false_alarms: float = 0.05
+    false_objects: float = 0.01
+    deviation: float = 0.85
+    block: float = 1.0
+    detector: tuple[str, ...] = (RULES.name,)
+
+    def __post_init__(self) -> None:
+        """Validate the values."""
+        for name in ("score", "false_alarms", "false_objects"):
+            if not 0 < getattr(self, name) < 1:
+                raise InputError(f"measure: {name} = {getattr(self, name):g}: give a share between 0 and 1")
+        if not 0.01 <= self.deviation <= 1e6:
+            raise InputError(f"measure: deviation = {self.deviation:g}: give 0.01 to 1,000,000 m")
+        if not 0.1 <= self.block <= 600:
+            raise InputError(f"measure: block = {self.block:g}: give 0.1 to 600 seconds")
+        if not self.detector or len(set(self.detector)) < len(self.detector):
+            raise InputError("measure: detector: give one or more that differ")
+        for name in self.detector:
+            read_detector(name)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One drive of the matrix.
+
+    drive      : to record
+    attack     : None for the drive without attack
+    conditions : values of the grid's other options, without the seed
+    twin       : name of the drive that differs by the attack alone
+    """
+
+    drive: GridDrive
+    attack: Attack | None
+    conditions: dict[str, str]
+    twin: str
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A matrix of attacks, defences and conditions."""
+
+    runs: tuple[Run, ...]
+    attacks: tuple[Attack, ...]
+    defences: tuple[NamedDefence, ...]
+    measure: Measure
+
+
+def read_plan(path: Path) -> Plan:
+    """The matrix that a file describes.
+
+    Tables ``drive``, ``grid`` and ``map`` are those of a sweep; each drive is made without attack and with
+    each attack of the tables ``[[attack]]`` (``name``, ``attack``: the value of ``lidar drive --attack``,
+    ``goal``: of `GOALS`, ``published``: what to compare with). Table ``defences`` has ``use``, a list of
+    defences as for ``lidar defend``; table ``measure`` has the fields of `Measure`.
+
+    Raises InputError, which names the file and what in it has the error.
+    """
+    with reading(path, InputError, remedy="give a TOML file with [grid] and [[attack]]", known=InputError):
+        document = read_toml(path.read_text("utf-8"))
+    if unknown := sorted(set(document) - set(_TABLES)):
+        raise InputError(f"{path}: unknown {unknown[0]}; there are the tables {', '.join(_TABLES)}")
+    attacks = _attacks(path, document.get("attack", []))
+    with naming(path, "defences"):
+        defences = _defences(document.get("defences", {}))
+    with naming(path, "measure"):
+        measure = _measure(document.get("measure", {}))
+    tables = {name: document[name] for name in ("drive", "map") if name in document}
+    grids = document.get("grid", {})
+    grids = grids if isinstance(grids, list) else [grids]
+    for name in [name for table in (document.get("drive", {}), *grids) for name in table]:
+        if name == "attack":
+            raise InputError(f"{path}: attack is an option of the tables [[attack]], not of drives")
+    options = {"attack": ["", *(attack.option for attack in attacks)]}
+    drives = drives_of(tables | {"grid": [{**grid, **options} for grid in grids]}, path)
+    return Plan(tuple(_runs(drives, attacks)), attacks, defences, measure)
+
+
+def _attacks(path: Path, tables: Any) -> tuple[Attack, ...]:
+    if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
+        raise InputError(f"{path}: no attacks; add tables [[attack]] with a name, an attack and a goal")
+    found: dict[str, Attack] = {}
+    for number, table in enumerate(tables, 1):
+        what = f"attack {table.get('name') or number}"
+        with naming(path, what):
+            attack = _attack(table)
+        if attack.name in found:
+            raise InputError(f"{path}: two attacks are named {attack.name}; rename one of them")
+        if attack.option in {other.option for other in found.values()}:
+            raise InputError(f"{path}: {what}: the same as another one; leave one out")
+        found[attack.name] = attack
+    return tuple(found.values())
+
+
+def _attack(table: Mapping[str, Any]) -> Attack:
+    if unknown := sorted(set(table) - {"name", "attack", "goal", "published"}):
+        raise InputError(f"unknown {unknown[0]}; there are name, attack, goal and published")
+    for name in ("name", "attack", "goal"):
+        if not table.get(name) or not isinstance(table[name], str):
+            raise InputError(f"{name}: give a text")
+    if table["goal"] not in GOALS:
+        raise InputError(f"goal = {table['goal']!r}: one of {', '.join(GOALS)}")
+    published = table.get("published", "")
+    if published and published not in PUBLISHED:
+        raise InputError(f"published = {published!r}: one of {', '.join(PUBLISHED)}")
+    return Attack(table["name"], text_of(table["attack"]), table["goal"], published)
+
+
+def _defences(table: Any) -> tuple[NamedDefence, ...]:
+    if not isinstance(table, dict) or set(table) - {"use"}:
+        raise InputError('give a table with use = ["NAME", ...]')
+    use = table.get("use", ["all"])
+    if not isinstance(use, list) or not all(isinstance(name, str) for name in use):
+        raise InputError('use: give a list of names, such as ["occlusion", "shadow"]')
+    return read_defences(use)
+
+
+def _measure(table: Any) -> Measure:
+    known = Measure.__dataclass_fields__
+    if not isinstance(table, dict):
+        raise InputError("give a table")
+    if unknown := sorted(set(table) - set(known)):
+        raise InputError(f"unknown {unknown[0]}; there are {', '.join(known)}")
+    numbers = {name: value for name, value in table.items() if name != "detector"}
+    if wrong := [name for name, value in numbers.items() if type(value) not in (int, float)]:
+        raise InputError(f"{wrong[0]}: give a number")
+    detector = table.get("detector", list(Measure().detector))
+    detector = [detector] if isinstance(detector, str) else detector
+    if not isinstance(detector, list) or not all(isinstance(name, str) for name in detector):
+        raise InputError('detector: give a name or a list of names, such as ["rules", "learned"]')
+    return replace(Measure(), **numbers, detector=tuple(detector))
+
+
+def _runs(drives: list[GridDrive], attacks: tuple[Attack, ...]) -> list[Run]:
+    by_option = {attack.option: attack for attack in attacks}
+    plain = {_without_attack(drive): drive.name for drive in drives if not drive.values["attack"]}
+    runs = []
+    for drive in drives:
+        conditions = {name: text for name, text in drive.values.items() if name not in _POOLED}
+        attack = by_option.get(drive.values["attack"])
+        runs.append(Run(drive, attack, conditions, plain[_without_attack(drive)]))
+    return runs
+
+
+def _without_attack(drive: GridDrive) -> tuple[tuple[str, str], ...]:
+    return tuple((name, text) for name, text in drive.values.items() if name != "attack")

@@ -1,0 +1,151 @@
+"""Records the drives of a matrix, measures them, and writes the results."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from geoscene.errors import GeosceneError
+from geoscene.support.files import exclusive
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress, silent
+from lidar.errors import InputError, LidarError
+from lidar.tools.detection import RULES
+from lidar.tools.detection.registry import read_detector
+from lidar.tools.redteam.evaluate import Figures, Matrix, evaluated
+from lidar.tools.redteam.measure import Case, measured
+from lidar.tools.redteam.plan import Plan, Run, read_plan
+from lidar.tools.redteam.report import write_report
+from lidar.tools.sweep.run import recorded
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RedTeamSummary:
+    """A matrix that was measured.
+
+    drives : names of the drives that were measured
+    failed : reason by name of those that could not be recorded or measured
+    """
+
+    path: Path
+    drives: tuple[str, ...]
+    failed: dict[str, str]
+    matrix: Matrix
+
+
+def redteam(
+    file: str | Path,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> RedTeamSummary:
+    """Record the drives of a matrix with and without attacks, judge them by defences, and write the results.
+
+    Folder ``out`` gets ``drives`` (a sweep), ``figures`` (of each drive), ``redteam.json``, CSV tables and
+    ``redteam.html``. What is there of the same drives and options is kept. A drive that fails is named in the
+    results, and the others count. The bytes do not depend on ``workers``, but for times that were measured.
+
+    Raises InputError for a file with an error, before the first drive starts.
+    """
+    plan, folder = read_plan(Path(file)), Path(out)
+    if folder.exists() and not (folder.is_dir() and (_is_matrix(folder) or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: is not empty and no matrix; give another directory")
+    with exclusive(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        swept = recorded(
+            [run.drive for run in plan.runs],
+            folder / "drives",
+            source=Path(file).name,
+            workers=workers,
+            overwrite=overwrite,
+            progress=progress,
+        )
+        failed = {row.name: row.error for row in swept.failed}
+        figures = []
+        for run, result in _results(plan, folder, failed=failed, workers=workers, progress=progress):
+            if isinstance(result, str):
+                failed[run.drive.name] = result
+            else:
+                figures.append(result)
+        matrix = evaluated(figures, plan.attacks, measure=plan.measure)
+        summary = RedTeamSummary(
+            folder, tuple(dict.fromkeys(one.run.drive.name for one in figures)), failed, matrix
+        )
+        absent = sorted({name for one in figures for name in one.absent})
+        write_report(summary.matrix, folder, plan=plan, failed=failed, absent=absent, source=Path(file).name)
+    return summary
+
+
+def _is_matrix(folder: Path) -> bool:
+    return (folder / "drives" / "sweep.json").is_file()
+
+
+def _results(
+    plan: Plan, folder: Path, *, failed: dict[str, str], workers: int, progress: Progress
+) -> Iterator[tuple[Run, Figures | str]]:
+    """Figures of the drives by each detector, in the order of the plan, or why there are none."""
+    ready = [run for run in plan.runs if run.drive.name not in failed]
+    for run in [run for run in ready if run.twin in failed]:
+        yield run, f"the drive without attack failed: {failed[run.twin]}"
+    ready = [run for run in ready if run.twin not in failed]
+    both = [(run, name) for name in plan.measure.detector for run in ready]
+    tasks = [_Task(row, _case(run, name, plan=plan, folder=folder)) for row, (run, name) in enumerate(both)]
+    several = len(plan.measure.detector) > 1
+    found: dict[int, Figures | str] = {}
+    progress("defences", 0, total=len(tasks))
+    for row, frames, absent, error in run_tasks(_measured, tasks, workers=workers):
+        run, name = both[row]
+        found[row] = error or Figures(run, frames, absent, name if several else "")
+        progress("defences", len(found), total=len(tasks))
+    for row, (run, _) in enumerate(both):
+        yield run, found[row]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A drive to measure, and its number."""
+
+    row: int
+    case: Case
+
+
+def _case(run: Run, detector: str, *, plan: Plan, folder: Path) -> Case:
+    drives = folder.absolute() / "drives"
+    identity = read_detector(detector).identity
+    own = "" if identity == RULES.identity else f".{identity.rpartition(' ')[2]}"
+    return Case(
+        drives / run.drive.name,
+        drives / run.twin if run.attack is not None else None,
+        folder.absolute() / "figures" / f"{run.drive.name}{own}.json",
+        plan.defences,
+        plan.measure.score,
+        detector,
+    )
+
+
+def _measured(task: _Task) -> tuple[int, list[dict[str, object]], list[str], str]:
+    """Number, rows of the frames, defences without data, and the error of a drive. Run by workers."""
+    try:
+        document = measured(task.case)
+    except (GeosceneError, LidarError, OSError) as error:
+        return task.row, [], [], " ".join(str(error).split())
+    except Exception as error:  # one drive's defect must not end the others
+        log.exception("drive %s", task.case.path.name)
+        return task.row, [], [], f"{type(error).__name__}: {' '.join(str(error).split())}"
+    return task.row, document["frames"], document["absent"], ""
+
+
+def failed_drives(failed: dict[str, str]) -> Sequence[str]:
+    """A line for each reason, with the drives that it concerns."""
+    lines = []
+    for error in dict.fromkeys(failed.values()):
+        names = [name for name, reason in failed.items() if reason == error]
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        lines.append(f"{names[0]}{more}: {error}")
+    return lines

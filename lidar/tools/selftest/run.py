@@ -1,0 +1,163 @@
+"""Runs the extremes on this machine and lays out what was measured."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene.support.progress import Progress, silent
+from lidar.errors import BackendError, InputError
+from lidar.raycast.library import library
+from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.cases import CASES, GROUPS
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was measured in a case.
+
+    count    : number of samples
+    measured : in the case's unit; NaN if the case ended in an error
+    error    : one line, or ""
+    seconds  : wall time
+    """
+
+    case: Case
+    count: int
+    measured: float
+    error: str
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether the bound holds."""
+        return self.measured <= self.case.bound
+
+
+def outcomes(
+    groups: Sequence[str] = (), *, full: bool = False, progress: Progress = silent
+) -> Iterator[Outcome]:
+    """The outcome of each case of some groups, all by default, one after the other.
+
+    Raises InputError for an unknown group.
+    """
+    if unknown := sorted(set(groups) - set(GROUPS)):
+        raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(GROUPS)}")
+    chosen = [case for case in CASES if not groups or case.group in groups]
+    for k, case in enumerate(chosen):
+        yield outcome(case, case.full if full else case.quick)
+        progress("cases", k + 1, total=len(chosen))
+
+
+def outcome(case: Case, count: int) -> Outcome:
+    """What is measured in a case in ``count`` samples."""
+    start = time.perf_counter()
+    try:
+        measured, error = case.measure(count), ""
+    except Exception as failure:  # noqa: BLE001 - the other cases are wanted, whatever the reason
+        measured, error = float("nan"), f"{type(failure).__name__}: {failure}"
+    return Outcome(case, count, float(measured), " ".join(error.split()), time.perf_counter() - start)
+
+
+def machine() -> dict[str, str]:
+    """Processor, system and libraries on which the figures depend."""
+    try:
+        loaded = library()
+        digits = loaded.embree.rtcGetDeviceProperty(loaded.device, 0)
+        embree = f"{digits // 10000}.{digits // 100 % 100}.{digits % 100}"
+        packets = str(loaded.width)
+    except BackendError as error:
+        embree, packets = f"none ({error})", "none: rays are cast in float64"
+    return {
+        "processor": _processor(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "embree": embree,
+        "rays per packet": packets,
+    }
+
+
+def _processor() -> str:
+    """Name of the processor, as far as the system tells it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(names, platform.processor() or platform.machine())
+
+
+def figure(value: float) -> str:
+    """A number with two digits, three from 10 to a million; whole numbers as such."""
+    if abs(value) < 1e6 and value == int(value):
+        return f"{value:,.0f}"
+    return f"{value:.3g}" if 10 <= abs(value) < 1e6 else f"{value:.2g}"
+
+
+def cells(done: Outcome) -> tuple[str, ...]:
+    """Case, samples, bound, measured and verdict as text."""
+    case = done.case
+    measured = done.error or f"{figure(done.measured)} {case.unit}"
+    return (
+        case.name,
+        f"{done.count:,} {case.of}",
+        f"{figure(case.bound)} {case.unit}",
+        measured,
+        "ok" if done.ok else "FAILS",
+    )
+
+
+def print_table(done: Sequence[Outcome]) -> None:
+    """Print the outcomes and the machine on standard output."""
+    from rich.console import Console  # noqa: PLC0415 - slow to import
+    from rich.markup import escape  # noqa: PLC0415
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table("case", "samples", "bound", "measured", "")
+    for row, one in enumerate(done):
+        words = cells(one)
+        style = "" if one.ok else "bold red"
+        ends = row + 1 == len(done) or done[row + 1].case.group != one.case.group
+        table.add_row(*map(escape, words), style=style, end_section=ends)
+    console = Console(soft_wrap=False)
+    console.print(table)
+    for name, value in machine().items():
+        console.print(f"{name}: {value}", highlight=False, markup=False)
+
+
+def markdown(done: Sequence[Outcome]) -> str:
+    """The tables of docs/extremes.md, one for each group."""
+    lines = ["Measured on: " + "; ".join(f"{name} {value}" for name, value in machine().items()) + "."]
+    for group in dict.fromkeys(one.case.group for one in done):
+        lines += ["", f"## {group.capitalize()}", "", "| case | samples | bound | measured | limited by |"]
+        lines += ["|---|---:|---:|---:|---|"]
+        for one in done:
+            if one.case.group == group:
+                *row, verdict = cells(one)
+                row[3] += "" if verdict == "ok" else " (FAILS)"
+                lines.append("| " + " | ".join([*row, one.case.limit]) + " |")
+    return "\n".join(lines)
+
+
+def document(done: Sequence[Outcome]) -> dict[str, Any]:
+    """The outcomes and the machine as JSON."""
+    rows = []
+    for one in done:
+        case = asdict(one.case)
+        del case["measure"], case["quick"], case["full"]
+        rows.append(
+            case
+            | {
+                "samples": one.count,
+                "measured": None if np.isnan(one.measured) else one.measured,
+                "ok": one.ok,
+                "error": one.error,
+                "seconds": round(one.seconds, 3),
+            }
+        )
+    return {"machine": machine(), "cases": rows}

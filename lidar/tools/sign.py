@@ -1,0 +1,291 @@
+"""Signs datasets: a watermark in the points of their clouds, and a signed hash chain over their files."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from geoscene.support.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
+from geoscene.support.progress import Progress, silent
+from geoscene.typing import Float
+from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.foreign import foreign_clouds
+from lidar.dataset.formats import FORMATS, Format, format_of
+from lidar.dataset.formats.table import read_rows, table_cloud
+from lidar.dataset.layout import Dataset, Paths
+from lidar.dataset.provenance import derived_from, write_folder_provenance
+from lidar.dataset.recorded import cloud_points
+from lidar.dataset.signable import Signable, place_of, signable
+from lidar.errors import DatasetError, FormatError, InputError, LidarError
+from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.rig.devices import Scanner, scanners
+from lidar.sensors.rig.specs import rig_of
+from lidar.simulation.record_clouds import write_clouds
+from lidar.simulation.recording import Recording
+from lidar.tools.integrity.digest_files import FrameDigests, Link, frame_file, links_bytes
+from lidar.tools.integrity.directions import with_mark
+from lidar.tools.integrity.keys import Signer
+from lidar.tools.integrity.merkle import (
+    START,
+    BlockDigests,
+    block_digests,
+    link,
+    signed_message,
+)
+from lidar.tools.integrity.watermark import Cells, Watermark
+from lidar.tools.rerecord import recording_again
+
+SCHEMA = 1
+"""Version of the files in the folder ``integrity``."""
+
+
+@dataclass(frozen=True, slots=True)
+class SignSummary:
+    """What was signed.
+
+    marked : clouds that got the watermark
+    rms    : metres by which it moved points, root mean square of their distance
+    frames : frames in hash chains
+    files  : files with digests
+    """
+
+    path: Path
+    marked: int = 0
+    rms: float = 0.0
+    frames: int = 0
+    files: int = 0
+
+
+def marked_formats(formats: tuple[str, ...]) -> list[Format]:
+    """The formats, of some, whose files bear a watermark that can be read from them alone."""
+    found = [FORMATS[name] for name in formats]
+    return [form for form in found if form.frame == "sensor" and {"ring", "column"} <= set(form.columns)]
+
+
+def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> Cells:
+    """Which pulses the returns of a cloud belong to."""
+    return Cells(sensor, frame, cloud.ring, cloud.column, cloud.echo)
+
+
+def sign_dataset(
+    source: str | Path,
+    out: str | Path | None,
+    *,
+    watermark: Watermark | None = None,
+    signer: Signer | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SignSummary:
+    """Write a dataset with a watermark, a signed hash chain or both to ``out``.
+
+    ``source`` is a dataset, or a folder with clouds of KITTI or nuScenes. Without ``out`` the chain is added
+    to the data themselves; a watermark changes clouds and needs ``out``.
+
+    Raises InputError and DatasetError for data that cannot be signed; nothing is written then.
+    """
+    source = Path(source)
+    given = signable(source)
+    if watermark is None and signer is None:
+        raise InputError("give `watermark`, `chain` or both")
+    dataset = given.dataset
+    if dataset is not None and dataset.manifest["frames_done"] != dataset.frames:
+        raise DatasetError(f"{source}: the drive was not finished; finish it first")
+    if out is None:
+        if watermark is not None:
+            raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
+        chain = Paths(source).chain
+        if chain.exists() and not overwrite:
+            raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
+        with exclusive(source.resolve()):
+            delete_leftovers(source)
+            summary, data = _chained(given, signer, summary=SignSummary(source), progress=progress)
+            known = {chain.relative_to(source).as_posix(): hashlib.sha256(data).digest()}
+            add_to_checksums(source, below=given.integrity.name, known=known)
+            write_atomically(chain, data)  # last: it marks signed data
+        return summary
+    out = Path(out)
+    check_target(out, source=source, overwrite=overwrite)
+    with complete_folder(out) as part:
+        summary = SignSummary(part)
+        if watermark is None:
+            copy_dataset(source, part, leave_out={Paths(part).integrity})
+        elif dataset is None:
+            summary = _marked_clouds(source, summary, watermark=watermark, progress=progress)
+        else:
+            summary = _marked(dataset, summary, watermark=watermark, progress=progress)
+        summary, data = _chained(signable(part), signer, summary=summary, progress=progress)
+        if data:
+            write_atomically(Paths(part).chain, data)
+        write_checksums(part)
+    return replace(summary, path=out)
+
+
+def _marked(
+    dataset: Dataset, summary: SignSummary, *, watermark: Watermark, progress: Progress
+) -> SignSummary:
+    """Copy a dataset with a watermark in its clouds, in all their formats."""
+    recipe, out = dataset.manifest["recipe"], summary.path
+    if "watermark" in recipe:
+        raise DatasetError(f"{dataset.path}: has a watermark already; sign the original")
+    recording = recording_again(dataset, out)
+    forms = marked_formats(recording.contents.formats)
+    if not forms:
+        known = ", ".join(form.name for form in marked_formats(tuple(FORMATS)))
+        raise InputError(
+            f"{dataset.path}: clouds are {','.join(recording.contents.formats)}; a watermark needs one of"
+            f" {known}, which keep ring and column"
+        )
+    # Exact coordinates first: CSV rounds them.
+    form = min(forms, key=lambda form: form.name == "csv")
+    jobs = [
+        (scanner, frame)
+        for scanner in scanners(rig_of(recipe["rig"]))
+        for frame in range(len(dataset.sample_times(scanner.name)))
+    ]
+    clouds = {path for job in jobs for name, path in recording.paths(*job).items() if not _kept(name)}
+    leave_out = clouds | {Paths(out).manifest, Paths(out).journal, Paths(out).integrity}
+    copy_dataset(dataset.path, out, leave_out=leave_out)
+    squares = points = 0.0
+    for done, (scanner, frame) in enumerate(jobs):
+        progress("watermark", done, total=len(jobs))
+        moved = _mark_frame(dataset, recording, scanner=scanner, frame=frame, form=form, watermark=watermark)
+        squares, points = squares + float(moved @ moved), points + len(moved)
+    progress("watermark", len(jobs), total=len(jobs))
+    recipe = recipe | {"watermark": watermark.step}
+    parents = derived_from(dataset.path, dataset.manifest, by="sign")
+    write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe} | parents)
+    return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
+
+
+def _marked_clouds(
+    source: Path, summary: SignSummary, *, watermark: Watermark, progress: Progress
+) -> SignSummary:
+    """Copy a folder of KITTI or nuScenes with a watermark in its clouds."""
+    out, clouds = summary.path, foreign_clouds(source)
+    marks = Paths(out).integrity / "watermark.json"
+    if (Paths(source).integrity / marks.name).exists():
+        raise DatasetError(f"{source}: has a watermark already; sign the original")
+    places = [path.relative_to(source) for path, _ in clouds]
+    leave_out = {*(out / place for place in places), Paths(out).integrity}
+    copy_dataset(source, out, leave_out=leave_out)
+    squares = points = 0.0
+    for done, (path, form) in enumerate(clouds):
+        progress("watermark", done, total=len(clouds))
+        rows = read_rows(path, len(form.columns))
+        sensor, frame = cloud_place(source, path)
+        xyz = with_mark(watermark, rows[:, :3], sensor=sensor, frame=frame)
+        moved = np.linalg.norm(xyz - rows[:, :3].astype(np.float64), axis=1)
+        write_atomically(out / places[done], np.column_stack([xyz, rows[:, 3:]]).astype("<f4"))
+        squares, points = squares + float(moved @ moved), points + len(moved)
+    progress("watermark", len(clouds), total=len(clouds))
+    marks.parent.mkdir(exist_ok=True)
+    write_folder_provenance(source, out, by="sign")
+    write_json(marks, {"schema": SCHEMA, "step": watermark.step, "clouds": len(clouds)})
+    return replace(summary, marked=len(clouds), rms=float(np.sqrt(squares / max(points, 1))))
+
+
+def cloud_place(source: Path, path: Path) -> tuple[str, int]:
+    """Folder and frame of a cloud of KITTI or nuScenes, by which its watermark differs from others.
+
+    Raises DatasetError for a file that is named otherwise.
+    """
+    found = place_of(path.relative_to(source))
+    if found is None:
+        raise DatasetError(f"{path}: its name has no frame number of six digits or more, nor a time stamp")
+    return found
+
+
+def _kept(name: str) -> bool:
+    """Whether files of a frame, named as by `Recording.paths`, stay as they are with a watermark."""
+    return name in ("boxes", "truth") or name.startswith("labels ")
+
+
+def _mark_frame(
+    dataset: Dataset,
+    recording: Recording,
+    *,
+    scanner: Scanner,
+    frame: int,
+    form: Format,
+    watermark: Watermark,
+) -> Float:
+    """Write a cloud with the watermark; return the distances (n,) in metres by which points moved."""
+    source = replace(recording, out=dataset.path).paths(scanner, frame)
+    paths = recording.paths(scanner, frame)
+    for path in paths.values():
+        path.parent.mkdir(parents=True, exist_ok=True)
+    table = cloud_points(source[form.name])
+    cloud = table_cloud(table, start_ns=scanner.frame_start_ns(frame))
+    marked = watermark.embedded(cloud.xyz, cells_of(cloud, sensor=scanner.name, frame=frame))
+    xyz = marked.astype(np.float32)
+    before = np.linalg.norm(cloud.xyz.astype(np.float64), axis=1)
+    longer = np.linalg.norm(xyz.astype(np.float64), axis=1) - before
+    moved: Float = np.linalg.norm(xyz - cloud.xyz.astype(np.float64), axis=1)
+    cloud = replace(cloud, xyz=xyz, range=cloud.range + longer)
+    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=table.get("velocity"))
+    return moved
+
+
+def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:
+    """Digests of the blocks of a cloud; None for another file, or one that cannot be read."""
+    try:
+        table = format_of(path).read(path)
+    except (LidarError, OSError, ValueError):
+        return None
+    return block_digests(table, rate_hz=rate_hz)
+
+
+def frame_digests(folder: Path, names: list[str], *, rate_hz: float) -> FrameDigests:
+    """Digests of the files of a frame."""
+    sha256 = {name: file_digest(folder / name) for name in names}
+    found = {name: _cloud_blocks(folder / name, rate_hz=rate_hz) for name in names}
+    return FrameDigests(sha256, {name: blocks for name, blocks in found.items() if blocks is not None})
+
+
+def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
+    try:
+        format_of(path)
+    except (FormatError, InputError):
+        return None
+    if path.parent.name in ("boxes", "signals"):
+        return None
+    return blocks_in(path, rate_hz=rate_hz)
+
+
+def _chained(
+    data: Signable, signer: Signer | None, *, summary: SignSummary, progress: Progress
+) -> tuple[SignSummary, bytes]:
+    """Write the hash chain over the files of a directory; the bytes of the signature, empty without a key."""
+    if signer is None:
+        return summary, b""
+    signer.sign(b"")  # a key that cannot sign is refused before anything is written
+    files, folder = data.files(), data.integrity
+    folder.mkdir(exist_ok=True)
+    Paths(data.path).chain.unlink(missing_ok=True)
+    heads: dict[str, tuple[int, bytes]] = {}
+    total, done = sum(map(len, files.frames.values())), 0
+    for sensor, frames in files.frames.items():
+        rate_hz, head, links = data.rate_hz(sensor), START, list[Link]()
+        for frame, time_ns in zip(sorted(frames), data.time_ns(sensor, sorted(frames)), strict=True):
+            progress("sign", done, total=total)
+            digests = frame_digests(data.path, frames[frame], rate_hz=rate_hz)
+            write_atomically(frame_file(folder, sensor, frame=frame), digests.to_bytes())
+            head = link(head, sensor=sensor, frame=frame, time_ns=time_ns, root=digests.root)
+            links.append(Link(frame, time_ns, digests.root, head))
+            done += 1
+        write_atomically(folder / f"{sensor}.csv", links_bytes(links))
+        heads[sensor] = len(links), head
+    tables = {name: file_digest(data.path / name) for name in files.others}
+    document = {
+        "schema": SCHEMA,
+        "algorithm": signer.algorithm,
+        "sensors": {name: {"frames": frames, "head": head.hex()} for name, (frames, head) in heads.items()},
+        "files": {name: sha256.hex() for name, sha256 in tables.items()},
+        "signature": signer.sign(signed_message(heads, tables)).hex(),
+    }
+    progress("sign", total, total=total)
+    return replace(summary, frames=total, files=files.count), json_bytes(document)

@@ -1,0 +1,356 @@
+"""Runs the drives of a sweep, each in a folder of its own, and writes a table of their states."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from geoscene import __version__
+from geoscene.errors import GeosceneError, WorkersLostError
+from geoscene.scene import Scene, open_scene
+from geoscene.scene.layout import using
+from geoscene.support.cluster import Cluster, connected
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import digest_of, exclusive, write_json
+from geoscene.support.processes import run_tasks
+from geoscene.support.progress import Progress, silent
+from lidar.dataset.journal import read_journal
+from lidar.dataset.layout import Paths, open_dataset
+from lidar.errors import InputError, LidarError
+from lidar.options import DriveOptions
+from lidar.tools.sweep.grid import GridDrive, read_grid
+from lidar.tools.tradeoff.accuracy import Pick, driven, picked
+
+log = logging.getLogger(__name__)
+
+_TABLE = "sweep.json"
+_GENERATOR = f"geoscene lidar {__version__}"
+_SECONDS = 2.0
+"""Between two updates of the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class DriveRow:
+    """One drive in the table of a sweep.
+
+    name    : of its folder
+    state   : waiting, done or failed
+    error   : why it failed, one line
+    frames  : of all sensors
+    points  : of all scanners
+    seconds : of simulated time
+    metres  : driven
+    digest  : of the journal, hence of all frames
+    files   : digest of all files
+    picked  : settings by which the drive reaches its accuracy or keeps its budget, in words
+    reached : errors that its spot check found, in words
+    """
+
+    name: str
+    state: str = "waiting"
+    error: str = ""
+    frames: int = 0
+    points: int = 0
+    seconds: float = 0.0
+    metres: float = 0.0
+    digest: str = ""
+    files: str = ""
+    picked: str = ""
+    reached: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepSummary:
+    """A sweep that has ended.
+
+    path : its folder
+    rows : of the drives, in the order of the grid
+    """
+
+    path: Path
+    rows: tuple[DriveRow, ...]
+
+    @property
+    def failed(self) -> list[DriveRow]:
+        """The drives that failed."""
+        return [row for row in self.rows if row.state == "failed"]
+
+
+def sweep(
+    file: str | Path,
+    out: str | Path,
+    *,
+    workers: int = 1,
+    scheduler: str = "",
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SweepSummary:
+    """Record all drives of a grid; finished ones of the same options whose files are unchanged are kept.
+
+    Folder ``out`` gets a dataset for each drive, ``sweep.json`` and ``sweep.csv``. A drive that fails, or
+    whose map cannot be built, is a row with the reason, and the others go on. The bytes depend neither on
+    ``workers`` nor on ``scheduler``.
+
+    file      : TOML file, see `lidar.tools.sweep.grid.read_grid`
+    workers   : processes, each of which records a drive at a time
+    scheduler : address of a Dask scheduler, whose workers record the drives instead
+
+    Raises InputError for a file with an error, before the first drive starts.
+    """
+    return recorded(
+        read_grid(Path(file)),
+        Path(out),
+        source=Path(file).name,
+        workers=workers,
+        scheduler=scheduler,
+        overwrite=overwrite,
+        progress=progress,
+    )
+
+
+def recorded(
+    drives: Sequence[GridDrive],
+    folder: Path,
+    *,
+    source: str,
+    workers: int = 1,
+    scheduler: str = "",
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> SweepSummary:
+    """Record drives into a folder; see `sweep`.
+
+    source : name of the file that describes them, for the table
+    """
+    if not 1 <= workers <= 256:
+        raise InputError(f"`workers` {workers}: give 1 to 256")
+    if folder.exists() and not (folder.is_dir() and (_is_sweep(folder) or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: is not empty and no sweep; give another directory")
+    with connected(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        if cluster is not None:
+            inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
+            cluster.check(folder.absolute(), inputs=list(inputs))
+        with _table(folder, source, drives=drives) as table:
+            scenes = _scenes(drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress)
+            threads = 1 if cluster else max(workers // len(drives), 1)
+            tasks = []
+            for row, planned in enumerate(drives):
+                scene = scenes[planned.map.name] if planned.map else planned.scene
+                if isinstance(scene, str):
+                    table.set(row, DriveRow(planned.name, "failed", scene))
+                    continue
+                ready = replace(planned, scene=scene, map=None)
+                earlier = None if overwrite or table.rows[row].state != "done" else table.rows[row]
+                task = _Task(row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier)
+                try:
+                    tasks.append(_with_pick(task, progress=progress))
+                except (GeosceneError, LidarError, OSError) as error:
+                    table.set(row, DriveRow(planned.name, "failed", _one_line(error)))
+            progress("drives", 0, total=len(tasks))
+            for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
+                table.set(row, result)
+                progress("drives", done, total=len(tasks))
+    return SweepSummary(folder, tuple(table.rows))
+
+
+def _scenes(
+    drives: Sequence[GridDrive], folder: Path, *, workers: int, cluster: Cluster | None, progress: Progress
+) -> dict[str, Path | str]:
+    """Scenes of maps by name, in folder ``scenes``, each built once, as needed; or why it cannot be built."""
+    scenes: dict[str, Path | str] = {}
+    for one in {planned.map.name: planned.map for planned in drives if planned.map}.values():
+        try:
+            scenes[one.name] = one.built(
+                folder / "scenes", workers=workers, cluster=cluster, progress=progress
+            )
+        except (GeosceneError, LidarError, OSError) as error:
+            scenes[one.name] = f"map {one.name}: {_one_line(error)}"
+        except Exception as error:  # one map's defect must not end the others
+            log.exception("map %s", one.name)
+            scenes[one.name] = f"map {one.name}: {type(error).__name__}: {_one_line(error)}"
+    return scenes
+
+
+def _one_line(error: Exception) -> str:
+    """The text of an error without line breaks."""
+    return " ".join(str(error).split())
+
+
+def _is_sweep(folder: Path) -> bool:
+    return (folder / _TABLE).is_file()
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One drive to record.
+
+    row     : in the table
+    folder  : of the sweep
+    earlier : its row in the table of an earlier run that finished it
+    """
+
+    row: int
+    drive: GridDrive
+    folder: Path
+    threads: int
+    overwrite: bool
+    earlier: DriveRow | None = None
+    pick: Pick | None = None
+
+
+def _with_pick(task: _Task, *, progress: Progress) -> _Task:
+    """The task with what is picked for its drive, here, as one profile serves many drives."""
+    planned = task.drive
+    if not planned.wanted.picks:
+        return task
+    options = replace(planned.options, workers=task.threads)
+    out = None if task.overwrite else task.folder / planned.name
+    with using(open_scene(planned.scene), known=LidarError) as scene:
+        pick = picked(scene, options, wanted=planned.wanted, out=out, progress=progress)
+    return replace(task, pick=pick and replace(pick, planned=None))
+
+
+def _results(
+    tasks: Sequence[_Task], *, workers: int, cluster: Cluster | None
+) -> Iterator[tuple[int, DriveRow]]:
+    """Rows of the table as the drives end, with their numbers."""
+    if cluster is not None:
+        yield from cluster.run_tasks(_recorded, tasks)
+        return
+    waiting = {task.row: task for task in tasks}
+    try:
+        for row, result in run_tasks(_recorded, tasks, workers=workers):
+            del waiting[row]
+            yield row, result
+    except (
+        WorkersLostError
+    ):  # one at a time needs the least memory, and shows which drives cannot be recorded
+        for task in waiting.values():
+            try:
+                yield from run_tasks(_recorded, [task], workers=1)
+            except WorkersLostError as error:
+                yield task.row, DriveRow(task.drive.name, "failed", str(error))
+
+
+def _recorded(task: _Task) -> tuple[int, DriveRow]:
+    """Record a drive; its row of the table. Run by workers."""
+    name, out = task.drive.name, task.folder / task.drive.name
+    options = replace(task.drive.options, workers=task.threads)
+    try:
+        with using(open_scene(task.drive.scene), known=LidarError) as scene:
+            if task.earlier is not None and _is_unchanged(task, scene, options=options):
+                return task.row, task.earlier
+            checked = driven(
+                scene,
+                out,
+                options=options,
+                wanted=task.drive.wanted,
+                pick=task.pick,
+                overwrite=task.overwrite,
+            )
+    except (GeosceneError, LidarError, OSError) as error:
+        return task.row, DriveRow(name, "failed", _one_line(error))
+    except Exception as error:  # one drive's defect must not end the others
+        log.exception("drive %s", name)
+        return task.row, DriveRow(name, "failed", f"{type(error).__name__}: {_one_line(error)}")
+    done = checked.summary
+    return task.row, DriveRow(
+        name,
+        "done",
+        frames=len(read_journal(Paths(out).journal)),
+        points=sum(done.points.values()),
+        seconds=done.duration,
+        metres=round(done.length, 3),
+        digest=digest_of(Paths(out).journal),
+        files=_digest_of_folder(out),
+        picked=task.pick.label if task.pick else "",
+        reached=checked.reached.reached.to_text("are") if checked.reached else "",
+    )
+
+
+def _is_unchanged(task: _Task, scene: Scene, *, options: DriveOptions) -> bool:
+    """Whether a drive is there as an earlier run finished it, of the same version, scene and options.
+
+    Whether other settings would be picked, or their errors checked again, is not known without a plan.
+    """
+    out, wanted = task.folder / task.drive.name, task.drive.wanted
+    if task.earlier is None or wanted.picks or wanted.checks or not Paths(out).manifest.exists():
+        return False
+    manifest = open_dataset(out).manifest
+    recipe = json.loads(json.dumps(options.recipe(scene)))
+    known = {"generator": _GENERATOR, "recipe": recipe}
+    return (
+        known.items() <= manifest.items()
+        and manifest["scene"]["path"] == scene.location
+        and _digest_of_folder(out) == task.earlier.files
+    )
+
+
+def _digest_of_folder(folder: Path) -> str:
+    """Digest of the names and contents of all files in a folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    text = "".join(f"{path.relative_to(folder)} {digest_of(path)}\n" for path in files)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+class _Table:
+    """The files ``sweep.json`` and ``sweep.csv`` of a sweep."""
+
+    def __init__(self, folder: Path, source: str, *, drives: Sequence[GridDrive]) -> None:
+        self._folder, self._source, self._drives = folder, source, drives
+        earlier = self._finished()
+        self.rows = [earlier.get(drive.name, DriveRow(drive.name)) for drive in drives]
+        self._written = 0.0
+
+    def _finished(self) -> dict[str, DriveRow]:
+        """Rows by name of the drives that an earlier run has finished; none if its table is damaged."""
+        names = [field.name for field in fields(DriveRow)]
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            drives = json.loads((self._folder / _TABLE).read_text("utf-8"))["drives"]
+            rows = [DriveRow(*(drive[name] for name in names)) for drive in drives]
+            return {row.name: row for row in rows if row.state == "done"}
+        return {}
+
+    def set(self, row: int, result: DriveRow) -> None:
+        """Set a row; the files follow within seconds, while rows are set."""
+        self.rows[row] = result
+        if time.monotonic() - self._written > _SECONDS:
+            self.write()
+
+    def write(self) -> None:
+        """Write the files."""
+        documents: list[dict[str, Any]] = [
+            {**asdict(row), "options": drive.values}
+            for row, drive in zip(self.rows, self._drives, strict=True)
+        ]
+        write_json(
+            self._folder / _TABLE,
+            {"schema": 1, "generator": _GENERATOR, "grid": self._source, "drives": documents},
+        )
+        names = list(dict.fromkeys(name for drive in self._drives for name in drive.values))
+        columns = {name: [drive.values.get(name, "") for drive in self._drives] for name in names}
+        figures = {name: [row[name] for row in map(asdict, self.rows)] for name in asdict(self.rows[0])}
+        clash = {f"option {name}" if name in figures else name: values for name, values in columns.items()}
+        write_columns(self._folder / "sweep.csv", {k: np.array(v) for k, v in (figures | clash).items()})
+        self._written = time.monotonic()
+
+
+@contextmanager
+def _table(folder: Path, source: str, *, drives: Sequence[GridDrive]) -> Iterator[_Table]:
+    """Yield the table of a sweep, written at the start and at the end, however that comes."""
+    table = _Table(folder, source, drives=drives)
+    table.write()
+    try:
+        yield table
+    finally:
+        table.write()

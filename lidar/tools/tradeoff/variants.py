@@ -1,0 +1,329 @@
+"""Settings to compare: the user's with some of them changed, and the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Generic, TypeVar
+
+from geoscene.options import RELIEFS
+from lidar.raycast import PRECISIONS
+from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.physics.settings import MOST_RAYS, POSES, ScannerSettings
+from lidar.settings import text_of
+from lidar.world.settings import ORIGINS, WorldSettings
+from lidar.world.settings import PLAIN as WHOLE
+
+RAYS = 217
+"""Rays per pulse of the reference, unless more are asked for."""
+
+SCANNER_VALUES: dict[str, tuple[Any, ...]] = {
+    "rays": (1, 7, 19, 37, 61, 127),
+    "poses": POSES,
+    "precision": PRECISIONS,
+    "retrace": (True, False),
+    "mirrors": (True, False),
+    "foliage": (True, False),
+}
+"""Values of the scanner's settings that are compared, by setting."""
+
+CAMERA_VALUES: dict[str, tuple[Any, ...]] = {
+    "supersample": (1, 2, 3, 4),
+    "edge_rays": (1, 2, 3),
+    "blur": (1, 5, 9, 17),
+    "shadows": (True, False),
+    "detail": (True, False),
+    "resolution": (1, 2, 4),
+    "precision": PRECISIONS,
+    "retrace": (True, False),
+    "haze": (20_000.0, float("inf")),
+}
+"""Values of the camera's settings that are compared; resolution divides width and height."""
+
+WORLD_VALUES: dict[str, tuple[Any, ...]] = {
+    "origin": ORIGINS,
+    "reach": (25.0, 50.0, 100.0),
+    "forests": (True, False),
+    "trees": (True, False),
+    "furniture": (True, False),
+    "barriers": (True, False),
+    "relief": ("off", "plain"),
+}
+"""Values of the world's settings that are compared, by setting."""
+
+KINDS = ("forests", "trees", "furniture", "barriers")
+"""Settings that leave kinds of objects out of the world."""
+
+OF_EMBREE = frozenset({"precision", "retrace", "origin"})
+"""Settings that act on Embree's float32 rays only: alone, they are cast by Embree."""
+
+MODELS = frozenset({"mirrors", "foliage", "haze", "relief"})
+"""Settings that change what is modelled: the difference that they make is no error."""
+
+CHEAPER: tuple[tuple[tuple[str, Any], ...], ...] = (
+    (("precision", "float32"),),
+    (("reach", 50.0),),
+    (("forests", False),),
+)
+"""Changes that combinations make to a scanner's number of rays, one after the other."""
+
+CHEAPER_IMAGES: tuple[tuple[tuple[str, Any], ...], ...] = ((("resolution", 2),), (("shadows", False),))
+"""Changes that combinations make to a camera's number of rays, one after the other."""
+
+SAMPLES = 16
+"""Rays along each side of a pixel of the reference; of an exposure with motion blur `BLURRED`."""
+
+BLURRED, MOMENTS = 4, 64
+"""Rays along each side of a pixel, and samples of the exposure, of the reference of a blurred image."""
+
+S = TypeVar("S", ScannerSettings, CameraSettings)
+
+
+@dataclass(frozen=True, slots=True)
+class Variant(Generic[S]):
+    """One row of a comparison of settings of a scanner or a camera.
+
+    changes : name and value of each setting that is changed; empty for the user's own settings
+    used    : the user's settings with these changed, without random effects
+    alone   : the reference's settings with these changed
+    world, alone_world : settings of the world of either
+    scene   : number of the scene, 0 for the first
+    traffic : whether other road users are in the world
+    """
+
+    changes: tuple[tuple[str, Any], ...]
+    used: S
+    alone: S
+    world: WorldSettings
+    alone_world: WorldSettings
+    scene: int = 0
+    traffic: bool = True
+
+    @property
+    def label(self) -> str:
+        """Names and values of what is changed; empty for the user's own settings."""
+        return " ".join(f"{name}={text_of(value)}" for name, value in self.changes)
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of what is changed."""
+        return frozenset(name for name, _ in self.changes)
+
+    @property
+    def choice(self) -> bool:
+        """Whether a drive in this world may choose it: not another model, scene or traffic."""
+        return not self.names & (MODELS | {"scene", "traffic"})
+
+    @property
+    def resolution(self) -> int:
+        """Pixels of a camera's side that are one pixel of the image."""
+        return int(dict(self.changes).get("resolution", 1))
+
+
+@dataclass(frozen=True, slots=True)
+class Basis(Generic[S]):
+    """What variants are made of.
+
+    used  : the user's settings, without random effects
+    exact : the reference's
+    world : the user's settings of the world
+    built : relief of the scene, of `geoscene.options.RELIEFS`
+    """
+
+    used: S
+    exact: S
+    world: WorldSettings = WHOLE
+    built: str = "off"
+
+    def variant(
+        self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
+    ) -> Variant[S]:
+        """The variant with some settings changed."""
+        changes = tuple(changes)
+        values = dict(changes)
+        return Variant(
+            changes,
+            _changed(self.used, values),
+            _changed(self.exact, values),
+            world=_changed(self.world, values),
+            alone_world=_changed(WHOLE, values),
+            scene=scene,
+            traffic=traffic,
+        )
+
+    def value(self, name: str) -> Any:
+        """The user's value of a setting of the sensor or of the world."""
+        if name == "relief" and self.world.relief == "scene":
+            return self.built
+        for group in (self.used, self.world):
+            if hasattr(group, name):
+                return getattr(group, name)
+        return 1  # resolution
+
+    def others(self, name: str, values: Sequence[Any]) -> list[Any]:
+        """The values of a setting that differ from the user's; of relief, those that the scene holds."""
+        if name == "relief":
+            values = [value for value in values if value in RELIEFS[: RELIEFS.index(self.built) + 1]]
+        return [value for value in values if value != self.value(name)]
+
+    def described(self, values: Mapping[str, Any]) -> str:
+        """The user's values: of the sensor's settings all, of the world's those that leave something out."""
+        shown = [n for n in values if hasattr(self.used, n)]
+        shown += [n for n in WORLD_VALUES if getattr(self.world, n) != getattr(WHOLE, n)]
+        return ", ".join(f"{name}={text_of(self.value(name))}" for name in shown)
+
+
+_Any = TypeVar("_Any", ScannerSettings, CameraSettings, WorldSettings)
+
+
+def _changed(settings: _Any, values: Mapping[str, Any]) -> _Any:
+    """Settings with those values that they have."""
+    own = {f.name for f in fields(settings)}
+    return replace(settings, **{name: value for name, value in values.items() if name in own})
+
+
+def noiseless(settings: ScannerSettings) -> ScannerSettings:
+    """The settings without random effects and without the sensor's own imperfections.
+
+    What decides which surfaces are seen stays: incidence law, extinction, threshold, mirrors and foliage.
+    """
+    return replace(
+        settings,
+        spread=0.0,
+        link=settings.link or settings.detection,
+        detection=False,
+        daylight_lux=0.0,
+        blooming=False,
+        interference=0,
+        false_alarms=False,
+        range_noise="none",
+        stretch=False,
+        bias=False,
+        walk=False,
+        angle_noise=False,
+        quantise=False,
+    )
+
+
+def reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
+    """The reference of settings: a pose for every firing and a dense footprint; cast it in float64."""
+    return replace(noiseless(settings), poses="firing", precision="exact", retrace=True, rays=rays)
+
+
+def next_step(rays: int) -> int:
+    """The number of rays that shows whether a reference has converged: half as many more."""
+    return min(rays + rays // 2 + rays % 2, MOST_RAYS)
+
+
+def scanner_basis(
+    settings: ScannerSettings, *, rays: int, world: WorldSettings = WHOLE, built: str = "off"
+) -> Basis[ScannerSettings]:
+    """The basis of variants of a scanner; ``rays`` are the reference's, ``built`` is the scene's relief."""
+    return Basis(noiseless(settings), reference(settings, rays=rays), world, built)
+
+
+def scanner_variants(
+    basis: Basis[ScannerSettings],
+    *,
+    compared: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    traffic: bool = False,
+) -> list[Variant[ScannerSettings]]:
+    """The user's settings, these with one of them changed, and combinations of cheap ones.
+
+    compared : names of settings; all by default
+    scenes   : labels of the scenes after the first
+    traffic  : whether there are other road users, to be left out in one variant
+    """
+    rows = _variants(
+        basis, SCANNER_VALUES, compared=compared, scenes=scenes, traffic=traffic, cheaper=CHEAPER
+    )
+    return [row for row in rows if row.used.rays < basis.exact.rays or not row.changes]
+
+
+def camera_basis(
+    settings: CameraSettings, *, exposed: bool, world: WorldSettings = WHOLE, built: str = "off"
+) -> Basis[CameraSettings]:
+    """The basis of variants of a camera.
+
+    exposed : whether its exposure lasts some time
+    built   : relief of the scene
+    """
+    used = replace(settings, camera_noise=False)
+    exact = replace(used, precision="exact", retrace=True, shadows=True, detail=True)
+    if exposed:
+        return Basis(used, replace(exact, supersample=BLURRED, blur=MOMENTS), world, built)
+    return Basis(used, replace(exact, supersample=SAMPLES), world, built)
+
+
+def coarser(settings: CameraSettings) -> CameraSettings:
+    """A reference with about half as many rays per pixel, which shows whether it has converged."""
+    return replace(settings, supersample=round(settings.supersample / 2**0.5))
+
+
+def camera_variants(
+    basis: Basis[CameraSettings],
+    *,
+    compared: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    traffic: bool = False,
+) -> list[Variant[CameraSettings]]:
+    """As `scanner_variants`, of a camera."""
+    return _variants(
+        basis,
+        CAMERA_VALUES,
+        compared=compared,
+        scenes=scenes,
+        traffic=traffic,
+        cheaper=CHEAPER_IMAGES,
+    )
+
+
+def _variants(
+    basis: Basis[S],
+    values: Mapping[str, Sequence[Any]],
+    *,
+    compared: Sequence[str],
+    scenes: Sequence[str],
+    traffic: bool,
+    cheaper: Sequence[Sequence[tuple[str, Any]]],
+) -> list[Variant[S]]:
+    """Variants of settings of a sensor, whose first one counts its rays, and of the world."""
+    chosen = {n: v for n, v in {**values, **WORLD_VALUES}.items() if not compared or n in compared}
+    rows = [basis.variant()]
+    rows += [
+        basis.variant([(name, value)])
+        for name, known in chosen.items()
+        for value in basis.others(name, known)
+    ]
+    if not compared or "scene" in compared:
+        rows += [basis.variant([("scene", text)], scene=k + 1) for k, text in enumerate(scenes)]
+    if traffic and (not compared or "traffic" in compared):
+        rows.append(basis.variant([("traffic", False)], traffic=False))
+    first = next(iter(values))
+    steps = [
+        [(name, value) for name, value in step if name in chosen and value != basis.value(name)]
+        for step in cheaper
+    ]
+    for value in chosen.get(first, ()):
+        changes = [] if value == basis.value(first) else [(first, value)]
+        for step in filter(None, steps):
+            changes = changes + step
+            if len(changes) > 1:
+                rows.append(basis.variant(changes))
+    return rows
+
+
+def without_each(basis: Basis[S], variant: Variant[S]) -> Iterator[tuple[str, Variant[S]]]:
+    """Each change of a variant, as text, and the variant without it."""
+    for k, (name, value) in enumerate(variant.changes):
+        rest = variant.changes[:k] + variant.changes[k + 1 :]
+        left = {n for n, _ in rest}
+        yield (
+            f"{name}={text_of(value)}",
+            basis.variant(
+                rest,
+                scene=variant.scene if "scene" in left else 0,
+                traffic=variant.traffic if "traffic" in left else True,
+            ),
+        )

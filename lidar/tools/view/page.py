@@ -1,0 +1,154 @@
+"""The page that plays a drive: frames, player and style in one HTML file."""
+
+from __future__ import annotations
+
+import html
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import SpooledTemporaryFile
+from typing import IO, Any
+
+from geoscene.export.files import compact_json
+from geoscene.support.files import atomic_file, exclusive, spool
+from geoscene.support.progress import Progress, silent
+from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
+from lidar.dataset.layout import Dataset
+from lidar.errors import InputError
+from lidar.options import PlaybackOptions
+from lidar.tools.view.drive import Drive
+from lidar.tools.view.sweeps import pack_slots
+
+SHARED = ("blob.js", "camera.js", "gestures.js", "program.js")
+"""Parts of the page of scenes that the player uses."""
+
+SCRIPTS = ("sweep.js", "draw.js", "panels.js", "player.js")
+"""The player's own parts, in the order in which they are joined."""
+
+
+@dataclass(frozen=True, slots=True)
+class PageSummary:
+    """What a page holds.
+
+    path    : the file
+    bytes   : of it
+    frames  : sweeps
+    images  : of cameras
+    returns : in the sweeps
+    notes   : what a user must know of it, one line each
+    """
+
+    path: Path
+    bytes: int
+    frames: int
+    images: int
+    returns: int
+    notes: tuple[str, ...]
+
+
+def view_drive(
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    options: PlaybackOptions = PlaybackOptions(),
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> PageSummary:
+    """Write a drive as one web page that a browser opens from disk and plays; returns its contents.
+
+    The page loads nothing: data, style and player (WebGL 2) are in it. Its bytes depend on the dataset, the
+    scene's roads and the options alone.
+
+    Raises InputError for a file that exists or is not named as a page, for sensors and frames that the
+    dataset does not have, and for a page that would be too large; the message then gives a selection that
+    would fit. Raises DatasetError for damaged files and a dataset without clouds in the sensor frame.
+    """
+    out = Path(out)
+    check_page(out, overwrite=overwrite)
+    drive = Drive(dataset, options)
+    head = drive.head()
+    returns = 0
+    written: set[str] = set()
+    swept: set[str] = set()
+    with exclusive(out), atomic_file(out) as file, spool(out) as blobs:
+        _write_slots(blobs, drive)
+        for k in range(len(drive)):
+            progress("page", k, total=len(drive))
+            for number, scanner in enumerate(drive.scanners):
+                row = int(scanner.index[k])
+                if (name := f"sweep-{number}-{row}") not in swept:
+                    count, data = drive.sweep(row, scanner=number)
+                    returns += count
+                    write_blob(blobs, name, data=data)
+                    swept.add(name)
+            for number, camera in enumerate(drive.cameras):
+                for kind in camera.kinds:
+                    image = int(camera.index[k])
+                    if (name := f"image-{number}-{kind}-{image}") not in written:
+                        write_blob(blobs, name, data=drive.image(number, image, kind=kind))
+                        written.add(name)
+            if blobs.tell() > options.max_mb * 1e6:
+                raise InputError(_too_large(drive, options, done=k + 1, size=blobs.tell()))
+        write_player(file, drive, head=head, blobs=blobs)
+    notes = (*drive.notes, *_left_out(drive))
+    return PageSummary(out, out.stat().st_size, len(drive), len(written), returns, notes)
+
+
+def write_player(
+    file: IO[bytes], drive: Drive, *, head: dict[str, Any], blobs: IO[bytes], served: bool = False
+) -> None:
+    """Write the player's page.
+
+    blobs  : elements with the bytes of frames
+    served : frames come from the server of the page instead; nothing else can be loaded
+    """
+    words = {
+        "title": html.escape(f"{head['name']}, {', '.join(one['name'] for one in head['scanners'])}"),
+        "credit": linked(str(drive.dataset.manifest.get("attribution", ""))),
+        "connect": "'self'" if served else "'none'",
+        "style": part("page.css", package="lidar.tools.view"),
+        "head": script_text(compact_json(head | {"served": served}).decode()),
+        "script": "\n".join(
+            [part(name) for name in SHARED] + [part(name, package="lidar.tools.view") for name in SCRIPTS]
+        ),
+    }
+    write_page(file, part("page.html", package="lidar.tools.view"), words=words, blobs=blobs)
+
+
+def _write_slots(blobs: IO[bytes], drive: Drive) -> None:
+    """Write the table of directions of each scanner."""
+    for number, slots in enumerate(drive.slots):
+        write_blob(blobs, f"slots-{number}", data=pack_slots(slots))
+
+
+def served_page(drive: Drive) -> bytes:
+    """The page of a server, which asks it for frames."""
+    with SpooledTemporaryFile() as blobs, SpooledTemporaryFile() as file:
+        _write_slots(blobs, drive)
+        write_player(file, drive, head=drive.head(), blobs=blobs, served=True)
+        file.seek(0)
+        return file.read()
+
+
+def _left_out(drive: Drive) -> list[str]:
+    """What of the dataset is not shown."""
+    names = {*(shown.clouds.name for shown in drive.scanners), *(camera.name for camera in drive.cameras)}
+    notes = []
+    if left := [name for name in drive.dataset.sensors("lidar", "camera") if name not in names]:
+        notes.append(f"sensors left out: {', '.join(left)} (name scanners and cameras by `sensors`)")
+    if len(drive) < len(drive.clouds.files):
+        notes.append(f"{len(drive)} of {len(drive.clouds.files)} frames")
+    return notes
+
+
+def _too_large(drive: Drive, options: PlaybackOptions, *, done: int, size: int) -> str:
+    """Error text: how large the page would be, and a selection of frames that would fit."""
+    limit = options.max_mb
+    whole = size / done * len(drive) / 1e6
+    fits = max(1, int(0.9 * limit * 1e6 / size * done))
+    message = f"the page would have about {max(whole, 1.01 * limit):.3g} MB and `max_mb` is {limit:g}"
+    every = options.every * -(-len(drive) // fits)
+    frames = drive.clouds.frames[drive.rows]
+    end = int(frames[min(fits, len(frames) - 1)])
+    return (
+        f"{message}; `every` {every} fits, `frames` {int(frames[0])}:{end} too; or serve all of it (--serve)"
+    )

@@ -1,3 +1,0 @@
-"""A recorded drive as one web page, served frame by frame, or in a window."""
-
-from lidar.view.page import view_drive as view_drive

@@ -1,0 +1,142 @@
+"""Position of the sun and daylight against almanacs and physics."""
+
+from datetime import UTC, datetime, timedelta
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from geoscene.geometry.frames import Frame
+from lidar.errors import InputError
+from lidar.sensors.camera.light import daylight
+from lidar.sensors.camera.sun import refraction, sun_direction, sun_position
+
+# Computed with Astropy 7 (ERFA): azimuth and elevation without an atmosphere, degrees.
+ALMANAC = [
+    ("Helsinki", 24.9384, 60.1699, "2024-06-21T10:00:00+00:00", 171.5275, 53.0623),
+    ("New York", -73.9857, 40.7484, "2024-03-20T20:30:00+00:00", 242.9588, 28.2044),
+    ("Sydney", 151.2093, -33.8688, "2025-01-05T23:00:00+00:00", 86.0738, 48.9016),
+    ("Quito", -78.4678, -0.1807, "2023-12-22T17:00:00+00:00", 172.8345, 66.5484),
+    ("Tromso", 18.9553, 69.6492, "2024-06-21T22:45:00+00:00", 359.7250, 3.0812),
+    ("Monaco", 7.4246, 43.7384, "2026-09-01T07:15:00+00:00", 102.5716, 24.4718),
+    ("London", -0.1276, 51.5072, "1999-08-11T10:11:00+00:00", 137.0584, 47.1864),
+    ("Tokyo", 139.6917, 35.6895, "2030-11-03T03:00:00+00:00", 190.8990, 38.5865),
+]
+
+
+@pytest.mark.parametrize(("place", "lon", "lat", "when", "azimuth", "elevation"), ALMANAC)
+def test_sun_positions_agree_with_astropy(place, lon, lat, when, azimuth, elevation):
+    a, e = sun_position(datetime.fromisoformat(when), lon, lat_deg=lat)
+    true = e - refraction(np.radians(elevation))
+    assert abs(np.degrees(a) - azimuth) < 0.02, place
+    assert abs(np.degrees(true) - elevation) < 0.02, place
+
+
+def test_sun_position_agrees_with_the_published_example():
+    # Reda and Andreas, NREL/TP-560-34302 (2008), appendix A.5: zenith 50.11162, azimuth 194.34024.
+    when = datetime.fromisoformat("2003-10-17T12:30:30-07:00")
+    azimuth, elevation = np.degrees(sun_position(when, -105.1786, lat_deg=39.742476))
+    assert abs(azimuth - 194.34024) < 0.01
+    assert abs(90 - elevation - 50.11162) < 0.01
+
+
+def test_refraction_lifts_the_setting_sun_by_its_own_width():
+    # 34' at the horizon is the almanacs' round figure; the disc is 32' wide.
+    assert abs(np.degrees(refraction(0.0)) * 60 - 29) < 2  # true elevation 0, seen 29' up
+    assert abs(np.degrees(refraction(np.radians(-0.575))) * 60 - 34.5) < 1
+    assert np.degrees(refraction(np.radians(45.0))) * 3600 == pytest.approx(58, abs=1)
+    assert refraction(np.radians(90.0)) == 0
+
+
+def test_a_time_without_a_zone_is_refused():
+    with pytest.raises(InputError, match="zone"):
+        sun_position(datetime(2024, 1, 1, 12), 0.0, lat_deg=0.0)  # noqa: DTZ001
+
+
+def test_sun_directions_are_rotated_to_grid_north():
+    # Far from its central meridian a UTM grid is rotated by over a degree.
+    when = datetime(2024, 6, 21, 10, tzinfo=UTC)
+    local = sun_direction(Frame.at(24.9384, 60.1699), when)
+    utm = sun_direction(Frame.at(24.9384, 60.1699, crs="utm"), when)
+    turn = np.arctan2(utm[0], utm[1]) - np.arctan2(local[0], local[1])
+    lon_from_meridian = np.radians(24.9384 - 27)
+    assert turn == pytest.approx(-lon_from_meridian * np.sin(np.radians(60.1699)), rel=0.01)
+    assert local[2] == pytest.approx(utm[2], abs=1e-6)
+
+
+@settings(max_examples=50, deadline=None)
+@given(lon=st.floats(-180, 180), lat=st.floats(-89, 89), hours=st.integers(0, 24 * 365 * 30))
+def test_direction_and_position_agree(lon, lat, hours):
+    when = datetime(2000, 1, 1, tzinfo=UTC) + timedelta(hours=hours)
+    azimuth, elevation = sun_position(when, lon, lat_deg=lat)
+    s = sun_direction(Frame.at(lon, lat), when)
+    assert np.linalg.norm(s) == pytest.approx(1.0)
+    assert np.arcsin(s[2]) == pytest.approx(elevation, abs=1e-4)
+    if abs(s[2]) < 0.99:
+        off = (np.arctan2(s[0], s[1]) - azimuth + np.pi) % (2 * np.pi) - np.pi
+        assert abs(off) < 1e-3
+
+
+def _sun(elevation_deg):
+    e = np.radians(elevation_deg)
+    return daylight([np.cos(e), 0.0, np.sin(e)])
+
+
+def test_light_reddens_and_fades_towards_evening():
+    beams = [_sun(e).beam for e in (60, 30, 10, 3)]
+    assert all((a > b).all() for a, b in pairwise(beams))
+    redness = [b[0] / b[2] for b in beams]
+    assert redness == sorted(redness)
+    assert _sun(-2).beam.max() == 0.0
+
+
+def test_the_clear_sky_is_blue_overhead_and_paler_below():
+    light = _sun(45)
+    zenith, horizon = light.sky[-1].mean(axis=0), light.horizon
+    assert zenith[2] > 1.3 * zenith[0]
+    assert zenith[2] / zenith[0] > horizon[2] / horizon[0]
+    assert horizon.mean() > zenith.mean()
+
+
+def test_ambient_light_falls_mostly_from_above():
+    light = _sun(45)
+
+    def on(normal):
+        x, y, z = normal
+        basis = [
+            0.282095, 0.488603 * y, 0.488603 * z, 0.488603 * x, 1.092548 * x * y, 1.092548 * y * z,
+            0.315392 * (3 * z * z - 1), 1.092548 * x * z, 0.546274 * (x * x - y * y),
+        ]  # fmt: skip
+        return float((np.array(basis) @ light.ambient).mean())
+
+    assert on((0, 0, 1)) > on((0, 1, 0)) > 0
+    assert on((1, 0, 0)) > on((-1, 0, 0))  # the sky is brighter around the sun
+
+
+@pytest.mark.parametrize("elevation", [90, 45, 5, 0, -0.2, -6, -40, -90])
+def test_light_and_exposure_are_positive_at_any_hour(elevation):
+    light = _sun(elevation)
+    for values in (light.beam, light.ambient, light.sky, light.horizon):
+        assert np.isfinite(values).all()
+    assert (light.sky > 0).all()
+    assert 0 < light.exposure < np.inf
+
+
+@pytest.mark.parametrize(("cloud", "share"), [(0.0, 1.0), (0.5, 0.929), (1.0, 0.25)])
+def test_clouds_take_the_share_of_the_light_that_kasten_and_czeplak_measured(cloud, share):
+    e = np.radians(40.0)
+    towards = [np.cos(e), 0.0, np.sin(e)]
+    clear, light = daylight(towards), daylight(towards, cloud=cloud)
+    assert clear.exposure / light.exposure == pytest.approx(share, abs=1e-3)
+    assert (light.sky > 0).all()
+
+
+def test_an_overcast_sky_is_three_times_as_bright_overhead_as_at_the_horizon():
+    e = np.radians(40.0)
+    light = daylight([np.cos(e), 0.0, np.sin(e)], cloud=1.0)
+    assert light.beam.max() == 0
+    np.testing.assert_allclose(light.sky[-1].mean(axis=0) / light.sky[0].mean(axis=0), 3.0)
+    # Fog in this light is bright: 0.7 to 0.9 of full scale.
+    assert 0.7 < light.mean[1] * light.exposure < 0.9

@@ -1,0 +1,290 @@
+"""Figures show the numbers of the dataset, and refuse what it lacks with one line."""
+
+import base64
+import csv
+import io
+import json
+import math
+import re
+import shutil
+from collections import Counter
+from typing import get_args
+
+import numpy as np
+import pytest
+from helpers.drives import record
+from helpers.programs import run_program
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from PIL import Image
+from pyproj import Geod
+
+import lidar
+import lidar.cli.look
+from geoscene.classes import Class, class_codes
+from lidar.dataset.formats import read_table
+from lidar.dataset.formats.table import placed_returns
+from lidar.dataset.layout import open_dataset
+from lidar.geometry.mounts import Mount
+from lidar.options import DriveOptions
+from lidar.tools.plots import FIGURES, plot
+from lidar.tools.plots.coverage import _coarser
+from lidar.tools.plots.drawn import thinned
+from lidar.tools.plots.sweeps import _image_sides
+
+SCANNER = "lidar_top"
+
+
+@pytest.fixture(scope="module")
+def drive(scene, tmp_path_factory):
+    return record(scene, tmp_path_factory.mktemp("drive") / "drive")
+
+
+def clouds(drive):
+    return [read_table(path) for path in sorted((drive / SCANNER / "pcd").glob("*.pcd"))]
+
+
+def drawn(drive, tmp_path, what, *words):
+    """The SVG of a figure, and the numbers that the program tells of it."""
+    out = tmp_path / f"{what}.svg"
+    done = run_program("lidar", "plot", what, drive, *words, "-o", out, "--json")
+    assert done.returncode == 0, done.stderr
+    return out.read_text("utf-8"), json.loads(done.stdout)
+
+
+def series(svg, name):
+    """Corners (n, 2) of the line of a series, pixels."""
+    (line,) = re.findall(rf'<polyline data-name="{name}" points="([^"]+)"', svg)
+    return np.array([pair.split(",") for pair in line.split()], float)
+
+
+def straight(shown, expected):
+    """Largest deviation of pixels from a linear function of the values, pixels."""
+    expected = np.asarray(expected, float)
+    fit = np.polyfit(expected, shown, 1)
+    return np.abs(np.polyval(fit, expected) - shown).max()
+
+
+def images(svg):
+    """Images (h, w, 3) of the rasters of a figure, without those of scales."""
+    found = re.findall(r'<image data-name="[^"]+"[^>]*base64,([^"]+)"', svg)
+    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")) for data in found]
+
+
+def test_the_program_offers_every_figure():
+    assert get_args(lidar.cli.look.Plotted) == ("weather", *FIGURES)
+
+
+@pytest.mark.parametrize("what", FIGURES)
+def test_every_figure_is_a_png_and_the_same_bytes_again(drive, tmp_path, what):
+    once, again = tmp_path / "a.png", tmp_path / "b.png"
+    for out in (once, again):
+        plot(open_dataset(drive), what, out=out)
+    assert once.read_bytes() == again.read_bytes()
+    picture = np.asarray(Image.open(once))
+    assert picture.shape[1] >= 700
+    edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+    assert (edge == 255).all(), "nothing is cut off"
+
+
+def test_the_speed_is_that_of_the_trajectory(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "speed")
+    with (drive / "trajectory.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    speed = [float(np.linalg.norm([float(row[k]) for k in ("vx", "vy", "vz")])) for row in rows]
+    shown = series(svg, "speed")
+    assert len(shown) == len(rows)
+    assert straight(shown[:, 0], [int(row["time_ns"]) for row in rows]) < 0.02
+    assert straight(shown[:, 1], speed) < 0.02
+    assert told["maximum_speed_m_s"] == pytest.approx(max(speed))
+    manifest = json.loads((drive / "dataset.json").read_text())
+    assert told["length_m"] == pytest.approx(manifest["length_m"], rel=0.01)
+
+
+def test_returns_by_range_are_those_of_the_clouds(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "returns", "--frames", "1:4")
+    tables = clouds(drive)[1:4]
+    distance = np.concatenate([np.sqrt(sum(t[k].astype(float) ** 2 for k in "xyz")) for t in tables])
+    assert told["returns"] == len(distance)
+    assert told["median_m"] == pytest.approx(np.median(distance), abs=told["bin_m"])
+    shown = series(svg, "all")[::2, 1]
+    counts = np.histogram(distance, np.arange(len(shown) + 1) * told["bin_m"])[0] / 3
+    assert straight(shown[counts > 0], np.log(counts[counts > 0])) < 0.05
+    assert 'data-name="injected"' in svg, "the attack's returns are shown by their origin"
+
+
+def test_intensities_are_those_of_each_class(drive, tmp_path):
+    _, told = drawn(drive, tmp_path, "intensity")
+    label = np.concatenate([t["label"] for t in clouds(drive)])
+    value = np.concatenate([t["intensity"] for t in clouds(drive)]).astype(float)
+    for name, mean in told["mean_intensity"].items():
+        of_class = label == Class[name.replace(" ", "_").upper()]
+        assert mean == pytest.approx(value[of_class].mean(), rel=1e-5)
+    assert len(told["mean_intensity"]) == len(np.unique(label))
+
+
+def test_the_range_image_has_each_return_at_its_azimuth_and_ring(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "range-image", "--frames", "2:")
+    table = clouds(drive)[2]
+    assert (told["frame"], told["returns"]) == (2, len(table["x"]))
+    *_, by_class = images(svg)
+    azimuth = np.degrees(np.arctan2(table["y"].astype(float), table["x"].astype(float)))
+    column = np.clip(((180 - azimuth) / 360 * by_class.shape[1]).astype(int), 0, by_class.shape[1] - 1)
+    row = by_class.shape[0] - 1 - table["ring"].astype(int)
+    cell, count = np.unique(row * by_class.shape[1] + column, return_counts=True)
+    alone = np.isin(row * by_class.shape[1] + column, cell[count == 1])
+    assert alone.sum() > 100
+    shown = by_class[row[alone], column[alone]]
+    assert (shown == class_codes().color[table["label"][alone]]).all()
+
+
+def test_the_range_image_of_lasers_beside_each_other_has_no_empty_rows(scene, tmp_path):
+    rig = tmp_path / "rig.toml"
+    rig.write_text(
+        'name = "r"\n[[lidar]]\nname = "top"\npreset = "hdl64e_s3"\ntranslation = [0.0, 0.0, 1.73]\n', "utf-8"
+    )
+    lidar.drive(scene, tmp_path / "drive", options=DriveOptions(rig=str(rig), duration=0.1))
+    svg, told = drawn(tmp_path / "drive", tmp_path, "range-image")
+    assert told["rows"] == 64
+    ranges, *_ = images(svg)
+    assert (ranges != (246, 246, 248)).any(axis=(1, 2)).all()
+
+
+def test_rows_of_scanners_that_look_down_are_times():
+    table = {
+        **dict(
+            zip("xyz", np.array([[0, 0, 0], [-100, 0, 100], [-200, -200, -200]], np.float32), strict=True)
+        ),
+        "time_ns": np.array([0, 5_000_000, 10_000_000], np.uint32),
+        "ring": np.zeros(3, np.uint16),
+    }
+    angle, _, rows = _image_sides(table, Mount())
+    assert np.allclose(angle, np.degrees(np.arctan([-0.5, 0, 0.5])))
+    assert (np.diff(rows.row) > 0).all()
+    assert rows.ends == (0, 10)
+
+
+def test_coverage_counts_every_true_return(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER, "--resolution", "0.5")
+    dataset = open_dataset(drive)
+    trajectory, mount = dataset.trajectory(), np.array(dataset.sensors()[SCANNER]["vehicle_from_sensor"])
+    starts = dataset.sample_times(SCANNER).tolist()
+    cells = set()
+    returns = 0
+    for start, table in zip(starts, clouds(drive), strict=True):
+        placed, _ = placed_returns(table, trajectory, start_ns=start, vehicle_from_sensor=mount)
+        true = placed[table["label"] != Class.NOISE]
+        returns += len(true)
+        cells |= set(map(tuple, np.floor(true[:, :2] / 0.5).astype(int).tolist()))
+    assert told["returns"] == returns
+    assert told["area_m2"] == pytest.approx(0.25 * len(cells), rel=1e-3)
+    (plan,) = images(svg)
+    assert (plan != 255).any(axis=2).sum() == len(cells)
+    west, south, east, north = told["bounds_m"]
+    assert plan.shape[:2] == (round((north - south) / 0.5), round((east - west) / 0.5))
+
+
+def test_coverage_is_drawn_in_cells_that_fit(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER)
+    (plan,) = images(svg)
+    assert 200 <= max(plan.shape[:2]) <= 500
+    side = told["cell_m"]
+    assert all(math.isclose(bound / side, round(bound / side), abs_tol=1e-6) for bound in told["bounds_m"])
+    (tmp_path / "fine").mkdir()
+    fine = drawn(drive, tmp_path / "fine", "coverage", "--sensor", SCANNER, "--resolution", "0.5")[1]
+    assert told["returns"] == fine["returns"]
+
+
+@given(
+    arrays(np.uint32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 99)),
+    st.tuples(st.integers(-50, 50), st.integers(-50, 50)),
+    st.integers(1, 7),
+)
+def test_larger_cells_hold_the_counts_of_the_smaller_ones_in_them(grid, first, factor):
+    coarse, corner = _coarser(grid, np.array(first), factor=factor)
+    expected = Counter()
+    for (row, column), count in np.ndenumerate(grid):
+        expected[(column + first[0]) // factor, (row + first[1]) // factor] += int(count)
+    found = {
+        (column + corner[0], row + corner[1]): int(count) for (row, column), count in np.ndenumerate(coarse)
+    }
+    assert {cell: count for cell, count in found.items() if count} == +expected
+
+
+def test_errors_of_fixes_are_geodesic_differences(drive, tmp_path):
+    svg, told = drawn(drive, tmp_path, "gnss")
+    with (drive / "gnss.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    value = {
+        key: np.array([float(row[key]) for row in rows])
+        for key in ("lon", "lat", "h", "true_lon", "true_lat", "true_h")
+    }
+    azimuth, _, length = Geod(ellps="WGS84").inv(
+        value["true_lon"], value["true_lat"], value["lon"], value["lat"]
+    )
+    errors = {
+        "east": length * np.sin(np.radians(azimuth)),
+        "north": length * np.cos(np.radians(azimuth)),
+        "up": value["h"] - value["true_h"],
+    }
+    for direction, error in errors.items():
+        assert straight(series(svg, f"error {direction}")[:, 1], error) < 0.05
+        assert told[f"rms_{direction}_m"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-3)
+    assert told["sigma_east_m"] > 0
+    assert svg.count("<polygon data-name") == 3
+
+
+def test_long_lines_keep_their_peaks_and_gaps():
+    x = np.linspace(0, 1, 100_000)
+    y = np.sin(40 * x)
+    y[5000], y[70_000:70_200] = 9.0, np.nan
+    points = thinned(x, y)
+    assert len(points) < 7000
+    assert max(v for _, v in points if math.isfinite(v)) == 9.0
+    assert any(math.isnan(v) for _, v in points)
+    assert points == sorted(points, key=lambda p: p[0])
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("speed", "{drive}", "-o", "a.jpg"), "end"),
+        (("speed", "{drive}", "-o", "taken.png"), "--overwrite"),
+        (("speed", "{drive}", "--sensor", "gnss", "-o", "a.png"), "speed does not take it"),
+        (("returns", "{drive}", "--sensor", "lidar", "-o", "a.png"), "there are lidar_top"),
+        (("returns", "{drive}", "--frames", "80:", "-o", "a.png"), "frames 0 to 5"),
+        (("gnss", "{drive}", "--sensor", "lidar_top", "-o", "a.png"), "there are gnss"),
+        (("coverage", "{drive}", "--resolution", "0.0001", "-o", "a.png"), "coarser"),
+        (("coverage", "-o", "a.png"), "give the drive"),
+        (("weather", "{drive}", "-o", "a.png"), "without one"),
+        (("speed", "nowhere", "-o", "a.png"), "no dataset.json"),
+    ],
+)
+def test_what_cannot_be_drawn_ends_with_a_line(drive, tmp_path, words, told):
+    (tmp_path / "taken.png").write_bytes(b"")
+    run = run_program("lidar", "plot", *(word.format(drive=drive) for word in words), cwd=tmp_path)
+    assert run.returncode in (1, 2)
+    assert told in run.stderr
+    assert run.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["taken.png"]
+
+
+def test_data_that_are_missing_are_named(drive, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(drive, copy)
+    for folder in copy.glob("*/pcd"):
+        shutil.rmtree(folder)
+    calibration = json.loads((copy / "calibration.json").read_text())
+    del calibration["sensors"]["gnss"]
+    (copy / "calibration.json").write_text(json.dumps(calibration))
+    for what, told in (
+        ("returns", "--format pcd"),
+        ("range-image", "--format pcd"),
+        ("gnss", "no GNSS receiver"),
+    ):
+        run = run_program("lidar", "plot", what, copy, "-o", tmp_path / "a.png")
+        assert run.returncode != 0
+        assert told in run.stderr
+        assert run.stderr.count("\n") == 1
+    assert not (tmp_path / "a.png").exists()
