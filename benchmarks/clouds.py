@@ -34,7 +34,7 @@ from geoscene.clouds.survey import with_clouds
 from geoscene.ground.terrain import base_heights
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline.build import build
-from geoscene.pipeline.plan import Plan, make_plan
+from geoscene.pipeline.plan import BuildPlan, make_plan
 from geoscene.sources import OsmData, read_osm
 from geoscene.sources.data import Tags
 from geoscene.support.progress import silent
@@ -89,7 +89,7 @@ def spoil(given: argparse.Namespace) -> None:
             target.write_points(points)
 
 
-def table(plan: Plan) -> Any:
+def table(plan: BuildPlan) -> Any:
     """Buildings of a scene by OSM id: base, height, top, roof, area, and slope of the ground.
 
     slope  : rise of the ground along the outline over the diagonal of its box
@@ -141,7 +141,7 @@ def compare_buildings(truth: Any, made: Any) -> None:
         )
 
 
-def compare_trees(truth: Plan, made: Plan, *, bounds: Sequence[float]) -> None:
+def compare_trees(truth: BuildPlan, made: BuildPlan, *, bounds: Sequence[float]) -> None:
     """Print trees that were found, missed and false within the map's bounds in degrees, and their errors."""
     corners = truth.frame.from_geographic(np.array(bounds[::2]), np.array(bounds[1::2]))
     low, high = np.column_stack(corners)

@@ -19,8 +19,8 @@ from pathlib import Path
 from geoscene.scene.layout import SceneFiles
 from lidar.dataset.layout import Paths
 from lidar.tools.detection.registry import MODEL
-from lidar.tools.redteam.evaluate import Accuracy, accuracies
-from lidar.tools.redteam.measure import Case, measured
+from lidar.tools.redteam.evaluate import DetectorAccuracy, accuracies
+from lidar.tools.redteam.measure import AttackCase, measured
 from lidar.tools.redteam.plan import Measure
 
 PLACES = {
@@ -124,10 +124,10 @@ def table(detectors: dict[str, str], drives: list[Path], figures: Path) -> list[
     return rows
 
 
-def _accuracy(detector: str, drives: list[Path], figures: Path) -> list[Accuracy]:
+def _accuracy(detector: str, drives: list[Path], figures: Path) -> list[DetectorAccuracy]:
     frames = []
     for drive in drives:
-        case = Case(drive, None, figures / f"{drive.name}.json", (), MEASURE.score, detector)
+        case = AttackCase(drive, None, figures / f"{drive.name}.json", (), MEASURE.score, detector)
         figures.mkdir(parents=True, exist_ok=True)
         rows = measured(case)["frames"]
         frames += [((drive.name, int(frame["seconds"] // MEASURE.block)), frame) for frame in rows]

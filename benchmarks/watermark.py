@@ -17,14 +17,14 @@ import numpy as np
 from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.tools.integrity.tampering import FrameVerdict, Place, frame_verdict
-from lidar.tools.integrity.watermark import Cells, Watermark
+from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey
 
-MARK = Watermark(b"key of a benchmark")
+MARK = WatermarkKey(b"key of a benchmark")
 TRIALS = 40
 SIZE = np.array([4.0, 2.0, 2.0])
 """Metres of the box that is tampered with."""
 
-Marked = tuple[np.ndarray, Cells]
+Marked = tuple[np.ndarray, WatermarkCells]
 
 
 def clouds(folder: Path) -> Iterator[Marked]:
@@ -34,7 +34,7 @@ def clouds(folder: Path) -> Iterator[Marked]:
     files = sorted((folder / name / "pcd").glob("*.pcd"))
     for trial in range(TRIALS):
         cloud = read_cloud(files[trial % len(files)])
-        cells = Cells(name, trial, cloud.ring, cloud.column, cloud.echo)
+        cells = WatermarkCells(name, trial, cloud.ring, cloud.column, cloud.echo)
         yield MARK.embedded(cloud.xyz, cells), cells
 
 
@@ -45,7 +45,7 @@ def inside(xyz: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return (np.abs(xyz - middle) < SIZE / 2).all(axis=1)
 
 
-def voxels(xyz: np.ndarray, cells: Cells, *, size: float) -> Marked:
+def voxels(xyz: np.ndarray, cells: WatermarkCells, *, size: float) -> Marked:
     """One return of each cube."""
     _, first = np.unique(np.floor(xyz / size).astype(np.int64), axis=0, return_index=True)
     keep = np.isin(np.arange(len(xyz)), first)
@@ -60,12 +60,16 @@ def distance(place: Place, xyz: np.ndarray) -> float:
     return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
 
 
-def removed(xyz: np.ndarray, cells: Cells, near: np.ndarray) -> tuple[Marked, np.ndarray | None, np.ndarray]:
+def removed(
+    xyz: np.ndarray, cells: WatermarkCells, near: np.ndarray
+) -> tuple[Marked, np.ndarray | None, np.ndarray]:
     """Returns are deleted."""
     return (xyz[~near], cells.where(~near)), None, xyz[near]
 
 
-def added(xyz: np.ndarray, cells: Cells, near: np.ndarray) -> tuple[Marked, np.ndarray | None, np.ndarray]:
+def added(
+    xyz: np.ndarray, cells: WatermarkCells, near: np.ndarray
+) -> tuple[Marked, np.ndarray | None, np.ndarray]:
     """Returns are copied to a direction 40 degrees to the left."""
     c, s = np.cos(np.radians(40)), np.sin(np.radians(40))
     new = xyz[near] @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -76,7 +80,9 @@ def added(xyz: np.ndarray, cells: Cells, near: np.ndarray) -> tuple[Marked, np.n
     return (np.concatenate([xyz, new]), replace(cells, ring=rings, column=column, echo=echoes)), forged, new
 
 
-def moved(xyz: np.ndarray, cells: Cells, near: np.ndarray) -> tuple[Marked, np.ndarray | None, np.ndarray]:
+def moved(
+    xyz: np.ndarray, cells: WatermarkCells, near: np.ndarray
+) -> tuple[Marked, np.ndarray | None, np.ndarray]:
     """Returns go 2 to 3 m outwards along their beams."""
     rng, out = np.random.default_rng(len(xyz)), xyz.copy()
     away = np.linalg.norm(xyz[near], axis=1)
@@ -89,7 +95,7 @@ def harmless(folder: Path) -> None:
     print("| data | bits wrong | clouds reported | blocks reported, of a cloud |")
     print("|---|---|---|---|")
     rng = np.random.default_rng(0)
-    cases: dict[str, tuple[float, Callable[[np.ndarray, Cells], Marked]]] = {
+    cases: dict[str, tuple[float, Callable[[np.ndarray, WatermarkCells], Marked]]] = {
         "as signed, float32": (0.001, lambda x, c: (x.astype(np.float32), c)),
         "rounded to 1 mm": (0.001, lambda x, c: (np.round(x, 3), c)),
         "rounded to 1 cm (`--noise 0.003`)": (0.003, lambda x, c: (np.round(x, 2), c)),

@@ -14,7 +14,14 @@ from cyclopts import App, Group, Parameter, validators
 
 from geoscene import __version__
 from geoscene.errors import GeosceneError, InputError
-from geoscene.options import BuildOptions, CloudOptions, Degrees, ExportOptions, TradeoffOptions, ViewOptions
+from geoscene.options import (
+    BuildOptions,
+    BuildTradeoffOptions,
+    CloudOptions,
+    Degrees,
+    ExportOptions,
+    ViewOptions,
+)
 from geoscene.support.console import (
     DEFAULTS,
     FAILURE,
@@ -247,7 +254,7 @@ def tradeoff(
     *,
     source: Annotated[MapSource, Parameter(group=_SOURCE)] = MapSource(),
     options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
-    compared: TradeoffOptions = TradeoffOptions(),
+    compared: BuildTradeoffOptions = BuildTradeoffOptions(),
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=_OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:

@@ -145,7 +145,7 @@ _OF_CLOUDS = ("cloud_crs", "cloud_unit", "cloud_align", "cloud_licence", "cloud_
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class TradeoffOptions:
+class BuildTradeoffOptions:
     """Options of a comparison of builds."""
 
     settings: Annotated[tuple[str, ...], WORDS] = ()

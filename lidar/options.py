@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from geoscene.scene import Scene
     from lidar.motion.road_conditions import RoadConditions
     from lidar.motion.route import Side, Spec
-    from lidar.settings import Contents
+    from lidar.settings import RecordingSettings
     from lidar.signal.registry import NamedStage
     from lidar.signal.weather.setting import WeatherSetting
     from lidar.traffic.fcd import TrafficFile
@@ -456,14 +456,16 @@ class DriveOptions:
         """Side of the road that the vehicle drives on."""
         return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"
 
-    def contents(self) -> Contents:
+    def contents(self) -> RecordingSettings:
         """Files and settings of every frame; raises InputError for unknown names."""
-        from lidar.settings import Contents, settings_of  # noqa: PLC0415  (a second, not needed for --help)
+        from lidar.settings import RecordingSettings, settings_of  # noqa: PLC0415  (a second, not needed for --help)
         from lidar.signal.registry import Stages  # noqa: PLC0415
 
         stages = self.all_stages
         chosen = settings_of(self.fidelity, with_stage_settings(self.settings, stages))
-        return Contents(self.formats, self.labels, self.deskew, self.seed, *chosen, Stages(stages, self.seed))
+        return RecordingSettings(
+            self.formats, self.labels, self.deskew, self.seed, *chosen, Stages(stages, self.seed)
+        )
 
     @property
     def all_stages(self) -> StageList:
@@ -509,7 +511,7 @@ _METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
+class AccuracyTarget:
     """Errors that the sensors of a drive must not exceed; 0 where none is asked for.
 
     text    : as it was asked for
@@ -524,12 +526,12 @@ class Accuracy:
     levels: float = 0.0
 
 
-def read_accuracy(text: str) -> Accuracy:
+def read_accuracy(text: str) -> AccuracyTarget:
     """An accuracy of a text such as ``1cm``, ``5mm@99``, ``3levels`` or ``1cm,3levels``.
 
     Raises InputError for others.
     """
-    asked = Accuracy(text.strip())
+    asked = AccuracyTarget(text.strip())
     for part in text.lower().split(","):
         found = _ACCURACY.fullmatch(part.strip())
         size = 0.0

@@ -38,7 +38,7 @@ _CHOICES: dict[str, Iterable[object]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class SettingDescription:
     """One setting as `list_settings` describes it.
 
     name    : field of `ScannerSettings`, `CameraSettings` or `WorldSettings`
@@ -58,7 +58,7 @@ def levels() -> tuple[str, ...]:
     return tuple(scanner_settings.LEVELS)
 
 
-class Settings(NamedTuple):
+class DriveSettings(NamedTuple):
     """Settings of a drive: of scanners, of cameras, and of the scene around the vehicle."""
 
     lidar: ScannerSettings
@@ -66,7 +66,7 @@ class Settings(NamedTuple):
     world: WorldSettings
 
 
-def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> Settings:
+def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> DriveSettings:
     """Settings at a level, with single ones changed by name and text.
 
     A name that both scanners and cameras have changes both. Values are numbers, words, or on/off, yes/no,
@@ -83,24 +83,24 @@ def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> Settings
         for group, values in zip(chosen, changed, strict=True):
             if hasattr(group, name):
                 values.update(_parsed(name, text, former=getattr(group, name)))
-    return Settings(*(replace(group, **values) for group, values in zip(chosen, changed, strict=True)))
+    return DriveSettings(*(replace(group, **values) for group, values in zip(chosen, changed, strict=True)))
 
 
-def _at(level: str) -> Settings:
+def _at(level: str) -> DriveSettings:
     if level not in levels():
         raise InputError(f"`fidelity` {level}: one of {', '.join(levels())}")
-    return Settings(scanner_settings.LEVELS[level], camera_settings.LEVELS[level], WorldSettings())
+    return DriveSettings(scanner_settings.LEVELS[level], camera_settings.LEVELS[level], WorldSettings())
 
 
-def list_settings() -> list[Setting]:
+def list_settings() -> list[SettingDescription]:
     """All settings, those of scanners first, with their values at each level."""
     at_levels = [_at(level) for level in levels()]
     found = []
-    for k, of in enumerate(Settings._fields):
+    for k, of in enumerate(DriveSettings._fields):
         meanings = _meanings(inspect.getdoc(type(at_levels[0][k])) or "")
         for f in fields(at_levels[0][k]):
             values = tuple(text_of(getattr(chosen[k], f.name)) for chosen in at_levels)
-            found.append(Setting(f.name, of, values, meanings.get(f.name, "")))
+            found.append(SettingDescription(f.name, of, values, meanings.get(f.name, "")))
     return found
 
 
@@ -137,7 +137,7 @@ def _parsed(name: str, text: str, *, former: object) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Contents:
+class RecordingSettings:
     """Which files are written of every frame, and how its measurements are simulated.
 
     formats : of clouds, names in `lidar.dataset.formats.FORMATS`

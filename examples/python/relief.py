@@ -14,7 +14,7 @@ import lidar
 from geoscene.classes import class_codes
 from lidar.dataset.formats import read_table
 from lidar.sensors.camera.png import counts_to_depth, read_png, write_png
-from lidar.tools.maps.picture import View, cloud_picture, depth_picture, with_key
+from lidar.tools.maps.picture import PictureView, cloud_picture, depth_picture, with_key
 
 RIG = """
 name = "street"
@@ -71,7 +71,7 @@ for relief in ("off", "plain", "full"):
     cloud = cloud_picture(
         np.column_stack([aside, along, offset[:, 2]])[shown],
         class_codes().color[points["label"][shown].astype(np.uint8)],
-        view=View(40.0, 16.0, 40.0),
+        view=PictureView(40.0, 16.0, 40.0),
         size=(800, 500),
         bounds=[(-ASIDE, AHEAD[0], 0.0), (ASIDE, AHEAD[1], UP)],
         point=0.04,

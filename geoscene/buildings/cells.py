@@ -22,7 +22,7 @@ ON_LINE = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Cells(Columns):
+class RoofCells(Columns):
     """Triangles of a footprint in plan and a continuous field, linear on each triangle.
 
     xy    : (m, 3, 2) metres on the grid, counter-clockwise
@@ -35,11 +35,11 @@ class Cells(Columns):
     face: Ints
 
 
-def sloped_cells(polygons: Polygons, direction: Float) -> Cells:
+def sloped_cells(polygons: Polygons, direction: Float) -> RoofCells:
     """The Delaunay triangles of polygons (n,), each of one face, with the field xy . direction (n, 2)."""
     xy, owner = triangulate(polygons)
     parts = zip(np.split(xy, _ends(owner, len(polygons))[:-1]), direction, strict=True)
-    return Cells(xy, np.concatenate([np.empty((0, 3)), *(part @ way for part, way in parts)]), owner)
+    return RoofCells(xy, np.concatenate([np.empty((0, 3)), *(part @ way for part, way in parts)]), owner)
 
 
 def _ends(owner: Ints, count: int) -> Ints:
@@ -47,7 +47,7 @@ def _ends(owner: Ints, count: int) -> Ints:
     return np.searchsorted(owner, np.arange(count), side="right")
 
 
-def cut(cells: Cells, level: float | Float) -> Cells:
+def cut(cells: RoofCells, level: float | Float) -> RoofCells:
     """The cells, split along the contour lines of a level, or of one each (m,).
 
     A face k becomes 2 k below the line and 2 k + 1 above it.
@@ -60,7 +60,7 @@ def cut(cells: Cells, level: float | Float) -> Cells:
     above = (sign.max(axis=1) > 0).astype(np.int64)
     if not crossed.any():
         return replace(cells, face=2 * cells.face + above)
-    whole = Cells(cells.xy[~crossed], cells.field[~crossed], (2 * cells.face + above)[~crossed])
+    whole = RoofCells(cells.xy[~crossed], cells.field[~crossed], (2 * cells.face + above)[~crossed])
     xy, field, sign, face = cells.xy[crossed], cells.field[crossed], sign[crossed], 2 * cells.face[crossed]
     # rotate the corners of each triangle: first comes the one alone on its side, or the one on the line
     on_line = (sign == 0).any(axis=1)
@@ -87,8 +87,8 @@ def cut(cells: Cells, level: float | Float) -> Cells:
         (q[u], b[u], c[u], at[u], fb[u], fc[u], face[u] + 1 - tip[u]),
         (q[u], c[u], r[u], at[u], fc[u], at[u], face[u] + 1 - tip[u]),
     ]
-    pieces = [Cells(np.stack(x[:3], axis=1), np.stack(x[3:6], axis=1), x[6]) for x in parts]
-    cut_cells = Cells.concatenate([whole, *pieces])
+    pieces = [RoofCells(np.stack(x[:3], axis=1), np.stack(x[3:6], axis=1), x[6]) for x in parts]
+    cut_cells = RoofCells.concatenate([whole, *pieces])
     return cut_cells.take(distinct_corners(cut_cells.xy))
 
 
@@ -151,7 +151,7 @@ def filled(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:
     ]
 
 
-def merged(cells: Cells, body: Ints, *, count: int) -> list[Cells]:
+def merged(cells: RoofCells, body: Ints, *, count: int) -> list[RoofCells]:
     """The cells of each body, each face triangulated again, which removes the slivers that many cuts leave.
 
     body : (m,) the body of each triangle, ascending
@@ -162,7 +162,7 @@ def merged(cells: Cells, body: Ints, *, count: int) -> list[Cells]:
         own = cells.take(slice(a, b))
         if polygons is not None and made is not None and len(np.unique(made[1])) == len(polygons):
             xy, owner = made
-            own = Cells(xy, _values_at(xy, own.xy.reshape(-1, 2), values=own.field.ravel()), owner)
+            own = RoofCells(xy, _values_at(xy, own.xy.reshape(-1, 2), values=own.field.ravel()), owner)
         out.append(own)
     return out
 
@@ -186,7 +186,7 @@ def _crossing(a: Float, b: Float, *, fa: Float, fb: Float, level: Float) -> Floa
     return to_grid(first + part[:, None] * (last - first))
 
 
-def skeleton_cells(skeleton: Skeleton) -> Cells:
+def skeleton_cells(skeleton: Skeleton) -> RoofCells:
     """The faces of a skeleton as cells whose field is the distance from their edges."""
     xy = to_grid(skeleton.xy)
     key = np.rint(xy * 1e4).astype(np.int64)
@@ -203,7 +203,7 @@ def skeleton_cells(skeleton: Skeleton) -> Cells:
         clipped = [_clip_ears(shapely.get_coordinates(p)[:-1]) for p in polygons[missing]]
         triangles = np.concatenate([triangles, *clipped])
         owner = np.concatenate([owner, np.repeat(missing, [len(c) for c in clipped])])
-    return Cells(triangles, _values_at(triangles, xy, values=time), owner)
+    return RoofCells(triangles, _values_at(triangles, xy, values=time), owner)
 
 
 def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:

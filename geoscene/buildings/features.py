@@ -14,7 +14,7 @@ from geoscene.buildings.appearance import choose_appearance, read_roof, read_wal
 from geoscene.buildings.footprints import clean, groups, project
 from geoscene.buildings.heights import CLOUD_TOP, read_heights
 from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
-from geoscene.buildings.resolve import Heights, Row, resolve_heights, texts
+from geoscene.buildings.resolve import BuildingHeights, BuildingRow, resolve_heights, texts
 from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.stacks import with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
@@ -64,7 +64,7 @@ def read_buildings(
 
 def _read_rows(
     areas: Sequence[Area], frame: Frame, *, problems: list[Problem], parts: bool, options: BuildingOptions
-) -> list[Row]:
+) -> list[BuildingRow]:
     """Rows of the buildings, or of the parts, in order of id, with clean footprints in scene metres."""
     chosen = []
     for area in areas:
@@ -87,7 +87,7 @@ def _read_rows(
 
 def _rows(
     areas: Sequence[Area], frame: Frame, *, parts: bool, options: BuildingOptions
-) -> tuple[list[Row], list[Problem]]:
+) -> tuple[list[BuildingRow], list[Problem]]:
     """Rows of areas that are large enough, and the problems."""
     raw = project(np.fromiter([a.geometry for a in areas], object), frame)
     polygons, repaired = clean(raw)
@@ -109,8 +109,8 @@ def _rows(
 
 def _row(
     osm_id: str, tags: Tags, *, footprint: Any, use: str, options: BuildingOptions, part: bool = False
-) -> Row:
-    return Row(
+) -> BuildingRow:
+    return BuildingRow(
         osm_id,
         tags,
         footprint,
@@ -129,8 +129,13 @@ def _id_order(area: Area) -> tuple[str, int]:
 
 
 def _assign_parts(
-    outlines: list[Row], parts: list[Row], *, osm: OsmData, options: BuildingOptions, problems: list[Problem]
-) -> list[Row]:
+    outlines: list[BuildingRow],
+    parts: list[BuildingRow],
+    *,
+    osm: OsmData,
+    options: BuildingOptions,
+    problems: list[Problem],
+) -> list[BuildingRow]:
     """Buildings, then parts with the rows of their outlines; the rest of an outline is a part too."""
     shapes = np.fromiter([p.footprint for p in parts], object)
     target = assign(
@@ -180,7 +185,7 @@ def _assign_parts(
 
 
 def _table(
-    rows: list[Row],
+    rows: list[BuildingRow],
     bounds: tuple[float, float, float, float],
     *,
     frame: Frame,
@@ -251,12 +256,12 @@ def _table(
     )
 
 
-def _measured_top(row: Row, source: str) -> float:
+def _measured_top(row: BuildingRow, source: str) -> float:
     """Height z of the top of a row where a point cloud gave its height, else NaN."""
     return float(row.tags.get(CLOUD_TOP, "nan")) if source == "cloud" else np.nan
 
 
-def _ranks(rows: Sequence[Row], heights: Heights) -> Ints:
+def _ranks(rows: Sequence[BuildingRow], heights: BuildingHeights) -> Ints:
     """How well each row is described (n,): 2 if the height of its building is known, 1 if only its name."""
     outline = [r.outline for r in rows]
     known = np.isin(heights.source, ("cloud", "tag", "est_height", "levels", "parts"))
@@ -265,7 +270,7 @@ def _ranks(rows: Sequence[Row], heights: Heights) -> Ints:
     return np.where(known, 2, named).astype(np.int64)
 
 
-def _ignored_tags(rows: Sequence[Row], heights: Heights) -> list[Problem]:
+def _ignored_tags(rows: Sequence[BuildingRow], heights: BuildingHeights) -> list[Problem]:
     """A problem for each row with tags that cannot be used, which names what was made instead."""
     problems = []
     for k, row in enumerate(rows):

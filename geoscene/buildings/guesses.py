@@ -65,7 +65,7 @@ _SOUTH_OF_FRANCE = 45.2
 
 
 @dataclass(frozen=True, slots=True)
-class Guesses(Columns):
+class AppearanceGuesses(Columns):
     """Looks of buildings, one row each.
 
     kind       : (n,) str, one of `KINDS`
@@ -120,7 +120,7 @@ def guess_looks(
     levels: Float,
     roof_height: Float,
     region: str,
-) -> Guesses:
+) -> AppearanceGuesses:
     """A plausible look for each building (n,).
 
     area        : (n,) square metres of the footprint
@@ -148,7 +148,7 @@ def guess_looks(
     storeys = np.where(np.isfinite(levels) & (levels >= 0.5), levels, walls / heights)
     shop = np.isin(use, _SHOPS) | ((kind == "tall") & (draw[5] < 0.35) & (walls > 8.0))
     windows = _windows(kind, wall, shop=shop)
-    return Guesses(
+    return AppearanceGuesses(
         kind,
         wall,
         roof,

@@ -30,7 +30,7 @@ _SIGMA_ROOF = {"default": 0.5, "angle": 0.2}
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class BuildingRow:
     """A building or a part before it enters the table.
 
     tagged       : heights
@@ -53,7 +53,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Heights:
+class BuildingHeights:
     """Columns (n,) of heights for `geoscene.buildings.table.Buildings`."""
 
     low: Float
@@ -70,11 +70,13 @@ def texts(values: Sequence[str]) -> Texts:
     return np.array(values, dtype=object)
 
 
-def resolve_heights(rows: Sequence[Row], *, options: BuildingOptions) -> tuple[Heights, list[Problem]]:
+def resolve_heights(
+    rows: Sequence[BuildingRow], *, options: BuildingOptions
+) -> tuple[BuildingHeights, list[Problem]]:
     """Underside, top and roof height of every row (buildings first, then parts), and what was repaired."""
     problems: list[Problem] = []
     tagged = [r.tagged for r in rows]
-    h = Heights(
+    h = BuildingHeights(
         np.nan_to_num([t.minimum for t in tagged]),
         np.array([t.height for t in tagged], float),
         np.array([t.roof for t in tagged], float),
@@ -113,7 +115,7 @@ def resolve_heights(rows: Sequence[Row], *, options: BuildingOptions) -> tuple[H
     return h, problems
 
 
-def _repair_undersides(rows: Sequence[Row], h: Heights, *, problems: list[Problem]) -> None:
+def _repair_undersides(rows: Sequence[BuildingRow], h: BuildingHeights, *, problems: list[Problem]) -> None:
     """Put undersides above the top at 0 and those just below it 1 cm below it, in place."""
     for k in np.flatnonzero(h.high - h.low < THINNEST - 1e-9).tolist():
         tags = f"underside at {h.low[k]:g} m, top at {h.high[k]:g} m"
@@ -126,7 +128,7 @@ def _repair_undersides(rows: Sequence[Row], h: Heights, *, problems: list[Proble
         problems.append(Problem(rows[k].osm_id, "building", "repaired", reason, detail))
 
 
-def _resolve_roofs(rows: Sequence[Row], *, h: Heights, options: BuildingOptions) -> None:
+def _resolve_roofs(rows: Sequence[BuildingRow], *, h: BuildingHeights, options: BuildingOptions) -> None:
     """Set missing roof heights, in place."""
     for k, row in enumerate(rows):
         if row.roof.shape == "flat":
@@ -143,7 +145,12 @@ def _resolve_roofs(rows: Sequence[Row], *, h: Heights, options: BuildingOptions)
 
 
 def _resolve_buildings(
-    rows: Sequence[Row], is_part: Bools, *, outline: Ints, h: Heights, options: BuildingOptions
+    rows: Sequence[BuildingRow],
+    is_part: Bools,
+    *,
+    outline: Ints,
+    h: BuildingHeights,
+    options: BuildingOptions,
 ) -> None:
     """Set missing heights of buildings, in place: at least that of their highest part, else inferred."""
     own = np.flatnonzero(is_part & np.isfinite(h.high) & ~np.array([r.is_remainder for r in rows], np.bool_))
@@ -169,7 +176,9 @@ def _resolve_buildings(
     h.high[gaps], h.sigma[gaps], h.source[gaps] = inferred[lacking], sigma[lacking], rule[lacking]
 
 
-def _resolve_remainders(rows: Sequence[Row], is_part: Bools, *, outline: Ints, h: Heights) -> None:
+def _resolve_remainders(
+    rows: Sequence[BuildingRow], is_part: Bools, *, outline: Ints, h: BuildingHeights
+) -> None:
     """Set the heights of the remainders of outlines, in place.
 
     The outline's tags apply, unless a part on the ground is as high: the tags then describe that part, and

@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 
 from geoscene.buildings.cells import (
-    Cells,
+    RoofCells,
     cut,
     filled,
     merged,
@@ -21,7 +21,7 @@ from geoscene.buildings.cells import (
     sloped_cells,
 )
 from geoscene.buildings.footprints import Polygons, to_grid
-from geoscene.buildings.shells import Triangles, close, distinct_corners, lift, prisms
+from geoscene.buildings.shells import ShellTriangles, close, distinct_corners, lift, prisms
 from geoscene.buildings.skeleton import straight_skeleton
 from geoscene.geometry.mesh import FLOOR, ROOF
 from geoscene.typing import Float
@@ -97,7 +97,7 @@ class RoofSpec:
     across: bool = False
 
 
-def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
+def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[ShellTriangles, str]:
     """The closed shell of a body with its roof (piece 0), and a note if the shape had to be replaced.
 
     For the arguments see `roof_shells`.
@@ -106,7 +106,7 @@ def roof_shell(polygon: Any, spec: RoofSpec) -> tuple[Triangles, str]:
     return shells, notes[0]
 
 
-def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[Triangles, list[str]]:
+def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[ShellTriangles, list[str]]:
     """The closed shells of bodies (n,) with their roofs, and a note on each whose shape had to be replaced.
 
     Pyramids, cones, domes and onions are built of rings about the centroid if all corners are visible from
@@ -116,7 +116,7 @@ def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[Triangle
     polygons : valid, on the grid, exteriors counter-clockwise
     """
     notes = [""] * len(specs)
-    radial, ridged, fields = list[int](), list[int](), dict[int, Cells]()
+    radial, ridged, fields = list[int](), list[int](), dict[int, RoofCells]()
     for k, (polygon, spec) in enumerate(zip(polygons, specs, strict=True)):
         if spec.shape in RADIAL and _is_star_shaped(polygon):
             radial.append(k)
@@ -148,7 +148,7 @@ def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[Triangle
         prisms(polygons[flat], flat, low=low, high=high),
         _closed(polygons, tops, fields=fields, specs=specs),
     ]
-    shells = Triangles.concatenate(made)
+    shells = ShellTriangles.concatenate(made)
     return shells.take(np.argsort(shells.piece, kind="stable")), notes
 
 
@@ -201,14 +201,14 @@ def _profile(field: Float, span: float | Float, *, profile: Profile) -> Float:
     return np.asarray(np.interp(field / span, share, height), float)
 
 
-def _skillion(polygon: Any, spec: RoofSpec) -> Cells:
+def _skillion(polygon: Any, spec: RoofSpec) -> RoofCells:
     """One plane; the field is the share of the roof's height."""
     cells = sloped_cells(np.array([polygon], dtype=object), _slope(polygon, spec)[None])
     low, high = cells.field.min(), cells.field.max()
     return replace(cells, field=(cells.field - low) / (high - low))
 
 
-def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[Cells]:
+def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[RoofCells]:
     """Cross-sections of one shape extruded along ridges; the fields are shares of the roofs' heights."""
     up = np.array([_slope(polygon, spec) for polygon, spec in zip(polygons, specs, strict=True)])
     shape, count = specs[0].shape, len(specs)
@@ -235,7 +235,7 @@ def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[Cells]:
     return merged(raised, body, count=count)
 
 
-def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
+def _hipped_ends(cells: RoofCells, up: Float, *, low: float, span: float) -> RoofCells:
     """A gabled cross-section whose ends are hipped above half the height, with the pitch of the sides."""
     ridge = np.array([-up[1], up[0]])
     hips = [(along, float((cells.xy @ along).min())) for along in (ridge, -ridge)]
@@ -252,7 +252,7 @@ def _hipped_ends(cells: Cells, up: Float, *, low: float, span: float) -> Cells:
     return replace(cells, field=height(cells.xy, len(hips)))
 
 
-def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
+def _inward(polygon: Any, spec: RoofSpec) -> tuple[RoofCells | None, bool]:
     """A profile from the eaves inwards on the straight skeleton; the field is the share of the roof's height.
 
     None if there is no skeleton with a height. The flag tells whether a hip end was raised to a gable.
@@ -275,7 +275,7 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[Cells | None, bool]:
     return replace(cells, field=_profile(cells.field, span, profile=profile)), len(skeleton.xy) > corners
 
 
-def _raised(cells: Cells, spec: RoofSpec) -> Float:
+def _raised(cells: RoofCells, spec: RoofSpec) -> Float:
     """Triangles (m, 3, 3) of a roof above cells whose field is the share of its height."""
     # the highest point has the tagged height even if the footprint excludes the ridge
     share = cells.field / cells.field.max()
@@ -285,8 +285,8 @@ def _raised(cells: Cells, spec: RoofSpec) -> Float:
 
 
 def _closed(
-    polygons: Polygons, tops: dict[int, Float], *, fields: dict[int, Cells], specs: Sequence[RoofSpec]
-) -> Triangles:
+    polygons: Polygons, tops: dict[int, Float], *, fields: dict[int, RoofCells], specs: Sequence[RoofSpec]
+) -> ShellTriangles:
     """The shells of roof triangles (m, 3, 3) by piece.
 
     Floors are polygons, or of pieces with cells the outlines of these, whose edges have the roof's vertices.
@@ -306,8 +306,8 @@ def _closed(
     bottom = to_grid(np.array([specs[k].low for k in pieces], float))
     of = np.repeat(np.arange(len(pieces)), [len(floor) for floor in floors])
     xy = np.concatenate([np.empty((0, 3, 2)), *floors])
-    top = Triangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
-    floor = Triangles(lift(xy, bottom[of]), of, np.full(len(xy), FLOOR, np.uint8))
+    top = ShellTriangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
+    floor = ShellTriangles(lift(xy, bottom[of]), of, np.full(len(xy), FLOOR, np.uint8))
     shells = close(top, floor, underside=bottom)
     return replace(shells, piece=np.array(pieces, np.int64)[shells.piece])
 

@@ -22,7 +22,7 @@ PARAPET = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Triangles(Columns):
+class ShellTriangles(Columns):
     """Triangles given by their corners, each belonging to one piece.
 
     corners : (m, 3, 3) metres, counter-clockwise seen from outside
@@ -83,7 +83,7 @@ def boundary(corners: Float, piece: Ints) -> tuple[Float, Ints]:
     return np.stack([corners[face, k], corners[face, (k + 1) % 3]], axis=1), piece[face]
 
 
-def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
+def close(top: ShellTriangles, floor: ShellTriangles, *, underside: Float) -> ShellTriangles:
     """Closed shells: top surfaces, walls from their boundaries down to the undersides, and floors.
 
     Walls of no height are left out, so that a roof may reach down to the floor.
@@ -97,9 +97,9 @@ def close(top: Triangles, floor: Triangles, *, underside: Float) -> Triangles:
     a0, b0 = a.copy(), b.copy()
     a0[:, 2] = b0[:, 2] = underside[piece]
     walls = np.concatenate([np.stack([a0, b0, b], axis=1), np.stack([a0, b, a], axis=1)])
-    wall = Triangles(walls, np.tile(piece, 2), np.full(len(walls), WALL, np.uint8))
-    bottom = Triangles(floor.corners[:, ::-1], floor.piece, np.full(len(floor), FLOOR, np.uint8))
-    shells = Triangles.concatenate([top, wall, bottom])
+    wall = ShellTriangles(walls, np.tile(piece, 2), np.full(len(walls), WALL, np.uint8))
+    bottom = ShellTriangles(floor.corners[:, ::-1], floor.piece, np.full(len(floor), FLOOR, np.uint8))
+    shells = ShellTriangles.concatenate([top, wall, bottom])
     # a wall of no height has triangles with two equal corners; real slivers must stay, or the shell opens
     return shells.take(distinct_corners(shells.corners))
 
@@ -111,16 +111,16 @@ def distinct_corners(triangles: Float) -> Bools:
     return distinct
 
 
-def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> Triangles:
+def prisms(polygons: Polygons, piece: Ints, *, low: Float, high: Float) -> ShellTriangles:
     """Prisms over polygons (n,) from z low to z high (n,), metres; ``piece`` (n,) are their numbers."""
     xy, owner = triangulate(polygons)
-    top = Triangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
-    floor = Triangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
+    top = ShellTriangles(lift(xy, to_grid(high)[owner]), owner, np.full(len(xy), ROOF, np.uint8))
+    floor = ShellTriangles(lift(xy, to_grid(low)[owner]), owner, np.full(len(xy), FLOOR, np.uint8))
     shells = close(top, floor, underside=to_grid(low))
-    return Triangles(shells.corners, piece[shells.piece], shells.surface)
+    return ShellTriangles(shells.corners, piece[shells.piece], shells.surface)
 
 
-def parapets(polygons: Polygons, piece: Ints, *, low: Float, high: Float, rise: Float) -> Triangles:
+def parapets(polygons: Polygons, piece: Ints, *, low: Float, high: Float, rise: Float) -> ShellTriangles:
     """As `prisms`, with parapets along the edges of the flat tops, `PARAPET` wide and ``rise`` (n,) high.
 
     A polygon so narrow that no roof is left between its parapets becomes a prism.
@@ -144,8 +144,8 @@ def parapets(polygons: Polygons, piece: Ints, *, low: Float, high: Float, rise: 
     inside = np.concatenate([np.stack([b, a, a1], axis=1), np.stack([b, a1, b1], axis=1)])
     corners = np.concatenate([lift(roof, high[of_roof]), lift(cap, top[of_cap]), inside])
     owner = np.concatenate([of_roof, of_cap, of_edge, of_edge])
-    upper = Triangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
-    floor = Triangles(lift(base, low[of_base]), of_base, np.full(len(base), FLOOR, np.uint8))
+    upper = ShellTriangles(corners, owner, np.full(len(corners), ROOF, np.uint8))
+    floor = ShellTriangles(lift(base, low[of_base]), of_base, np.full(len(base), FLOOR, np.uint8))
     made = close(upper, floor, underside=low)
-    shells.append(Triangles(made.corners, piece[rows][made.piece], made.surface))
-    return Triangles.concatenate(shells)
+    shells.append(ShellTriangles(made.corners, piece[rows][made.piece], made.surface))
+    return ShellTriangles.concatenate(shells)

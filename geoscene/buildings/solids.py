@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.footprints import Polygons, clean, groups
 from geoscene.buildings.roofs import RoofSpec, roof_shells
-from geoscene.buildings.shells import Triangles, parapets, prisms
+from geoscene.buildings.shells import ShellTriangles, parapets, prisms
 from geoscene.buildings.table import Buildings
 from geoscene.buildings.unions import unite
 from geoscene.classes import Class
@@ -86,7 +86,7 @@ def build_solids(
         pieces = replace(pieces, parapet=_parapets(pieces, parapet))
     problems: list[Problem] = []
 
-    done = [Triangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
+    done = [ShellTriangles(np.empty((0, 3, 3)), np.empty(0, np.int64), np.empty(0, np.uint8))]
     for attempt in ("", "no-parapet", "aligned-parts", "overlapping-roofs", "flat-roof", "cleaned-footprint"):
         if not len(pieces.row):
             break
@@ -114,7 +114,7 @@ def build_solids(
     problems += [
         _problem(buildings, b, action="dropped", reason="no-solid") for b in np.unique(pieces.building)
     ]
-    return _mesh(buildings, Triangles.concatenate(done)), problems
+    return _mesh(buildings, ShellTriangles.concatenate(done)), problems
 
 
 def _problem(buildings: Buildings, row: int, *, action: Any, reason: str, detail: str = "") -> Problem:
@@ -228,7 +228,7 @@ def _cut(pieces: _Pieces, polygons: Polygons) -> _Pieces:
     return replace(pieces.take(index), polygon=polygon).take(shapely.area(polygon) > 0)
 
 
-def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, list[Problem]]:
+def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[ShellTriangles, Ints, list[Problem]]:
     """Triangles of all bodies, the buildings that failed, and the replaced roofs and separated bodies."""
     shells, notes = _shells(buildings, pieces)
     found = check_solids(shells.corners, shells.piece, n=len(pieces.row))
@@ -252,10 +252,10 @@ def _bodies(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, Ints, lis
                 _problem(buildings, building, action="repaired", reason="touching-bodies", detail=note)
             )
     failed = {buildings.osm_id[b] for b in bad}
-    return Triangles.concatenate(out), bad, [p for p in notes if p.osm_id not in failed]
+    return ShellTriangles.concatenate(out), bad, [p for p in notes if p.osm_id not in failed]
 
 
-def _cuts(buildings: Buildings, pieces: _Pieces, *, chosen: Ints) -> list[Triangles]:
+def _cuts(buildings: Buildings, pieces: _Pieces, *, chosen: Ints) -> list[ShellTriangles]:
     """Closed shells of the passages through a building, given its pieces (numbers).
 
     Their faces, which become those of the passages, have the number of the piece of which they cut most.
@@ -276,7 +276,7 @@ def _cuts(buildings: Buildings, pieces: _Pieces, *, chosen: Ints) -> list[Triang
     return out
 
 
-def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Problem]]:
+def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[ShellTriangles, list[Problem]]:
     """The closed shell of each piece, and the replaced roofs."""
     notes = []
     flat = np.flatnonzero(pieces.flat)
@@ -292,7 +292,7 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Prob
         shape = buildings.roof_shape[pieces.row[k]]
         given.append((shell, {k: f"{shape} roof made flat, {described(error)}"}))
 
-    given: list[tuple[Triangles, dict[int, str]]] = []
+    given: list[tuple[ShellTriangles, dict[int, str]]] = []
     given += make_without_failures(
         lambda rows: _roofed(buildings, pieces, rows=rows), np.flatnonzero(~pieces.flat), failed=failed
     )
@@ -302,10 +302,10 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[Triangles, list[Prob
             _problem(buildings, pieces.row[k], action="repaired", reason="roof-fallback", detail=note)
             for k, note in replaced.items()
         ]
-    return Triangles.concatenate(made), notes
+    return ShellTriangles.concatenate(made), notes
 
 
-def _roofed(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[Triangles, dict[int, str]]:
+def _roofed(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[ShellTriangles, dict[int, str]]:
     """The closed shells of pieces (rows) with their roofs, and what was replaced of them, by piece."""
     of = pieces.row[rows]
     columns = (
@@ -322,7 +322,7 @@ def _roofed(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[Trian
     return shells, {k: note for k, note in zip(rows.tolist(), notes, strict=True) if note}
 
 
-def _mesh(buildings: Buildings, triangles: Triangles) -> Mesh:
+def _mesh(buildings: Buildings, triangles: ShellTriangles) -> Mesh:
     """The mesh of all triangles (pieces: rows of the table), sorted by building and welded within each."""
     triangles = triangles.take(np.argsort(buildings.outline[triangles.piece], kind="stable"))
     row = triangles.piece

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 
 from geoscene.buildings.footprints import Polygons, subtract
-from geoscene.buildings.resolve import Heights, Row
+from geoscene.buildings.resolve import BuildingHeights, BuildingRow
 from geoscene.buildings.table import GRID
 from geoscene.support.report import Problem
 
@@ -20,7 +20,9 @@ _SUPPORT = 0.01
 """Square metres; parts that share less in plan do not stand on one another."""
 
 
-def with_support(rows: Sequence[Row], footprint: Polygons, *, heights: Heights) -> list[Problem]:
+def with_support(
+    rows: Sequence[BuildingRow], footprint: Polygons, *, heights: BuildingHeights
+) -> list[Problem]:
     """Extend remainders of outlines under the parts that stand on them, and close slits, both in place.
 
     A remainder keeps the ground of the parts that begin at its top or above: a penthouse does not stand over

@@ -12,7 +12,7 @@ import shapely
 
 from geoscene.buildings.clearance import parted
 from geoscene.buildings.footprints import to_grid
-from geoscene.buildings.shells import Triangles
+from geoscene.buildings.shells import ShellTriangles
 from geoscene.geometry.intersections import intersecting_faces, plan_axes
 from geoscene.geometry.mesh import WALL
 from geoscene.geometry.watertight import (
@@ -38,8 +38,8 @@ _MERGE = 15
 
 
 def unite(
-    buildings: Sequence[Triangles], cuts: Sequence[Sequence[Triangles]]
-) -> list[tuple[Triangles, str] | None]:
+    buildings: Sequence[ShellTriangles], cuts: Sequence[Sequence[ShellTriangles]]
+) -> list[tuple[ShellTriangles, str] | None]:
     """Of the closed shells of each building their union, and a note on beads; None if it is no solid.
 
     Faces keep their piece and surface.
@@ -74,7 +74,7 @@ class _Union:
     origin: Float
 
     @classmethod
-    def of(cls, shells: Triangles, cuts: Sequence[Triangles]) -> _Union | None:
+    def of(cls, shells: ShellTriangles, cuts: Sequence[ShellTriangles]) -> _Union | None:
         """The union of closed shells, less what is cut out; None if one or the result is no manifold."""
         pieces = np.unique(shells.piece)
         first = m3.Manifold.reserve_ids(4 * len(pieces))
@@ -113,11 +113,11 @@ class _Union:
         points = points[where]
         return _without_slivers(*repair(points, merged_vertices(points)[ids[faces]], run=run))
 
-    def result(self, corners: Float, run: Ints) -> Triangles:
+    def result(self, corners: Float, run: Ints) -> ShellTriangles:
         """Triangles with their pieces and surfaces; those of beads are walls of the first piece."""
         known = (run >= 0) & (run < 4 * len(self.pieces))
         piece = self.pieces[np.where(known, run // 4, 0)]
-        return Triangles(
+        return ShellTriangles(
             to_grid(corners + self.origin), piece, np.where(known, run % 4, WALL).astype(np.uint8)
         )
 
@@ -143,7 +143,7 @@ def _without_slivers(corners: Float, run: Ints) -> tuple[Float, Ints]:
     return corners[thick], run[thick]
 
 
-def _mended(union: _Union) -> tuple[Triangles, str] | None:
+def _mended(union: _Union) -> tuple[ShellTriangles, str] | None:
     """A union with a fault, its faces parted, simplified, or with beads where it touches itself.
 
     None if that does not help.
@@ -180,7 +180,7 @@ def _without_faults(corners: Float) -> Float | None:
     return corners if found.ok[0] else None
 
 
-def _manifold(shell: Triangles, *, first: int, origin: Float) -> Any:
+def _manifold(shell: ShellTriangles, *, first: int, origin: Float) -> Any:
     """A closed shell as a manifold whose faces have the id ``first`` plus surface; None if it is no solid."""
     order = np.argsort(shell.surface, kind="stable")
     corners, surface = shell.corners[order].reshape(-1, 3) - origin, shell.surface[order]

@@ -14,12 +14,12 @@ from geoscene.buildings.heights import CLOUD_ROOF, CLOUD_SIGMA, CLOUD_TOP, THINN
 from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.table import BuildingOptions
 from geoscene.clouds.levels import Body
-from geoscene.clouds.measure import Measured
+from geoscene.clouds.measure import CloudMeasurements
 from geoscene.clouds.roofs import Roof
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 from geoscene.objects.vegetation import CLOUD_TREE
-from geoscene.sources.data import Area, OsmData, Point, Tags
+from geoscene.sources.data import Area, OsmData, TaggedNode, Tags
 from geoscene.support.report import Problem
 from geoscene.typing import Float, Ints
 
@@ -39,7 +39,7 @@ _ROOF_TAGS = (
 
 
 def with_measurements(
-    osm: OsmData, measured: Measured, *, prefer_tags: bool
+    osm: OsmData, measured: CloudMeasurements, *, prefer_tags: bool
 ) -> tuple[OsmData, dict[str, Any]]:
     """The map with measured heights, roofs and trees, and counts and residuals for the report.
 
@@ -53,7 +53,7 @@ def with_measurements(
 
 
 def _with_buildings(
-    osm: OsmData, measured: Measured, *, prefer_tags: bool
+    osm: OsmData, measured: CloudMeasurements, *, prefer_tags: bool
 ) -> tuple[OsmData, dict[str, Any], list[Problem]]:
     """The map with measured buildings, counts, and disagreements."""
     names = measured.buildings.osm_id[measured.rows].tolist()
@@ -176,7 +176,9 @@ def _with_roof(tags: Tags, roof: Roof, *, turn: float) -> Tags:
     return kept
 
 
-def _with_trees(osm: OsmData, measured: Measured, *, prefer_tags: bool) -> tuple[OsmData, dict[str, int]]:
+def _with_trees(
+    osm: OsmData, measured: CloudMeasurements, *, prefer_tags: bool
+) -> tuple[OsmData, dict[str, int]]:
     """The map with measured sizes of its trees and with those that it lacks; counts."""
     frame, found = measured.frame, measured.trees
     mapped = [k for k, point in enumerate(osm.points) if point.tags.get("natural") == "tree"]
@@ -197,7 +199,7 @@ def _with_trees(osm: OsmData, measured: Measured, *, prefer_tags: bool) -> tuple
     sizes = zip(found.height[new].tolist(), found.crown[new].tolist(), strict=True)
     places = np.rint(10 * found.xy[new]).astype(np.int64).tolist()
     added = [
-        Point(f"cloud/{x}_{y}", {"natural": "tree"} | _sizes(*size), float(a), float(b))
+        TaggedNode(f"cloud/{x}_{y}", {"natural": "tree"} | _sizes(*size), float(a), float(b))
         for (x, y), size, a, b in zip(places, sizes, lon, lat, strict=True)
     ]
     return replace(osm, points=points + sorted(added, key=lambda p: (p.lon, p.lat))), {

@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.clouds.read import GROUND
-from geoscene.clouds.spool import Points
+from geoscene.clouds.spool import SurveyPoints
 from geoscene.typing import Bools, Float
 
 WINDOW = 18.0
@@ -32,7 +32,7 @@ _EMPTY = 0.6
 """Cells of area up to which a triangle over centres of cells has no further centre within it (Pick 1899)."""
 
 
-class Grid(NamedTuple):
+class CloudGrid(NamedTuple):
     """A lattice of cells.
 
     x, y    : scene metres of the lower left corner
@@ -67,7 +67,7 @@ class Grid(NamedTuple):
         return east, north
 
 
-def ground_heights(points: Points, grid: Grid, *, classified: bool, built: Bools) -> Float:
+def ground_heights(points: SurveyPoints, grid: CloudGrid, *, classified: bool, built: Bools) -> Float:
     """Heights (rows, columns) of the ground at the cells' centres, NaN where no ground return lies.
 
     A cell's height is the mean of its ground returns, moved along the local slope from their mean place to
@@ -93,7 +93,7 @@ def ground_heights(points: Points, grid: Grid, *, classified: bool, built: Bools
     return np.asarray(z, float)
 
 
-def ground_returns(points: Points, grid: Grid, *, built: Bools) -> Bools:
+def ground_returns(points: SurveyPoints, grid: CloudGrid, *, built: Bools) -> Bools:
     """Which points (n,) lie on the ground, by a progressive morphological filter (SMRF, Pingel et al. 2013).
 
     The lowest last returns of the cells are opened with windows of growing width. What an opening lowers by

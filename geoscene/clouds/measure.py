@@ -13,11 +13,11 @@ import shapely
 from geoscene.buildings import Buildings
 from geoscene.clouds import shift as shifts
 from geoscene.clouds import trees as canopy
-from geoscene.clouds.ground import MARGIN, Grid, ground_heights
+from geoscene.clouds.ground import MARGIN, CloudGrid, ground_heights
 from geoscene.clouds.levels import Body, split_bodies
 from geoscene.clouds.read import GROUND, VEGETATION
 from geoscene.clouds.roofs import FEWEST, block_of, fit_roof, roof_points
-from geoscene.clouds.spool import SIDE, Points, Spool, Square, without_outliers
+from geoscene.clouds.spool import SIDE, Spool, Square, SurveyPoints, without_outliers
 from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
 from geoscene.support.processes import run_tasks
@@ -56,11 +56,11 @@ class _Objects(NamedTuple):
     square: Square
     bodies: list[tuple[int, tuple[Body, ...]]]
     walls: list[tuple[int, float]]
-    trees: canopy.Found
+    trees: canopy.DetectedTrees
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class CloudMeasurements:
     """What was measured in a cloud.
 
     frame     : of the scene
@@ -79,7 +79,7 @@ class Measured:
     bodies: list[tuple[Body, ...]]
     walls: Float
     base: Float
-    trees: canopy.Found
+    trees: canopy.DetectedTrees
 
 
 def classified(spool: Spool) -> bool:
@@ -93,15 +93,15 @@ def box_of(square: Square, margin: float = 0.0) -> tuple[float, float, float, fl
     return x - margin, y - margin, x + SIDE + margin, y + SIDE + margin
 
 
-def grid_of(square: Square, cell: float, *, margin: float) -> Grid:
+def grid_of(square: Square, cell: float, *, margin: float) -> CloudGrid:
     """Cells of a square and of a margin around it, in whole cells."""
     around = int(np.ceil(margin / cell))
     x, y, _, _ = box_of(square, around * cell)
     many = round(SIDE / cell) + 2 * around
-    return Grid(x, y, many, many, cell)
+    return CloudGrid(x, y, many, many, cell)
 
 
-def burnt(shapes: Any, grid: Grid, *, buffer: float = 0.0) -> Bools:
+def burnt(shapes: Any, grid: CloudGrid, *, buffer: float = 0.0) -> Bools:
     """Cells (rows, columns) whose centres lie in polygons, or within ``buffer`` metres of them."""
     from rasterio import Affine  # noqa: PLC0415 - slow to import
     from rasterio.features import rasterize  # noqa: PLC0415
@@ -117,7 +117,7 @@ def burnt(shapes: Any, grid: Grid, *, buffer: float = 0.0) -> Bools:
     return np.asarray(rasterize(near.tolist(), grid.shape, transform=place, dtype="uint8"), np.bool_)
 
 
-def _points(work: Work, square: Square, *, margin: float) -> tuple[Points, int]:
+def _points(work: Work, square: Square, *, margin: float) -> tuple[SurveyPoints, int]:
     """The points of a square with a margin, without outliers, and the outliers in the square itself."""
     # a voxel more, so that what lies at the rim has all its neighbours
     wide = work.spool.around(box_of(square, margin + 3.0), shift=work.shift)
@@ -186,7 +186,7 @@ def _nearest(heights: Float) -> Float:
 
 def measure(
     work: Work, buildings: Buildings, *, terrain: Terrain, frame: Frame, workers: int, progress: Progress
-) -> Measured:
+) -> CloudMeasurements:
     """Roofs of all buildings and parts that are drawn, and all trees."""
     rows = np.flatnonzero(buildings.drawn & ~shapely.is_empty(buildings.footprint))
     outlines = _seen_from_above(buildings.footprint[rows], buildings.outline[rows])
@@ -216,14 +216,14 @@ def measure(
     bodies = dict(pair for some in found for pair in some.bodies)
     walls = dict(pair for some in found for pair in some.walls)
     trees = [some.trees for some in found]
-    return Measured(
+    return CloudMeasurements(
         frame,
         buildings,
         rows.tolist(),
         [bodies.get(k, ()) for k in range(len(rows))],
         np.array([walls.get(k, np.nan) for k in range(len(rows))], float),
         base,
-        canopy.Found(
+        canopy.DetectedTrees(
             *(np.concatenate([getattr(t, name) for t in trees]) for name in ("xy", "height", "crown"))
         ),
     )
@@ -305,7 +305,7 @@ def _bodies_of(polygon: Any, xyz: Float, *, seed: str, split: bool) -> tuple[Bod
     return () if roof is None else (Body(polygon, roof),)
 
 
-def _trees_of(work: Work, square: Square, *, points: Points, terrain: Terrain) -> canopy.Found:
+def _trees_of(work: Work, square: Square, *, points: SurveyPoints, terrain: Terrain) -> canopy.DetectedTrees:
     """Trees whose crowns have their middle in a square."""
     x0, y0, x1, y1 = box_of(square, canopy.MARGIN)
     x, y = points.xyz[:, 0], points.xyz[:, 1]

@@ -46,7 +46,7 @@ class Chunk(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class CloudFile:
+class SurveyFile:
     """A point cloud on disk.
 
     crs       : horizontal CRS
@@ -69,7 +69,7 @@ class CloudFile:
             yield from (_las_chunks if self.path.suffix.lower() != ".ply" else _ply_chunks)(self.path)
 
 
-def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> CloudFile:
+def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> SurveyFile:
     """The header of a cloud.
 
     crs  : of the coordinates, where the file states none or a wrong one
@@ -115,7 +115,7 @@ def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> CloudFile:
             " with `cloud_unit` m, ft or us-ft"
         )
     datum = upright.name if upright is not None else f"ellipsoid of {stated.name}" if ellipsoidal else ""
-    return CloudFile(
+    return SurveyFile(
         path,
         plane,
         factor,

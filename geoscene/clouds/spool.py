@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
 
-from geoscene.clouds.read import GROUND, NOISE, VEGETATION, CloudFile
+from geoscene.clouds.read import GROUND, NOISE, VEGETATION, SurveyFile
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 from geoscene.support.columns import Columns
@@ -31,7 +31,7 @@ Square = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Points(Columns):
+class SurveyPoints(Columns):
     """Points as columns.
 
     xyz   : (n, 3) float64, scene metres
@@ -69,7 +69,7 @@ class Spool:
         """Points beyond the bounds."""
         return self.read - sum(self.within)
 
-    def around(self, bounds: Sequence[float], *, shift: tuple[float, float] = (0.0, 0.0)) -> Points:
+    def around(self, bounds: Sequence[float], *, shift: tuple[float, float] = (0.0, 0.0)) -> SurveyPoints:
         """The points within bounds (xmin, ymin, xmax, ymax) after a shift in metres is added to all."""
         low = np.floor((np.array(bounds[:2]) - shift) / SIDE).astype(int)
         high = np.floor((np.array(bounds[2:]) - shift) / SIDE).astype(int)
@@ -82,11 +82,11 @@ class Spool:
         rows = np.concatenate(parts)
         xyz = rows["xyz"] * _STEP + (*shift, 0.0)
         inside = ((xyz[:, :2] >= bounds[:2]) & (xyz[:, :2] < bounds[2:])).all(axis=1)
-        return Points(xyz[inside], rows["klass"][inside], rows["last"][inside])
+        return SurveyPoints(xyz[inside], rows["klass"][inside], rows["last"][inside])
 
 
 def spool_clouds(
-    clouds: Sequence[CloudFile],
+    clouds: Sequence[SurveyFile],
     frame: Frame,
     *,
     bounds: Sequence[float],
@@ -140,7 +140,7 @@ def spool_clouds(
     return Spool(folder, tuple(sorted(squares)), read, tuple(inside), noise, ground, plants)
 
 
-def without_outliers(points: Points) -> Points:
+def without_outliers(points: SurveyPoints) -> SurveyPoints:
     """The points without single ones and small groups far from all others, such as birds and low noise."""
     if not len(points):
         return points
@@ -185,7 +185,7 @@ def _flush(held: dict[Square, list[NDArray[np.void]]], folder: Path) -> None:
 
 
 def _beside(
-    clouds: Sequence[CloudFile], frame: Frame, *, bounds: Sequence[float], covered: Sequence[float]
+    clouds: Sequence[SurveyFile], frame: Frame, *, bounds: Sequence[float], covered: Sequence[float]
 ) -> str:
     names = ", ".join(cloud.path.name for cloud in clouds)
     if not np.isfinite(covered).all():

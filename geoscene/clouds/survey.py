@@ -13,9 +13,9 @@ import numpy as np
 
 from geoscene.buildings import read_buildings
 from geoscene.clouds.apply import with_measurements
-from geoscene.clouds.ground import MARGIN, Grid, bridged_by_blocks
+from geoscene.clouds.ground import MARGIN, CloudGrid, bridged_by_blocks
 from geoscene.clouds.measure import GroundOf, Work, burnt, classified, grounds_of, measure
-from geoscene.clouds.read import CloudFile, open_cloud
+from geoscene.clouds.read import SurveyFile, open_cloud
 from geoscene.clouds.shift import best_shift
 from geoscene.clouds.spool import SIDE, Spool, spool_clouds
 from geoscene.errors import InputError
@@ -129,7 +129,7 @@ def with_clouds(
     )
 
 
-def _check_datums(files: Sequence[CloudFile]) -> None:
+def _check_datums(files: Sequence[SurveyFile]) -> None:
     if len({file.vertical for file in files}) > 1:
         raise InputError(
             "the clouds differ in the reference of heights: "
@@ -156,7 +156,7 @@ def _ground_file(
     *,
     frame: Frame,
     extent: Sequence[float],
-    files: Sequence[CloudFile],
+    files: Sequence[SurveyFile],
     keys: Sequence[str],
     cloud: CloudOptions,
     options: BuildOptions,
@@ -185,7 +185,7 @@ def _ground_file(
             heights[begin[1] : end[1], begin[0] : end[0]] = ground.heights[r0:r1, c0:c1]
     if np.isnan(heights).all():
         raise InputError(f"{files[0].path.name}: no ground returns within the map")
-    grid = Grid(float(low[0] * cell), float(low[1] * cell), columns, rows, cell)
+    grid = CloudGrid(float(low[0] * cell), float(low[1] * cell), columns, rows, cell)
     gap = np.isnan(heights) & (distance_transform_edt(np.isnan(heights)) * cell > _FAR)
     gap &= ~burnt(footprints, grid)
     if gap.any() and options.dem:
@@ -215,7 +215,7 @@ def _ground_file(
 
 
 def _write_raster(
-    path: Path, heights: Any, *, grid: Grid, frame: Frame, file: CloudFile, attribution: str
+    path: Path, heights: Any, *, grid: CloudGrid, frame: Frame, file: SurveyFile, attribution: str
 ) -> None:
     import rasterio  # noqa: PLC0415 - slow to import
 

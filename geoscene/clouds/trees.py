@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from geoscene.clouds.ground import Grid
+from geoscene.clouds.ground import CloudGrid
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
@@ -26,7 +26,7 @@ _SLENDER = 0.12  # crown diameter over height, at least: lamps, masts and cranes
 
 
 @dataclass(frozen=True, slots=True)
-class Found(Columns):
+class DetectedTrees(Columns):
     """Trees found in a cloud.
 
     xy     : (n, 2) scene metres, the centre of the crown
@@ -39,7 +39,7 @@ class Found(Columns):
     crown: Float
 
 
-def find_trees(xyz: Float, above: Float, *, grid: Grid, excluded: Bools) -> Found:
+def find_trees(xyz: Float, above: Float, *, grid: CloudGrid, excluded: Bools) -> DetectedTrees:
     """Trees whose crowns have their peaks in a grid.
 
     The canopy is the highest point of each cell, smoothed; its peaks within a distance that grows with the
@@ -60,7 +60,7 @@ def find_trees(xyz: Float, above: Float, *, grid: Grid, excluded: Bools) -> Foun
     smooth = gaussian_filter(_closed(top), 0.6 / grid.cell)
     peaks, crown = _crowns(smooth, top, cell=grid.cell)
     if not len(peaks):
-        return Found(np.empty((0, 2)), np.empty(0), np.empty(0))
+        return DetectedTrees(np.empty((0, 2)), np.empty(0), np.empty(0))
     label = crown.ravel()
     count = np.bincount(label[label >= 0], minlength=len(peaks))
     height = np.zeros(len(peaks))
@@ -83,7 +83,7 @@ def find_trees(xyz: Float, above: Float, *, grid: Grid, excluded: Bools) -> Foun
     rough = _roughness(xyz, member, count=len(peaks))
     keep = (count * grid.cell**2 >= _SMALLEST) & (diameter <= _WIDEST) & (height >= _LOWEST)
     keep &= (rough > _ROUGHER * noise + _ROUGH) & (diameter > _SLENDER * height)
-    return Found(centre[keep], height[keep], diameter[keep])
+    return DetectedTrees(centre[keep], height[keep], diameter[keep])
 
 
 def _closed(top: Float) -> Float:

@@ -37,7 +37,7 @@ _LEGEND = (
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class ChartPoint:
     """A named point of a chart, with intervals if they are known; ``best`` ones are joined by a line."""
 
     name: str
@@ -68,7 +68,7 @@ class Axes:
     y_text: Callable[[float], str]
 
 
-def scatter(points: Sequence[Point], axes: Axes, *, width: int = 1100, height: int = 700) -> bytes:
+def scatter(points: Sequence[ChartPoint], axes: Axes, *, width: int = 1100, height: int = 700) -> bytes:
     """A PNG of points with a legend, both axes logarithmic.
 
     Values of 0 are drawn at the lower end, marked ``0``. Points whose names have no room are counted in the

@@ -45,7 +45,7 @@ class Series:
 
 
 @dataclass(frozen=True, slots=True)
-class Band:
+class ShadedBand:
     """A named area between two values of y, (x, low, high) from point to point; broken where not finite."""
 
     name: str
@@ -66,7 +66,7 @@ class Panel:
     series: Sequence[Series]
     x_log: bool = True
     y_log: bool = True
-    bands: Sequence[Band] = ()
+    bands: Sequence[ShadedBand] = ()
     x_ends: Point | None = None
     y_ends: Point | None = None
     floor: bool = False

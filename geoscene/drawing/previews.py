@@ -27,7 +27,7 @@ _FINER = 2
 _MARK = (255, 255, 255)
 
 
-class Plan:
+class PreviewPlan:
     """A picture of a part of the plane, north up.
 
     bounds : xmin, ymin, xmax, ymax of what is shown, metres

@@ -2,6 +2,6 @@
 
 from geoscene.export.files import Summary as Summary
 from geoscene.export.kinds import KINDS as KINDS
-from geoscene.export.kinds import Kind as Kind
+from geoscene.export.kinds import ExportFormat as ExportFormat
 from geoscene.export.kinds import export_scene as export_scene
 from geoscene.export.kinds import kind_of as kind_of

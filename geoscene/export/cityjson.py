@@ -15,7 +15,7 @@ from geoscene.classes import Class, materials
 from geoscene.errors import InputError
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.objects import (
-    Features,
+    FeatureAttributes,
     Part,
     Piece,
     attribution,
@@ -28,7 +28,7 @@ from geoscene.export.shells import bodies, manifold_patches, shell_numbers
 from geoscene.export.tables import target_crs
 from geoscene.export.vertices import Vertices
 from geoscene.geometry.frames import Frame, utm_crs
-from geoscene.geometry.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Instances, Mesh
+from geoscene.geometry.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Mesh, ShapeInstances
 from geoscene.scene import Scene
 from geoscene.support.files import append, atomic_file, spool
 from geoscene.support.progress import Progress, silent
@@ -206,7 +206,7 @@ def _metadata(scene: Scene, target: _Target, *, extent: Float | None) -> dict[st
 
 def _tile_objects(
     part: Part,
-    features: Features,
+    features: FeatureAttributes,
     *,
     library: Sequence[Mesh],
     target: _Target,
@@ -271,7 +271,7 @@ def _tile_objects(
     return fresh, entries, solids
 
 
-def _name(features: Features, piece: Piece, *, index: tuple[int, int]) -> str:
+def _name(features: FeatureAttributes, piece: Piece, *, index: tuple[int, int]) -> str:
     name = features.name(piece.feature)
     if piece.solid and piece.feature >= 0:
         return name
@@ -391,8 +391,8 @@ def _surface(piece: Piece, triangles: Ints, *, look: Ints, kind: str) -> dict[st
 
 
 def _copies(
-    instances: Instances,
-    features: Features,
+    instances: ShapeInstances,
+    features: FeatureAttributes,
     *,
     library: Sequence[Mesh],
     index: tuple[int, int],

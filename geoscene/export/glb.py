@@ -9,8 +9,16 @@ from typing import Any
 import numpy as np
 
 from geoscene.export.files import Summary
-from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
-from geoscene.export.objects import Features, Part, attribution, klass_name, parts, pieces, read_features
+from geoscene.export.gltf import GlbWriter, PropertyTables, add_instances, y_up
+from geoscene.export.objects import (
+    FeatureAttributes,
+    Part,
+    attribution,
+    klass_name,
+    parts,
+    pieces,
+    read_features,
+)
 from geoscene.scene import Scene
 from geoscene.support.files import atomic_file
 from geoscene.support.progress import Progress, silent
@@ -34,7 +42,7 @@ def write_glb(
     library = scene.shapes()
     objects = solids = faces = 0
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        tables = Tables(features)
+        tables = PropertyTables(features)
         shapes: dict[int, int] = {}
         tiles = []
         for part in parts(scene, layers, stage="GLB", progress=progress):
@@ -62,7 +70,7 @@ def write_glb(
     return Summary.of(path, "glb", objects=objects, solids=solids, faces=faces, crs=scene.frame.name)
 
 
-def _objects(writer: GlbWriter, part: Part, *, features: Features, tables: Tables) -> int:
+def _objects(writer: GlbWriter, part: Part, *, features: FeatureAttributes, tables: PropertyTables) -> int:
     """Add a node for every object of a tile; returns the number of solids among them."""
     solids = 0
     for piece in pieces(part.mesh):

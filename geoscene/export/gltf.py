@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.errors import InputError
 from geoscene.export.files import compact_json
-from geoscene.export.objects import Features, table_columns
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.export.objects import FeatureAttributes, table_columns
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.support.files import append, spool
 from geoscene.typing import Float
 
@@ -272,10 +272,10 @@ class GlbWriter:
         out.write(b"}")
 
 
-class Tables:
+class PropertyTables:
     """Rows of the property tables: a table for each layer, a row for each feature and class in it."""
 
-    def __init__(self, features: Features) -> None:
+    def __init__(self, features: FeatureAttributes) -> None:
         self.features = features
         self._tables: dict[int, tuple[int, dict[tuple[int, int], int]]] = {}
 
@@ -294,9 +294,9 @@ class Tables:
 
 def add_instances(
     writer: GlbWriter,
-    instances: Instances,
+    instances: ShapeInstances,
     *,
-    features: Features,
+    features: FeatureAttributes,
     library: Mapping[str, Mesh],
     meshes: dict[int, int],
     metadata: Callable[[int, NDArray[np.integer]], dict[str, Any]],
@@ -305,7 +305,7 @@ def add_instances(
 
     meshes   : numbers of the meshes of shapes that the file has already; new ones are added
     metadata : the arguments ``table``, ``rows`` and ``count`` of `GlbWriter.copies` for a layer's number and
-               the feature and class (k, 2) of its instances, see `Tables.metadata`
+               the feature and class (k, 2) of its instances, see `PropertyTables.metadata`
     """
     layer = np.searchsorted(features.starts, instances.feature, side="right") - 1
     keys = np.column_stack([instances.shape, layer])

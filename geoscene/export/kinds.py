@@ -16,7 +16,7 @@ from geoscene.support.progress import Progress, silent
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class ExportFormat:
     """One format.
 
     title    : name for messages
@@ -33,11 +33,11 @@ class Kind:
     beside: str = ""
 
 
-def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: str = "") -> Kind:
-    return Kind(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside)
+def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: str = "") -> ExportFormat:
+    return ExportFormat(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside)
 
 
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, ExportFormat] = {
     "cityjson": _kind(
         "CityJSON 2.0",
         "cityjson:write_cityjson",

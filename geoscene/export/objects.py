@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.export.files import plain
-from geoscene.geometry.mesh import Instances, Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, ShapeInstances, concatenate
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float, Ints
@@ -22,7 +22,7 @@ BARE = "terrain"
 
 
 @dataclass(frozen=True)
-class Features:
+class FeatureAttributes:
     """Attributes of all features of a scene.
 
     starts  : (k,) int64, first feature number of each layer
@@ -64,7 +64,7 @@ class Features:
         return layer, int(np.searchsorted(self.numbers[layer], feature))
 
 
-def read_features(scene: Scene) -> Features:
+def read_features(scene: Scene) -> FeatureAttributes:
     """The attributes of all features, without their geometry.
 
     Raises SceneFormatError if the scene lacks a layer that its manifest names.
@@ -79,7 +79,7 @@ def read_features(scene: Scene) -> Features:
     for layer in columns:
         _, owner, count = np.unique(layer["osm_id"].astype(str), return_inverse=True, return_counts=True)
         unique.append(count[owner] == 1)
-    return Features(starts, tuple(layers), numbers, columns, tuple(unique))
+    return FeatureAttributes(starts, tuple(layers), numbers, columns, tuple(unique))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class Part:
     span: int
     origin: Float
     mesh: Mesh
-    instances: Instances
+    instances: ShapeInstances
 
 
 def parts(
@@ -161,7 +161,7 @@ def parts(
         raise InputError(f"`layers` {names}: no faces in this scene; they are attributes alone, or empty")
 
 
-def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
+def expand(instances: ShapeInstances, library: Sequence[Mesh]) -> Mesh:
     """The instances as one mesh, for formats without instances; faces keep their instance's feature."""
     out = []
     for number in np.unique(instances.shape).tolist():
@@ -181,7 +181,9 @@ def expand(instances: Instances, library: Sequence[Mesh]) -> Mesh:
     return concatenate(out)
 
 
-def table_columns(features: Features, *, layer: int, pairs: NDArray[np.integer]) -> dict[str, NDArray[Any]]:
+def table_columns(
+    features: FeatureAttributes, *, layer: int, pairs: NDArray[np.integer]
+) -> dict[str, NDArray[Any]]:
     """``feature``, ``class`` and the attributes of features of a layer.
 
     pairs : (n, 2) feature number and `Class` code: a building and its pad are one feature of two classes

@@ -32,7 +32,7 @@ _STRUCTURES = (Class.BUILDING, Class.BRIDGE, Class.TUNNEL, Class.WALL, Class.FEN
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class RasterGrid:
     """Cells of a raster: its north-west corner in projected coordinates, their side, their counts."""
 
     west: float
@@ -48,7 +48,7 @@ class Grid:
         return np.stack([x, y, points[..., 2]], axis=-1)
 
 
-def grid_of(scene: Scene, resolution: float) -> Grid:
+def grid_of(scene: Scene, resolution: float) -> RasterGrid:
     """The scene's extent aligned to multiples of the resolution, so that rasters of one CRS match."""
     if not (np.isfinite(resolution) and resolution > 0):
         raise InputError(f"`resolution` {resolution}: must be positive metres")
@@ -61,7 +61,7 @@ def grid_of(scene: Scene, resolution: float) -> Grid:
         raise InputError(
             f"`resolution` {resolution}: {columns} x {rows} cells are too many; use a larger one"
         )
-    return Grid(float(left * resolution), float(high * resolution), resolution, columns, rows)
+    return RasterGrid(float(left * resolution), float(high * resolution), resolution, columns, rows)
 
 
 def write_geotiff(
@@ -116,7 +116,7 @@ def write_geotiff(
     return Summary.of(path, "geotiff", objects=count, faces=faces, crs=scene.frame.name)
 
 
-def _cells_on_disk(path: Path, grid: Grid, *, value: np.generic) -> NDArray[Any]:
+def _cells_on_disk(path: Path, grid: RasterGrid, *, value: np.generic) -> NDArray[Any]:
     """Cells (rows, columns) of a value in a file, mapped to memory.
 
     They are written first: a disk that is full then ends in an OSError, not in a fault of the memory.
@@ -133,7 +133,7 @@ def draw(
     origin: Float,
     *,
     scene: Scene,
-    grid: Grid,
+    grid: RasterGrid,
     height: NDArray[np.float32],
     labels: NDArray[np.uint8],
 ) -> None:
@@ -148,7 +148,7 @@ def draw(
     draw_triangles(corners, mesh.klass, height[window], labels[window])
 
 
-def _write_draft(path: Path, scene: Scene, *, grid: Grid, cells: NDArray[Any], model: Model) -> None:
+def _write_draft(path: Path, scene: Scene, *, grid: RasterGrid, cells: NDArray[Any], model: Model) -> None:
     import rasterio  # noqa: PLC0415  (0.4 s)
     from rasterio.windows import Window  # noqa: PLC0415
 

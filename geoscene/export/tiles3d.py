@@ -11,8 +11,8 @@ import numpy as np
 
 from geoscene.export.files import Summary, compact_json
 from geoscene.export.globe import Globe
-from geoscene.export.gltf import GlbWriter, Tables, add_instances, y_up
-from geoscene.export.objects import Features, Part, attribution, expand, parts, pieces, read_features
+from geoscene.export.gltf import GlbWriter, PropertyTables, add_instances, y_up
+from geoscene.export.objects import FeatureAttributes, Part, attribution, expand, parts, pieces, read_features
 from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.support.files import atomic_file, atomic_folder, write_atomically
@@ -130,7 +130,13 @@ def _leaf(uri: str, low: Float, *, high: Float) -> _Node:
 
 
 def _tile(
-    folder: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, library: dict[str, Mesh]
+    folder: Path,
+    scene: Scene,
+    *,
+    part: Part,
+    features: FeatureAttributes,
+    globe: Globe,
+    library: dict[str, Mesh],
 ) -> _Node | None:
     """Write the contents of one tile; returns its node, or None for an empty tile."""
     name = f"content/{part.index[0]}_{part.index[1]}"
@@ -156,7 +162,7 @@ def _tile(
 
 
 def _write_mesh(
-    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe
+    path: Path, scene: Scene, *, part: Part, features: FeatureAttributes, globe: Globe
 ) -> tuple[Float, Float]:
     """Write the faces of a tile, one mesh per layer; returns the corners of the bounding box as written."""
     mesh = part.mesh
@@ -165,7 +171,7 @@ def _write_mesh(
     layer = np.searchsorted(features.starts, mesh.feature, side="right")
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        tables, children = Tables(features), []
+        tables, children = PropertyTables(features), []
         for number in np.unique(layer).tolist():
             rows = np.flatnonzero(layer == number)
             pair = np.column_stack([mesh.feature[rows], mesh.klass[rows]])
@@ -193,7 +199,13 @@ def _write_mesh(
 
 
 def _write_copies(
-    path: Path, scene: Scene, *, part: Part, features: Features, globe: Globe, library: dict[str, Mesh]
+    path: Path,
+    scene: Scene,
+    *,
+    part: Part,
+    features: FeatureAttributes,
+    globe: Globe,
+    library: dict[str, Mesh],
 ) -> None:
     """Write the instances of a tile, one node per shape and layer."""
     anchors = part.instances.transform[:, :, 3] + part.origin
@@ -202,7 +214,7 @@ def _write_copies(
     transform[:, :, 3] = globe.local(anchors)
     copies = replace(part.instances, transform=transform)
     with atomic_file(path) as out, GlbWriter(path) as writer:
-        tables = Tables(features)
+        tables = PropertyTables(features)
         nodes = add_instances(
             writer, copies, features=features, library=library, meshes={}, metadata=tables.metadata
         )

@@ -121,7 +121,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
 
 @dataclass(frozen=True, slots=True)
-class Instances(Columns):
+class ShapeInstances(Columns):
     """Instances of shapes, such as trees.
 
     shape     : (k,) int32, index into the scene's shapes
@@ -133,13 +133,13 @@ class Instances(Columns):
     transform: Float
     feature: NDArray[np.int32]
 
-    def shifted(self, offset: Sequence[float] | Float) -> Instances:
+    def shifted(self, offset: Sequence[float] | Float) -> ShapeInstances:
         """The instances moved by ``offset`` (3,), metres."""
         moved = self.transform.copy()
         moved[:, :, 3] += np.asarray(offset, float)
         return replace(self, transform=moved)
 
     @classmethod
-    def empty(cls) -> Instances:
+    def empty(cls) -> ShapeInstances:
         """No instances."""
         return cls(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))

@@ -64,7 +64,7 @@ class Findings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict(Findings):
+class MeshVerdict(Findings):
     """Result of the checks of a mesh, one row per feature with closed faces, in order of feature number.
 
     A feature with a vertex that is not finite is not closed, and its volume is NaN.
@@ -215,7 +215,7 @@ def grid_cells(points: Float, *, grid: float = GRID) -> Ints:
     return np.rint(points * (1.0 / grid)).astype(np.int64)
 
 
-def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
+def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> MeshVerdict:
     """Check every feature that has closed faces (`Mesh.closed`).
 
     Vertices of a feature in one grid cell count as one, because files with rounded coordinates merge them.
@@ -228,7 +228,7 @@ def validate_mesh(mesh: Mesh, *, grid: float = GRID) -> Verdict:
     checked = finite[owner]
     corners = mesh.vertices[mesh.faces[rows[checked]]]
     found = check_solids(corners, owner[checked].astype(np.int64), n=n, grid=grid)
-    return Verdict(
+    return MeshVerdict(
         feature=feature.astype(np.int32),
         faces=np.bincount(owner, minlength=n),
         finite=finite,

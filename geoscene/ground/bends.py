@@ -22,7 +22,7 @@ def without_bends(
     run the way of the ring that had the first of them first, as from GEOS.
 
     points  : (k, 2) float64, on a grid on which products of differences are exact
-    a, b, other, ring : as in `geoscene.ground.faces.Faces`
+    a, b, other, ring : as in `geoscene.ground.faces.GroundFaces`
     largest : area of the largest triangle that counts as a small bend, m2
     """
     node = _meetings(len(points), a, other, ring)

@@ -25,7 +25,7 @@ from geoscene.ground.partition import (
     tile_lattice,
     values_at,
 )
-from geoscene.ground.triangulate import Triangles, triangulate, triangulate_relief
+from geoscene.ground.triangulate import PlaneTriangles, triangulate, triangulate_relief
 from geoscene.sources.data import Way
 from geoscene.typing import Bools, Float, Height
 
@@ -93,7 +93,7 @@ def drape(
     plan: GroundPlan,
     cells: Partition,
     *,
-    triangles: Triangles,
+    triangles: PlaneTriangles,
     height: Height | None = None,
     levels: WaterLevels | None = None,
 ) -> Mesh:

@@ -17,7 +17,7 @@ from geoscene.typing import Bools, Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
-class Faces:
+class GroundFaces:
     """Faces that segments bound, and the half-edges of their outlines: ring by ring, in the ring's order.
 
     points : (k, 2) float64, metres, those of the segments
@@ -75,7 +75,7 @@ class Faces:
         return inner
 
 
-def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, float, float]) -> Faces:
+def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, float, float]) -> GroundFaces:
     """The faces within a box that noded segments bound.
 
     points : (k, 2) float64, metres, each once, on a grid in which twice the area of each ring is exact
@@ -92,7 +92,7 @@ def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, flo
     whole = (box[2] - box[0]) * (box[3] - box[1])
     if abs(covered - whole) > 1e-7 * whole:
         raise GeosceneError(f"ground cells of the tile at {box} cover {covered:.6f} m2 of {whole:.6f}")
-    return Faces(points, *columns)
+    return GroundFaces(points, *columns)
 
 
 def _polygons(points: Float, vertex: Ints, *, ring: Ints, rings: Ints, count: Ints) -> NDArray[np.object_]:

@@ -27,7 +27,7 @@ from geoscene.ground.layers import (
 )
 from geoscene.ground.nearby import points_in_boxes, shapes_near
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
-from geoscene.ground.triangulate import Triangles
+from geoscene.ground.triangulate import PlaneTriangles
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
@@ -168,7 +168,7 @@ class Beside(NamedTuple):
     inside: Bools
 
 
-def rows_beside(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Beside:
+def rows_beside(plan: GroundPlan, cells: Partition, *, triangles: PlaneTriangles) -> Beside:
     """The rows of the layers that touch the vertices of triangles.
 
     On a tile's side they are those of all layers there, so that neighbouring tiles agree.
@@ -189,7 +189,7 @@ def has_kerbs(plan: GroundPlan, near: Ints) -> bool:
     return plan.kerbs is not None and bool(_is_raised(plan.layers.priority[near]).any())
 
 
-def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, triangles: Triangles, beside: Beside) -> Float:
+def kerb_heights(plan: GroundPlan, kerbs: Kerbs, *, triangles: PlaneTriangles, beside: Beside) -> Float:
     """Metres (n,) by which vertices of triangles are raised: on sidewalks and on the outside of kerbs.
 
     What touches a carriageway, water or a tunnel's mouth is not raised.
@@ -226,7 +226,7 @@ def _is_raised(priority: Float) -> Bools:
     return sidewalk | ((priority >= KERBS) & (priority <= RAISED))
 
 
-def on_border(plan: GroundPlan, cells: Partition, *, triangles: Triangles) -> Bools:
+def on_border(plan: GroundPlan, cells: Partition, *, triangles: PlaneTriangles) -> Bools:
     """Whether vertices (n,) lie on the border of a tile."""
     edge = np.zeros(len(triangles.points), np.bool_)
     x, y = triangles.points.T

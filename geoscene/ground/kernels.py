@@ -570,7 +570,7 @@ def last_around(xy: Float, corners: Float, ring: Ints, polygon: Ints) -> tuple[I
 def inner_points(points: Float, a: Ints, ring: Ints, face: Ints) -> Float:
     """A point (n, 2) within each face: amid the widest section at half its height, between two vertices.
 
-    a, ring, face : as in `geoscene.ground.faces.Faces`
+    a, ring, face : as in `geoscene.ground.faces.GroundFaces`
     """
     found = np.empty((len(face) - 1, 2))
     cuts = np.empty(16)

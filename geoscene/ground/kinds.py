@@ -9,7 +9,7 @@ from geoscene.sources.data import Tags
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class GroundKind:
     """One kind of ground.
 
     klass    : `geoscene.classes.Class`
@@ -26,29 +26,29 @@ class Kind:
     body: str = ""
 
 
-_BUILT = Kind(Class.TERRAIN, "soil", 10)
-_PAVED = Kind(Class.TERRAIN, "paving", 11)
-_LOOSE = Kind(Class.TERRAIN, "gravel", 12)
-_FIELD = Kind(Class.TERRAIN, "soil", 20)
-_GREEN = Kind(Class.GRASS, "grass", 22)
-_LAWN = Kind(Class.GRASS, "grass", 26)
-_WOOD = Kind(Class.FOREST_FLOOR, "soil", 24)
-_SCRUB = Kind(Class.TERRAIN, "dry_grass", 23)
-_SAND = Kind(Class.SAND, "sand", 30)
-_STONES = Kind(Class.TERRAIN, "gravel", 30)
-_ROCK = Kind(Class.TERRAIN, "stone", 30)
-_STANDING = Kind(Class.WATER, "water", 40, body="standing")
-_RIVER = Kind(Class.WATER, "water", 41, body="river")
-_MOLE = Kind(Class.TERRAIN, "stone", 50)
-_PIER = Kind(Class.SIDEWALK, "concrete", 55)
-_RUNWAY = Kind(Class.ROAD, "asphalt", 70)
-_PARKING = Kind(Class.PARKING, "asphalt", 65)
-_SQUARE = Kind(Class.SIDEWALK, "paving", 60)
-_BASIN = Kind(Class.WATER, "water", 75, body="standing")
+_BUILT = GroundKind(Class.TERRAIN, "soil", 10)
+_PAVED = GroundKind(Class.TERRAIN, "paving", 11)
+_LOOSE = GroundKind(Class.TERRAIN, "gravel", 12)
+_FIELD = GroundKind(Class.TERRAIN, "soil", 20)
+_GREEN = GroundKind(Class.GRASS, "grass", 22)
+_LAWN = GroundKind(Class.GRASS, "grass", 26)
+_WOOD = GroundKind(Class.FOREST_FLOOR, "soil", 24)
+_SCRUB = GroundKind(Class.TERRAIN, "dry_grass", 23)
+_SAND = GroundKind(Class.SAND, "sand", 30)
+_STONES = GroundKind(Class.TERRAIN, "gravel", 30)
+_ROCK = GroundKind(Class.TERRAIN, "stone", 30)
+_STANDING = GroundKind(Class.WATER, "water", 40, body="standing")
+_RIVER = GroundKind(Class.WATER, "water", 41, body="river")
+_MOLE = GroundKind(Class.TERRAIN, "stone", 50)
+_PIER = GroundKind(Class.SIDEWALK, "concrete", 55)
+_RUNWAY = GroundKind(Class.ROAD, "asphalt", 70)
+_PARKING = GroundKind(Class.PARKING, "asphalt", 65)
+_SQUARE = GroundKind(Class.SIDEWALK, "paving", 60)
+_BASIN = GroundKind(Class.WATER, "water", 75, body="standing")
 
-SEA = Kind(Class.WATER, "water", 39, body="sea")
+SEA = GroundKind(Class.WATER, "water", 39, body="sea")
 
-AREAS: dict[str, dict[str, Kind]] = {
+AREAS: dict[str, dict[str, GroundKind]] = {
     "landuse": {
         "residential": _BUILT, "construction": _BUILT, "brownfield": _BUILT, "military": _BUILT,
         "farmyard": _BUILT, "landfill": _BUILT, "greenfield": _FIELD, "civil": _BUILT, "education": _BUILT,
@@ -57,25 +57,29 @@ AREAS: dict[str, dict[str, Kind]] = {
         "port": _PAVED, "harbour": _PAVED, "quarry": _LOOSE,
         "farmland": _FIELD, "farm": _FIELD, "vineyard": _FIELD, "orchard": _GREEN, "allotments": _GREEN,
         "forest": _WOOD, "meadow": _GREEN, "cemetery": _GREEN, "recreation_ground": _GREEN,
-        "village_green": _GREEN, "grass": _LAWN, "flowerbed": Kind(Class.GRASS, "soil", 27),
+        "village_green": _GREEN, "grass": _LAWN, "flowerbed": GroundKind(Class.GRASS, "soil", 27),
         "basin": _STANDING, "reservoir": _STANDING, "salt_pond": _STANDING,
-        "railway": Kind(Class.RAIL, "gravel", 25),
+        "railway": GroundKind(Class.RAIL, "gravel", 25),
     },
     "natural": {
         "wood": _WOOD, "scrub": _SCRUB, "heath": _SCRUB, "fell": _SCRUB, "moor": _SCRUB, "shrubbery": _SCRUB,
-        "tundra": _SCRUB, "grassland": _LAWN, "wetland": Kind(Class.TERRAIN, "grass", 28),
-        "mud": Kind(Class.TERRAIN, "soil", 29), "beach": _SAND, "sand": _SAND, "dune": _SAND,
+        "tundra": _SCRUB, "grassland": _LAWN, "wetland": GroundKind(Class.TERRAIN, "grass", 28),
+        "mud": GroundKind(Class.TERRAIN, "soil", 29), "beach": _SAND, "sand": _SAND, "dune": _SAND,
         "shingle": _STONES, "scree": _STONES, "bare_rock": _ROCK, "rock": _ROCK, "stone": _ROCK,
-        "shoal": _SAND, "reef": _ROCK, "glacier": Kind(Class.TERRAIN, "snow", 31),
+        "shoal": _SAND, "reef": _ROCK, "glacier": GroundKind(Class.TERRAIN, "snow", 31),
         "water": _STANDING, "bay": _STANDING, "strait": _STANDING,
     },
     "leisure": {
-        "park": Kind(Class.GRASS, "grass", 21), "common": _GREEN, "golf_course": _GREEN, "garden": _LAWN,
-        "dog_park": _GREEN, "pitch": Kind(Class.GRASS, "grass", 62), "stadium": _PAVED,
+        "park": GroundKind(Class.GRASS, "grass", 21), "common": _GREEN, "golf_course": _GREEN,
+        "garden": _LAWN,
+        "dog_park": _GREEN, "pitch": GroundKind(Class.GRASS, "grass", 62), "stadium": _PAVED,
         "sports_centre": _BUILT,
-        "playground": Kind(Class.TERRAIN, "sand", 61), "track": Kind(Class.TERRAIN, "soil", 61),
-        "swimming_pool": _BASIN, "schoolyard": _PAVED, "fitness_station": Kind(Class.TERRAIN, "sand", 61),
-        "marina": Kind(Class.TERRAIN, "concrete", 9), "slipway": Kind(Class.TERRAIN, "concrete", 56),
+        "playground": GroundKind(Class.TERRAIN, "sand", 61),
+        "track": GroundKind(Class.TERRAIN, "soil", 61),
+        "swimming_pool": _BASIN, "schoolyard": _PAVED,
+        "fitness_station": GroundKind(Class.TERRAIN, "sand", 61),
+        "marina": GroundKind(Class.TERRAIN, "concrete", 9),
+        "slipway": GroundKind(Class.TERRAIN, "concrete", 56),
     },
     "golf": {
         "green": _LAWN, "fairway": _LAWN, "tee": _LAWN, "rough": _GREEN, "driving_range": _LAWN,
@@ -83,12 +87,13 @@ AREAS: dict[str, dict[str, Kind]] = {
     },
     "amenity": {
         "parking": _PARKING, "parking_space": _PARKING, "motorcycle_parking": _PARKING,
-        "bicycle_parking": Kind(Class.SIDEWALK, "paving", 66), "fuel": Kind(Class.PARKING, "concrete", 64),
-        "taxi": _PARKING, "bus_station": Kind(Class.PARKING, "asphalt", 63), "marketplace": _SQUARE,
+        "bicycle_parking": GroundKind(Class.SIDEWALK, "paving", 66),
+        "fuel": GroundKind(Class.PARKING, "concrete", 64),
+        "taxi": _PARKING, "bus_station": GroundKind(Class.PARKING, "asphalt", 63), "marketplace": _SQUARE,
         "school": _BUILT, "kindergarten": _BUILT, "university": _BUILT, "college": _BUILT, "hospital": _BUILT,
         "grave_yard": _GREEN, "fountain": _BASIN, "swimming_pool": _BASIN,
     },
-    "place": {"square": Kind(Class.SIDEWALK, "paving", 58)},
+    "place": {"square": GroundKind(Class.SIDEWALK, "paving", 58)},
     "railway": {"platform": _SQUARE},
     "public_transport": {"platform": _SQUARE},
     "waterway": {"riverbank": _RIVER, "dock": _STANDING, "boatyard": _PAVED},
@@ -97,46 +102,46 @@ AREAS: dict[str, dict[str, Kind]] = {
         "wastewater_plant": _PAVED, "water_works": _PAVED, "works": _PAVED,
     },
     "aeroway": {
-        "runway": _RUNWAY, "taxiway": _RUNWAY, "apron": Kind(Class.PARKING, "concrete", 68),
-        "helipad": Kind(Class.PARKING, "asphalt", 71), "aerodrome": _GREEN, "heliport": _PAVED,
+        "runway": _RUNWAY, "taxiway": _RUNWAY, "apron": GroundKind(Class.PARKING, "concrete", 68),
+        "helipad": GroundKind(Class.PARKING, "asphalt", 71), "aerodrome": _GREEN, "heliport": _PAVED,
     },
 }  # fmt: skip
 """Kinds of areas by key and value."""
 
-LINES: dict[str, dict[str, Kind]] = {
+LINES: dict[str, dict[str, GroundKind]] = {
     # Widths where the map has none, metres. Waterways: the orders of size that the OpenStreetMap wiki
     # gives each value. Railways: the ballast of one track of standard gauge, sleepers of 2.6 m and a
     # shoulder on each side; a tram lies in paving. Runways and taxiways: code letters C and D of ICAO
     # Annex 14, 45 m and 15 m.
     "waterway": {
-        "river": Kind(Class.WATER, "water", 41, 12.0, "river"),
-        "canal": Kind(Class.WATER, "water", 41, 10.0, "river"),
-        "stream": Kind(Class.WATER, "water", 41, 2.0, "river"),
-        "brook": Kind(Class.WATER, "water", 41, 2.0, "river"),
-        "tidal_channel": Kind(Class.WATER, "water", 41, 3.0, "river"),
-        "ditch": Kind(Class.WATER, "water", 41, 1.0, "river"),
-        "drain": Kind(Class.WATER, "water", 41, 1.0, "river"),
+        "river": GroundKind(Class.WATER, "water", 41, 12.0, "river"),
+        "canal": GroundKind(Class.WATER, "water", 41, 10.0, "river"),
+        "stream": GroundKind(Class.WATER, "water", 41, 2.0, "river"),
+        "brook": GroundKind(Class.WATER, "water", 41, 2.0, "river"),
+        "tidal_channel": GroundKind(Class.WATER, "water", 41, 3.0, "river"),
+        "ditch": GroundKind(Class.WATER, "water", 41, 1.0, "river"),
+        "drain": GroundKind(Class.WATER, "water", 41, 1.0, "river"),
     },
     "railway": {
-        "rail": Kind(Class.RAIL, "ballast", 80, 3.6),
-        "light_rail": Kind(Class.RAIL, "ballast", 80, 3.6),
-        "subway": Kind(Class.RAIL, "ballast", 80, 3.6),
-        "narrow_gauge": Kind(Class.RAIL, "ballast", 80, 2.8),
-        "funicular": Kind(Class.RAIL, "ballast", 80, 2.8),
-        "preserved": Kind(Class.RAIL, "ballast", 80, 3.6),
-        "disused": Kind(Class.RAIL, "ballast", 79, 3.6),
-        "tram": Kind(Class.RAIL, "paving", 81, 2.4),
-        "platform": Kind(Class.SIDEWALK, "paving", 82, 3.0),
+        "rail": GroundKind(Class.RAIL, "ballast", 80, 3.6),
+        "light_rail": GroundKind(Class.RAIL, "ballast", 80, 3.6),
+        "subway": GroundKind(Class.RAIL, "ballast", 80, 3.6),
+        "narrow_gauge": GroundKind(Class.RAIL, "ballast", 80, 2.8),
+        "funicular": GroundKind(Class.RAIL, "ballast", 80, 2.8),
+        "preserved": GroundKind(Class.RAIL, "ballast", 80, 3.6),
+        "disused": GroundKind(Class.RAIL, "ballast", 79, 3.6),
+        "tram": GroundKind(Class.RAIL, "paving", 81, 2.4),
+        "platform": GroundKind(Class.SIDEWALK, "paving", 82, 3.0),
     },
     "man_made": {
-        "pier": Kind(Class.SIDEWALK, "concrete", 55, 3.0),
-        "quay": Kind(Class.SIDEWALK, "concrete", 55, 3.0),
-        "breakwater": Kind(Class.TERRAIN, "stone", 50, 6.0),
-        "groyne": Kind(Class.TERRAIN, "stone", 50, 3.0),
+        "pier": GroundKind(Class.SIDEWALK, "concrete", 55, 3.0),
+        "quay": GroundKind(Class.SIDEWALK, "concrete", 55, 3.0),
+        "breakwater": GroundKind(Class.TERRAIN, "stone", 50, 6.0),
+        "groyne": GroundKind(Class.TERRAIN, "stone", 50, 3.0),
     },
     "aeroway": {
-        "runway": Kind(Class.ROAD, "asphalt", 70, 45.0),
-        "taxiway": Kind(Class.ROAD, "asphalt", 69, 15.0),
+        "runway": GroundKind(Class.ROAD, "asphalt", 70, 45.0),
+        "taxiway": GroundKind(Class.ROAD, "asphalt", 69, 15.0),
     },
 }
 """Kinds of lines by key and value."""
@@ -172,7 +177,7 @@ def is_underground(tags: Tags) -> bool:
     )
 
 
-def area_kind(tags: Tags) -> Kind | None:
+def area_kind(tags: Tags) -> GroundKind | None:
     """The kind of ground of an area: the highest tier of all its keys; None if it is none."""
     found = [kind for key, values in AREAS.items() if (kind := values.get(tags.get(key, ""))) is not None]
     if not found or is_underground(tags):
@@ -183,7 +188,7 @@ def area_kind(tags: Tags) -> Kind | None:
     return kind
 
 
-def line_kind(tags: Tags) -> Kind | None:
+def line_kind(tags: Tags) -> GroundKind | None:
     """The kind of ground of a line; None if it is none."""
     for key, values in LINES.items():
         kind = values.get(tags.get(key, ""))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.geometry.frames import Frame
 from geoscene.ground.coast import sea
-from geoscene.ground.kinds import SEA, SURFACES, Kind, area_kind, line_kind
+from geoscene.ground.kinds import SEA, SURFACES, GroundKind, area_kind, line_kind
 from geoscene.ground.layers import Layers
 from geoscene.sources.data import Area, OsmData, Tags, Way
 from geoscene.support.report import Problem
@@ -55,7 +55,7 @@ def _to_scene(frame: Frame, lonlat: Float) -> Float:
     return np.column_stack(frame.from_geographic(lonlat[:, 0], lonlat[:, 1]))
 
 
-def _material(tags: Tags, kind: Kind) -> tuple[str, str]:
+def _material(tags: Tags, kind: GroundKind) -> tuple[str, str]:
     """(material, source): the surface tag's, else the kind's."""
     named = SURFACES.get(tags.get("surface", "").split(";")[0].strip())
     if named is None or kind.body:
@@ -64,7 +64,10 @@ def _material(tags: Tags, kind: Kind) -> tuple[str, str]:
 
 
 def _layers(
-    found: Sequence[tuple[Area | Way, Kind]], polygons: NDArray[np.object_], *, source: Sequence[str] = ()
+    found: Sequence[tuple[Area | Way, GroundKind]],
+    polygons: NDArray[np.object_],
+    *,
+    source: Sequence[str] = (),
 ) -> Layers:
     """Rows of features and their kinds; within a tier the smaller polygon lies above the larger.
 
@@ -116,7 +119,7 @@ def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:
     return _layers(found, strips, source=source), problems
 
 
-def _width(way: Way, kind: Kind) -> tuple[float, list[Problem]]:
+def _width(way: Way, kind: GroundKind) -> tuple[float, list[Problem]]:
     """A line's width in metres, and a problem where its tag cannot be used."""
     text = way.tags.get("width") or way.tags.get("est_width")
     if text is None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
 from geoscene.ground.camber import Kerbs, Raised
-from geoscene.ground.faces import Faces, faces
+from geoscene.ground.faces import GroundFaces, faces
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.ground.snapping import distinct_places, snap_rounded
@@ -487,7 +487,7 @@ def _noded_faces(
     *,
     ruling: list[Float],
     box: tuple[float, float, float, float],
-) -> Faces:
+) -> GroundFaces:
     """The cells of a tile between segments of the outlines, its sides and the terrain's lines."""
     start = np.concatenate([plan.start[outlines], *(line[:-1] for line in ruling)])
     end = np.concatenate([plan.end[outlines], *(line[1:] for line in ruling)])
@@ -500,7 +500,7 @@ def _noded_faces(
     return faces(np.asarray(points * PRECISION, float), ends, rank=rank, box=box)
 
 
-def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
+def _without_slivers(edges: GroundFaces, *, row: Ints) -> tuple[Ints, int]:
     """Rows after each sliver took that of the wider cell it shares most border with; how many changed."""
     # The area is at most the radius of the greatest circle within times the outline (Bonnesen), so all
     # slivers are among the few cells that pass this; those with a wider spot are then excluded.
@@ -531,8 +531,8 @@ def _without_slivers(edges: Faces, *, row: Ints) -> tuple[Ints, int]:
 
 
 def _dissolve(
-    edges: Faces, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
-) -> tuple[Faces, Ints]:
+    edges: GroundFaces, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
+) -> tuple[GroundFaces, Ints]:
     """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
 
     Vertices on what remains of the borders all stay.

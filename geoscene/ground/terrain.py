@@ -49,7 +49,7 @@ _AT_ONCE = 1000
 
 
 @dataclass(frozen=True)
-class Grid:
+class ElevationGrid:
     """Posts of one elevation model, or of several that share a lattice.
 
     crs    : horizontal CRS, WKT
@@ -84,7 +84,7 @@ class Terrain:
     """
 
     frame: Frame
-    grids: tuple[Grid, ...] = ()
+    grids: tuple[ElevationGrid, ...] = ()
     vertical: Vertical = "flat"
     datum: str = "level ground"
     spacing: float = 0.0
@@ -355,7 +355,7 @@ def _shares_lattice(one: _Raster, other: _Raster) -> bool:
 class _Found(NamedTuple):
     """Heights near the scene: spacing in metres, numbers of posts and of voids among them, and repairs."""
 
-    grid: Grid
+    grid: ElevationGrid
     spacing: float
     posts: int
     voids: int
@@ -409,7 +409,7 @@ def _read(group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]) ->
         values, spikes=spikes, known=known, names=[r.path.name for r in group], metres=spacing
     )
     values[spikes] = np.nan
-    grid = Grid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
+    grid = ElevationGrid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
     return _Found(grid, spacing, posts, voids, problems)
 
 
@@ -495,7 +495,7 @@ def _turn(crs: CRS) -> float:
     return 2 * np.pi * 6378137.0 if crs.to_epsg() == 3857 else np.inf
 
 
-def _bilinear(grid: Grid, column: Float, *, row: Float) -> tuple[Float, Bools]:
+def _bilinear(grid: ElevationGrid, column: Float, *, row: Float) -> tuple[Float, Bools]:
     """Heights (n,) at fractional posts (n,), and whether a raster covers the place (its pixels do)."""
     rows, columns = grid.values.shape
     column, row = np.clip(column, 0.0, columns - 1.0), np.clip(row, 0.0, rows - 1.0)

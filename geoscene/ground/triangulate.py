@@ -15,7 +15,7 @@ from geoscene.typing import Float, Ints
 
 
 @dataclass(frozen=True, slots=True)
-class Triangles:
+class PlaneTriangles:
     """Triangles in the plane.
 
     points : (n, 2) float64, scene metres, sorted by x, then y, each once
@@ -32,7 +32,7 @@ class Triangles:
         return len(self.faces)
 
 
-def triangulate(partition: Partition) -> Triangles:
+def triangulate(partition: Partition) -> PlaneTriangles:
     """The triangles of a partition: each cell by constrained Delaunay over its own vertices, none added.
 
     Neighbouring cells have the same vertices on their border, so triangles meet edge to edge, and they do
@@ -46,7 +46,7 @@ def triangulate(partition: Partition) -> Triangles:
     return _checked(partition, rings.reshape(-1, 4, 2)[:, :3], cell=cell[::4])
 
 
-def triangulate_relief(partition: Partition, vertices: Lattice) -> Triangles:
+def triangulate_relief(partition: Partition, vertices: Lattice) -> PlaneTriangles:
     """The triangles of a tile of bare ground, which is one cell, with the vertices that its relief needs.
 
     Raises GeosceneError if the triangles do not add up to its area.
@@ -55,7 +55,7 @@ def triangulate_relief(partition: Partition, vertices: Lattice) -> Triangles:
     return _checked(partition, corners, cell=np.zeros(len(corners), np.int64))
 
 
-def _checked(partition: Partition, corners: Float, *, cell: Ints) -> Triangles:
+def _checked(partition: Partition, corners: Float, *, cell: Ints) -> PlaneTriangles:
     """Triangles with these corners (m, 3, 2), if they add up to the area of their cells (m,)."""
     points, number = distinct(corners.reshape(-1, 2))
     faces = number.reshape(-1, 3)
@@ -69,7 +69,7 @@ def _checked(partition: Partition, corners: Float, *, cell: Ints) -> Triangles:
             f"{int(amiss.sum())} ground cells not fully triangulated, {int((area == 0).sum())} triangles "
             f"have no area; look at ({where.x:z.3f}, {where.y:z.3f})"
         )
-    return Triangles(points, faces.astype(np.int32), cell.astype(np.int32))
+    return PlaneTriangles(points, faces.astype(np.int32), cell.astype(np.int32))
 
 
 def _signed_area(points: Float, faces: NDArray[np.integer]) -> Float:

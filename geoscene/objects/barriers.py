@@ -35,7 +35,7 @@ _LEAST, _HIGHEST, _WIDEST = 0.01, 30.0, 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class BarrierKind:
     """Class, material and default sizes in metres (assumed: common values in towns)."""
 
     klass: Class
@@ -44,17 +44,17 @@ class Kind:
     width: float
 
 
-KINDS: dict[str, Kind] = {
-    "wall": Kind(Class.WALL, "stone", 1.8, 0.25),
-    "retaining_wall": Kind(Class.WALL, "concrete", 1.0, 0.4),
-    "city_wall": Kind(Class.WALL, "stone", 6.0, 1.5),
-    "jersey_barrier": Kind(Class.WALL, "concrete", 0.8, 0.6),
-    "fence": Kind(Class.FENCE, "metal", 1.5, 0.05),
-    "railing": Kind(Class.FENCE, "metal", 1.0, 0.05),
-    "handrail": Kind(Class.FENCE, "metal", 0.9, 0.05),
-    "guard_rail": Kind(Class.FENCE, "metal", 0.75, 0.1),
-    "hedge": Kind(Class.HEDGE, "foliage", 1.5, 0.8),
-    "hedge_bank": Kind(Class.HEDGE, "foliage", 2.0, 1.5),
+KINDS: dict[str, BarrierKind] = {
+    "wall": BarrierKind(Class.WALL, "stone", 1.8, 0.25),
+    "retaining_wall": BarrierKind(Class.WALL, "concrete", 1.0, 0.4),
+    "city_wall": BarrierKind(Class.WALL, "stone", 6.0, 1.5),
+    "jersey_barrier": BarrierKind(Class.WALL, "concrete", 0.8, 0.6),
+    "fence": BarrierKind(Class.FENCE, "metal", 1.5, 0.05),
+    "railing": BarrierKind(Class.FENCE, "metal", 1.0, 0.05),
+    "handrail": BarrierKind(Class.FENCE, "metal", 0.9, 0.05),
+    "guard_rail": BarrierKind(Class.FENCE, "metal", 0.75, 0.1),
+    "hedge": BarrierKind(Class.HEDGE, "foliage", 1.5, 0.8),
+    "hedge_bank": BarrierKind(Class.HEDGE, "foliage", 2.0, 1.5),
 }
 """Kinds by value of ``barrier``; others (kerbs, chains, gates) do not become solids."""
 
@@ -107,7 +107,7 @@ def read_barriers(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tup
     box = shapely.box(*extent)
     gates = _gates(osm)
     problems: list[Problem] = []
-    rows: list[tuple[object, Kind, str, float, str, str, str]] = []
+    rows: list[tuple[object, BarrierKind, str, float, str, str, str]] = []
     for way in osm.ways:
         kind = _kind(way.tags)
         if kind is None or len(way.lonlat) < 2:
@@ -221,13 +221,13 @@ def _touches_itself(shape: Any) -> bool:
     return len(np.unique(np.rint(coordinates / PRECISION), axis=0)) < len(coordinates)
 
 
-def _kind(tags: Tags) -> Kind | None:
+def _kind(tags: Tags) -> BarrierKind | None:
     if is_underground(tags) or tags.get("layer", "0") != "0":
         return None
     return KINDS.get(tags.get("barrier", ""))
 
 
-def _material(tags: Tags, kind: Kind) -> str:
+def _material(tags: Tags, kind: BarrierKind) -> str:
     for key in ("material", "wall", "fence_type"):
         if tags.get(key) in _MATERIALS and kind.klass != Class.HEDGE:
             return _MATERIALS[tags[key]]
@@ -281,7 +281,7 @@ def _polygonal(geometry: Any) -> Any:
     return shapely.multipolygons(parts[areal])
 
 
-def _table(rows: list[tuple[object, Kind, str, float, str, str, str]]) -> Barriers:
+def _table(rows: list[tuple[object, BarrierKind, str, float, str, str, str]]) -> Barriers:
     return Barriers(
         np.fromiter((row[0] for row in rows), object),
         np.array([row[1].klass for row in rows], np.uint8),

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from geoscene.classes import Class
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.vegetation import CROWN, HEIGHT, TRUNK, Trees, tree_instances
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
@@ -91,7 +91,7 @@ def forest_tree_count(ground: Mesh, forests: Forests, *, box: Sequence[float]) -
     return len(_places(ground.take(is_floor), forests, box=box)[0]) if is_floor.any() else 0
 
 
-def forest_instances(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> Instances:
+def forest_instances(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> ShapeInstances:
     """The trees of `forest_trees` as copies of shapes, scene coordinates."""
     trees, z = forest_trees(ground, forests, box=box)
     return tree_instances(trees, height=lambda *_: z)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import Instances
+from geoscene.geometry.mesh import ShapeInstances
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
 from geoscene.objects.shapes import place, shapes
@@ -20,7 +20,7 @@ from geoscene.objects.siting import Sites
 from geoscene.objects.street import stands as bicycle_stands
 from geoscene.objects.street import street_shape
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
-from geoscene.sources.data import OsmData, Point, Tags
+from geoscene.sources.data import OsmData, TaggedNode, Tags
 from geoscene.support.columns import Columns
 from geoscene.support.report import Problem
 from geoscene.tags import parse_direction, parse_length
@@ -164,7 +164,7 @@ def read_furniture(
 
 def mapped_furniture(
     osm: OsmData, frame: Frame, *, extent: Sequence[float], relief: str = "off"
-) -> tuple[list[tuple[Point, str]], Float]:
+) -> tuple[list[tuple[TaggedNode, str]], Float]:
     """The nodes within an extent that are street furniture, with their shapes, and their places (n, 2)."""
     points = osm.points
     if relief != "off":
@@ -180,7 +180,7 @@ def mapped_furniture(
     return [chosen[k] for k in inside.tolist()], np.column_stack([x, y])[inside]
 
 
-def furniture_instances(furniture: Furniture, *, height: Height | None = None) -> Instances:
+def furniture_instances(furniture: Furniture, *, height: Height | None = None) -> ShapeInstances:
     """An instance of a shape for each object, in scene coordinates, standing on the terrain."""
     n = len(furniture)
     z = np.zeros(n) if height is None else np.asarray(height(*furniture.xy.T), float)
@@ -239,7 +239,7 @@ def usual_height(shape: str) -> float:
     return float(shapes(relief=True)[shape].vertices[:, 2].max())
 
 
-def _height(point: Point, shape: str, *, problems: list[Problem]) -> tuple[float, str]:
+def _height(point: TaggedNode, shape: str, *, problems: list[Problem]) -> tuple[float, str]:
     """(metres, source) of the height of an object."""
     usual = usual_height(shape)
     if "height" not in point.tags:
@@ -289,7 +289,7 @@ class _Roads:
         raised = np.array([is_bridge(way.tags) or is_tunnel(way.tags) for way in ways], np.bool_)
         return cls(lines, np.array(oneway, np.int8), raised, by_node, nodes, shapely.STRtree(lines))
 
-    def at(self, point: Point) -> list[tuple[int, int]]:
+    def at(self, point: TaggedNode) -> list[tuple[int, int]]:
         """(row, vertex index) pairs of a node that lies on roads."""
         return self.by_node.get(int(point.osm_id.removeprefix("node/")), [])
 
@@ -329,7 +329,7 @@ def _addresses(shape: str) -> bool:
     return shape == "traffic_signals" or shape.startswith("sign_")
 
 
-def _facing(point: Point, xy: Float, *, frame: Frame) -> float | None:
+def _facing(point: TaggedNode, xy: Float, *, frame: Frame) -> float | None:
     """Heading from tags in degrees or as a compass point, None without one."""
     stated = parse_direction(point.tags.get("direction") or point.tags.get("light:direction"))
     if stated is None:
@@ -338,7 +338,9 @@ def _facing(point: Point, xy: Float, *, frame: Frame) -> float | None:
     return float(np.pi / 2 - (np.radians(stated) - float(frame.convergence(lon, lat))))
 
 
-def _stand(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool) -> _Stand:
+def _stand(
+    point: TaggedNode, shape: str, *, xy: Float, roads: _Roads, frame: Frame, left_hand: bool
+) -> _Stand:
     """Position and heading of an object that is not on a node of a road."""
     heading = _facing(point, xy, frame=frame)
     if heading is not None:
@@ -363,7 +365,9 @@ def _stand(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame, 
     return xy, float(np.arctan2(against[1], against[0])), "road"
 
 
-def _roadside_stands(point: Point, shape: str, *, xy: Float, roads: _Roads, frame: Frame) -> list[_Stand]:
+def _roadside_stands(
+    point: TaggedNode, shape: str, *, xy: Float, roads: _Roads, frame: Frame
+) -> list[_Stand]:
     """A post, still at the node, for each direction of traffic that a road's node addresses."""
     on = [(row, index) for row, index in roads.at(point) if not roads.raised[row]]
     if not on:

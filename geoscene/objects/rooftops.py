@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from geoscene.buildings import Buildings
 from geoscene.buildings.footprints import groups
 from geoscene.buildings.guesses import guess_looks, region_at, seeds
-from geoscene.geometry.mesh import FLOOR, ROOF, Instances, Mesh
+from geoscene.geometry.mesh import FLOOR, ROOF, Mesh, ShapeInstances
 from geoscene.objects.roof_shapes import DORMER_DEPTH
 from geoscene.objects.shapes import place
 from geoscene.support.columns import Columns
@@ -136,7 +136,7 @@ def plan_rooftops(buildings: Buildings, *, centre: tuple[float, float]) -> Rooft
     )
 
 
-def roof_objects(solids: Mesh, rooftops: Rooftops) -> tuple[Instances, dict[str, int]]:
+def roof_objects(solids: Mesh, rooftops: Rooftops) -> tuple[ShapeInstances, dict[str, int]]:
     """Copies of shapes on the roofs of buildings, and their number by shape.
 
     Each stands within one plane of a roof, half a metre or more from its edges (dormers less), and clear of
@@ -155,7 +155,7 @@ def roof_objects(solids: Mesh, rooftops: Rooftops) -> tuple[Instances, dict[str,
         items = _on_building(corners[up], normals[up], under=under, rooftops=rooftops, row=row)
         found += [(*item, row) for item in items]
     if not found:
-        return Instances.empty(), {}
+        return ShapeInstances.empty(), {}
     names, x, y, z, across, upwards, heading, rows = (list(column) for column in zip(*found, strict=True))
     copies = place(
         np.array(names, np.str_),

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class, materials
-from geoscene.geometry.mesh import Instances, Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, ShapeInstances, concatenate
 from geoscene.objects.crowns import leaf_area_densities, tree_shapes
 from geoscene.objects.roof_shapes import roof_shapes
 from geoscene.objects.solids import circle, lathe, prism, rectangle, solid
@@ -49,7 +49,7 @@ def leaf_area_density(*, relief: bool = False) -> dict[str, float]:
 
 @functools.cache
 def shapes(*, relief: bool = False) -> dict[str, Mesh]:
-    """All shapes by name, in the order of their numbers in `Instances.shape`.
+    """All shapes by name, in the order of their numbers in `ShapeInstances.shape`.
 
     Crowns and trunks are of unit size (x and y from -0.5 to 0.5, z from 0 to 1), to be scaled; the rest is in
     metres at its usual size, x in the direction it faces, z up from the ground. All are closed.
@@ -151,7 +151,7 @@ def place(
     size: ArrayLike = (1.0, 1.0, 1.0),
     heading: ArrayLike = 0.0,
     feature: ArrayLike = -1,
-) -> Instances:
+) -> ShapeInstances:
     """Copies of shapes at positions (k, 3), scene metres.
 
     name    : one name, or one a copy
@@ -168,6 +168,6 @@ def place(
     known, which = np.unique(names, return_inverse=True)
     library = list(shapes(relief=True))
     number = np.array([library.index(str(n)) for n in known], np.int32)[which.reshape(-1)]
-    return Instances(
+    return ShapeInstances(
         number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()
     )

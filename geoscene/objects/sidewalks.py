@@ -8,14 +8,16 @@ import numpy as np
 
 from geoscene.objects.furniture import Furniture, usual_height
 from geoscene.objects.siting import Sites
-from geoscene.objects.street import Guesses, Taken, site_guesses, usable
+from geoscene.objects.street import FurnitureGuesses, Taken, site_guesses, usable
 from geoscene.support.splitmix import number_of, uniform_at
 
 _SHELTER_BACK = 0.8
 """Metres from the place of a bus stop, beside the kerb, to the middle of its shelter."""
 
 
-def with_guesses(table: Furniture, guesses: Guesses, *, sites: Sites, taken: Taken, first: int) -> Furniture:
+def with_guesses(
+    table: Furniture, guesses: FurnitureGuesses, *, sites: Sites, taken: Taken, first: int
+) -> Furniture:
     """The table, and the guesses that find a place, with numbers from ``first`` on."""
     row, xy, heading = site_guesses(guesses, sites, taken=taken)
     n, found = len(row), guesses.take(row)

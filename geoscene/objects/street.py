@@ -125,7 +125,7 @@ def stands(tags: Tags, *, place: Float, heading: float, most: int) -> Float:
 
 
 @dataclass(frozen=True, slots=True)
-class Guesses(Columns):
+class FurnitureGuesses(Columns):
     """Where unmapped furniture may stand, before it is known what ground is there.
 
     xy      : (n, 2) on a street's centre line, or the place to eat; scene metres
@@ -146,17 +146,17 @@ class Guesses(Columns):
     osm_id: NDArray[np.str_]
 
 
-def guess_furniture(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> Guesses:
+def guess_furniture(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> FurnitureGuesses:
     """What may stand along the streets and before the restaurants within an extent of a map.
 
     It is drawn by the OSM id of each street and the place on it, whatever else there is.
     """
-    guesses = Guesses.concatenate([_beside_streets(osm, frame), _tables(osm, frame)])
+    guesses = FurnitureGuesses.concatenate([_beside_streets(osm, frame), _tables(osm, frame)])
     low, high = np.array(extent[:2]), np.array(extent[2:])
     return guesses.take(((guesses.xy >= low) & (guesses.xy < high)).all(axis=1))
 
 
-def _beside_streets(osm: OsmData, frame: Frame) -> Guesses:
+def _beside_streets(osm: OsmData, frame: Frame) -> FurnitureGuesses:
     west, south, east, north = osm.bounds
     usual = dict(_USUAL)
     if region_at((west + east) / 2, (south + north) / 2) == "north_america":
@@ -191,7 +191,7 @@ def _beside_streets(osm: OsmData, frame: Frame) -> Guesses:
             toward = course @ np.array([[0.0, 1.0], [-1.0, 0.0]]) * (1 - 2 * side)
             n = int(chosen.sum())
             parts.append(
-                Guesses(
+                FurnitureGuesses(
                     (a + b) / 2,
                     toward,
                     shape[chosen],
@@ -201,10 +201,10 @@ def _beside_streets(osm: OsmData, frame: Frame) -> Guesses:
                     np.full(n, way.osm_id),
                 )
             )
-    return Guesses.concatenate([_nothing(), *parts])
+    return FurnitureGuesses.concatenate([_nothing(), *parts])
 
 
-def _tables(osm: OsmData, frame: Frame) -> Guesses:
+def _tables(osm: OsmData, frame: Frame) -> FurnitureGuesses:
     """Four places for tables at each place to eat that has some outside, or may have."""
     parts = []
     for point in osm.points:
@@ -217,7 +217,7 @@ def _tables(osm: OsmData, frame: Frame) -> Guesses:
             continue
         n = len(_BESIDE)
         parts.append(
-            Guesses(
+            FurnitureGuesses(
                 np.tile(
                     np.column_stack(frame.from_geographic(*np.array([[point.lon], [point.lat]]))), (n, 1)
                 ),
@@ -229,12 +229,14 @@ def _tables(osm: OsmData, frame: Frame) -> Guesses:
                 np.full(n, point.osm_id),
             )
         )
-    return Guesses.concatenate([_nothing(), *parts])
+    return FurnitureGuesses.concatenate([_nothing(), *parts])
 
 
-def _nothing() -> Guesses:
+def _nothing() -> FurnitureGuesses:
     text = np.empty(0, "U1")
-    return Guesses(np.empty((0, 2)), np.empty((0, 2)), text, np.empty(0), np.empty(0, np.int64), text, text)
+    return FurnitureGuesses(
+        np.empty((0, 2)), np.empty((0, 2)), text, np.empty(0), np.empty(0, np.int64), text, text
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +253,7 @@ class Taken:
     areas: NDArray[np.object_]
 
 
-def site_guesses(guesses: Guesses, sites: Sites, *, taken: Taken) -> tuple[Ints, Float, Float]:
+def site_guesses(guesses: FurnitureGuesses, sites: Sites, *, taken: Taken) -> tuple[Ints, Float, Float]:
     """Rows (k,) of the guesses that find a place, the places (k, 2), and the headings (k,).
 
     Beside the kerb of a sidewalk, where it is 1.5 m wide or more and goes on by a metre on both sides; tables
@@ -271,7 +273,7 @@ def site_guesses(guesses: Guesses, sites: Sites, *, taken: Taken) -> tuple[Ints,
     return row[order], xy[order], heading[order]
 
 
-def _unmapped(guesses: Guesses, taken: Taken) -> Ints:
+def _unmapped(guesses: FurnitureGuesses, taken: Taken) -> Ints:
     """Rows of the guesses without a mapped object of their kind near them."""
     near = np.zeros(len(guesses), np.bool_)
     for shape in np.unique(taken.shape):
@@ -284,7 +286,7 @@ def _unmapped(guesses: Guesses, taken: Taken) -> Ints:
     return np.flatnonzero(~near)
 
 
-def _at_kerbs(guesses: Guesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Float, Float]:
+def _at_kerbs(guesses: FurnitureGuesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Float, Float]:
     """Rows with a place beside the kerb, the places, and the headings towards the street."""
     start, toward = guesses.xy[rows], guesses.toward[rows]
     walk = _classes(sites, start[:, None] + _REACH[:, None] * toward[:, None]) == Class.SIDEWALK
@@ -305,7 +307,7 @@ def _at_kerbs(guesses: Guesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Floa
     return rows[roomy], place[roomy], heading[roomy]
 
 
-def _at_fronts(guesses: Guesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Float, Float]:
+def _at_fronts(guesses: FurnitureGuesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Float, Float]:
     """Rows of tables that stand beside their building where a sidewalk is near, the places, and headings."""
     start = guesses.xy[rows]
     reach = np.arange(0.0, 18.1, 0.5)
@@ -333,7 +335,7 @@ def _classes(sites: Sites, xy: Float) -> NDArray[np.uint8]:
     return sites.classes(xy.reshape(-1, 2)).reshape(xy.shape[:-1])
 
 
-def _apart(xy: Float, *, taken: Taken, guesses: Guesses) -> Bools:
+def _apart(xy: Float, *, taken: Taken, guesses: FurnitureGuesses) -> Bools:
     """Whether points (n, 2) keep `_APART` from what stands there and from guesses of smaller draws."""
     points, free = shapely.points(xy), np.ones(len(xy), np.bool_)
     stand = shapely.STRtree(shapely.points(taken.xy))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import Instances
+from geoscene.geometry.mesh import ShapeInstances
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
 from geoscene.support.columns import Columns
@@ -186,7 +186,7 @@ def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
     return placed.take(~blocked), list(dict.fromkeys(problems))  # the tags of a row are read once per tree
 
 
-def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
+def tree_instances(trees: Trees, *, height: Height | None = None) -> ShapeInstances:
     """Two copies of shapes a tree, trunk then crown, in scene coordinates, standing on the terrain.
 
     The trunk begins 0.3 m below the ground, so that no gap opens on a slope, and ends inside the crown.
@@ -217,7 +217,7 @@ def tree_instances(trees: Trees, *, height: Height | None = None) -> Instances:
         heading=2 * np.pi * turn,
         feature=trees.feature,
     )
-    return Instances.concatenate([trunks, crowns])
+    return ShapeInstances.concatenate([trunks, crowns])
 
 
 def _botanical(tags: Tags) -> str:

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import Instances
+from geoscene.geometry.mesh import ShapeInstances
 from geoscene.objects.shapes import shapes
 from geoscene.roadgraph.tags import is_tunnel
 from geoscene.sources.data import OsmData, Way
@@ -138,7 +138,7 @@ def _contact(line: Float, osm_id: str) -> list[Wires]:
     return [Wires.of(points[:-1], points[1:], kind="contact", osm_id=osm_id)]
 
 
-def wire_instances(wires: Wires, *, height: Height | None = None) -> Instances:
+def wire_instances(wires: Wires, *, height: Height | None = None) -> ShapeInstances:
     """Straight pieces of the shape ``wire`` along each span, which hangs as a parabola, scene coordinates.
 
     Each reaches 5 mm into the next, so that they do not meet in common edges.
@@ -163,4 +163,4 @@ def wire_instances(wires: Wires, *, height: Height | None = None) -> Instances:
     more = _JOINT * along / np.linalg.norm(along, axis=1)[:, None]
     transform = np.stack([along + 2 * more, width * aside, width * above, a - more], axis=2)
     number = list(shapes(relief=True)).index("wire")
-    return Instances(np.full(len(a), number, np.int32), transform, np.repeat(wires.feature, _PIECES))
+    return ShapeInstances(np.full(len(a), number, np.int32), transform, np.repeat(wires.feature, _PIECES))

@@ -19,7 +19,7 @@ from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
-from geoscene.support.cluster import Cluster
+from geoscene.support.cluster import DaskCluster
 from geoscene.support.files import digest, digest_of, sources_digest
 from geoscene.support.progress import Progress, silent
 from geoscene.support.report import Problem
@@ -39,7 +39,7 @@ def build(
     options: BuildOptions = BuildOptions(),
     overwrite: bool = False,
     workers: int = 1,
-    cluster: Cluster | None = None,
+    cluster: DaskCluster | None = None,
     needed: AreaOf | None = None,
     former: Path | None = None,
     progress: Progress = silent,

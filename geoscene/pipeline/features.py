@@ -9,7 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings
-from geoscene.buildings.facades import Setting
+from geoscene.buildings.facades import FacadeSetting
 from geoscene.classes import Class, materials
 from geoscene.ground import Layers
 from geoscene.objects.barriers import Barriers
@@ -32,7 +32,7 @@ def building_layers(
     base: NDArray[np.float64],
     *,
     parapet: NDArray[np.float64] | None = None,
-    facades: Setting | None = None,
+    facades: FacadeSetting | None = None,
 ) -> list[Layer]:
     """Layers ``buildings`` and ``building_parts``; ``base`` (n,) is z of each building's base in metres.
 

@@ -15,7 +15,7 @@ from geoscene.ground import tile_span
 from geoscene.ground.kerbs import count_covers, count_kerbs
 from geoscene.objects.shapes import leaf_area_density
 from geoscene.pipeline.limits import height_limit, places, scale_limit
-from geoscene.pipeline.plan import Plan
+from geoscene.pipeline.plan import BuildPlan
 from geoscene.pipeline.tiles import TileReport
 from geoscene.roadgraph import find_components
 from geoscene.roadgraph.graph import RoadGraph
@@ -31,7 +31,7 @@ def scene_manifest(
     options: Mapping[str, Any],
     *,
     digest: str,
-    plan: Plan,
+    plan: BuildPlan,
     reports: Sequence[TileReport],
     problems: Sequence[Problem],
     fingerprint: str,
@@ -93,7 +93,7 @@ def scene_manifest(
     }
 
 
-def _sources(osm: OsmData, plan: Plan) -> list[dict[str, str]]:
+def _sources(osm: OsmData, plan: BuildPlan) -> list[dict[str, str]]:
     """All sources of the scene, with licence and attribution if known."""
     licences = {source.attribution: source.licence for source in SOURCES.values()}
     maps = [
@@ -115,7 +115,7 @@ def _sources(osm: OsmData, plan: Plan) -> list[dict[str, str]]:
     return maps + terrain
 
 
-def _open_area(plan: Plan) -> float:
+def _open_area(plan: BuildPlan) -> float:
     """Square metres of the extent without ground, at tunnel mouths."""
     openings = [shape for shape in plan.openings if shape is not None]
     return float(shapely.intersection(shapely.union_all(openings), shapely.box(*plan.extent)).area)
@@ -140,7 +140,7 @@ def road_metres(graph: RoadGraph, extent: Sequence[float]) -> tuple[float, float
     return float(metres.sum()), float(metres[steep].sum())
 
 
-def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Problem]) -> dict[str, Any]:
+def _counts(plan: BuildPlan, reports: Sequence[TileReport], *, problems: Sequence[Problem]) -> dict[str, Any]:
     count = plan.buildings.count
     summary = summarise(problems)
     dropped = summary["dropped"].get("building", {})
@@ -170,7 +170,7 @@ def _counts(plan: Plan, reports: Sequence[TileReport], *, problems: Sequence[Pro
     }
 
 
-def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
+def _relief(plan: BuildPlan, reports: Sequence[TileReport]) -> dict[str, Any]:
     """What the scene has for its relief, by kind and source."""
     furniture = plan.furniture
     parts, roofs, facades = Counter[str](), Counter[str](), Counter[str]()
@@ -197,19 +197,19 @@ def _relief(plan: Plan, reports: Sequence[TileReport]) -> dict[str, Any]:
     }
 
 
-def _camber_km(plan: Plan) -> float:
+def _camber_km(plan: BuildPlan) -> float:
     """Kilometres of carriageway in the extent that have a camber."""
     raised = plan.ground.raised
     return 0.0 if raised is None else round(raised.camber.metres(plan.extent) / 1000, 3)
 
 
-def _ballast_m2(plan: Plan) -> float:
+def _ballast_m2(plan: BuildPlan) -> float:
     """Square metres of raised ballast in the extent."""
     raised = plan.ground.raised
     return 0.0 if raised is None else round(raised.beds.square_metres(plan.extent), 1)
 
 
-def _facade_tallies(plan: Plan) -> dict[str, dict[str, int]]:
+def _facade_tallies(plan: BuildPlan) -> dict[str, dict[str, int]]:
     """Buildings by the type of their facades and its source."""
     count, setting = plan.buildings.count, plan.facades
     if setting is None:

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings, read_buildings
-from geoscene.buildings.facades import Setting, read_setting
+from geoscene.buildings.facades import FacadeSetting, read_setting
 from geoscene.buildings.tops import with_measured_tops
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame, extent_of, wrapped
@@ -109,7 +109,7 @@ _RAISED = 1.0  # metres, minimum height of an underside for a building to have n
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class BuildPlan:
     """All that tiles are built from.
 
     frame     : frame of the scene
@@ -162,7 +162,7 @@ class Plan:
     openings: NDArray[np.object_]
     use: Use
     relief: str
-    facades: Setting | None
+    facades: FacadeSetting | None
     rooftops: Rooftops | None
     wires: Wires
     layers: list[Layer]
@@ -184,7 +184,7 @@ class Plan:
 
 def make_plan(
     osm: OsmData, options: BuildOptions, *, progress: Progress, needed: AreaOf | None = None
-) -> tuple[Plan, list[Problem]]:
+) -> tuple[BuildPlan, list[Problem]]:
     """The plan of a scene of a map, and the features that were repaired or dropped.
 
     needed : chooses the area to build; the road graph is then that of the whole map
@@ -265,7 +265,7 @@ def make_plan(
     ]
     if len(local.wires):
         layers.append(wire_layer(local.wires))
-    plan = Plan(
+    plan = BuildPlan(
         frame=frame,
         terrain=terrain,
         height=local.height,
@@ -376,7 +376,7 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """What is planned near a route, or everywhere; see `Plan` for the columns.
+    """What is planned near a route, or everywhere; see `BuildPlan` for the columns.
 
     shapes : of all features by kind
     """

@@ -18,9 +18,9 @@ import numpy as np
 import shapely
 
 from geoscene.buildings import build_solids
-from geoscene.buildings.facades import Layout, Setting, wall_relief
+from geoscene.buildings.facades import FacadeSetting, Layout, wall_relief
 from geoscene.classes import Class
-from geoscene.geometry.mesh import Instances, Mesh, concatenate
+from geoscene.geometry.mesh import Mesh, ShapeInstances, concatenate
 from geoscene.geometry.watertight import validate_mesh
 from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.ground.standing import standing_height
@@ -30,11 +30,11 @@ from geoscene.objects.furniture import furniture_instances
 from geoscene.objects.rooftops import roof_objects
 from geoscene.objects.vegetation import tree_instances
 from geoscene.objects.wires import wire_instances
-from geoscene.pipeline.plan import Plan, take_buildings
+from geoscene.pipeline.plan import BuildPlan, take_buildings
 from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Extras, Tile, read_tile, write_tile
 from geoscene.structures import StructureOptions, built_structures
-from geoscene.support.cluster import Cluster
+from geoscene.support.cluster import DaskCluster
 from geoscene.support.files import digest_of, naming, write_atomically
 from geoscene.support.processes import run_tasks
 from geoscene.support.report import Problem, described, make_without_failures, unexpected
@@ -106,7 +106,7 @@ class Keys:
     solids: str
 
 
-def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, list[Problem]]:
+def make_solids(plan: BuildPlan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, list[Problem]]:
     """Mesh of the buildings of tile (i, j) in scene metres, and their problems."""
     i, j = tile
     parts = plan.of_tile("parts", i, j=j)
@@ -133,7 +133,7 @@ def make_solids(plan: Plan, tile: tuple[int, int], *, lod: int) -> tuple[Mesh, l
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class TileSurroundings:
     """What a tile holds besides its buildings.
 
     mesh      : ground, barriers and structures, scene metres
@@ -144,13 +144,13 @@ class Surroundings:
     """
 
     mesh: Mesh
-    instances: Instances
+    instances: ShapeInstances
     equipment: Bools
     problems: list[Problem]
     guessed: Counter[str]
 
 
-def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
+def make_ground(plan: BuildPlan, tile: tuple[int, int]) -> TileSurroundings:
     """All of tile (i, j) but its buildings."""
     i, j = tile
     height, problems = plan.height, list[Problem]()
@@ -191,12 +191,12 @@ def make_ground(plan: Plan, tile: tuple[int, int]) -> Surroundings:
         meshes.append(built.mesh)
         equipment.append(built.equipment)
         guessed.update(built.guessed)
-    instances = Instances.concatenate([Instances.empty(), *copies])
-    return Surroundings(concatenate(meshes), instances, np.concatenate(equipment), problems, guessed)
+    instances = ShapeInstances.concatenate([ShapeInstances.empty(), *copies])
+    return TileSurroundings(concatenate(meshes), instances, np.concatenate(equipment), problems, guessed)
 
 
 def build_tile(
-    plan: Plan,
+    plan: BuildPlan,
     folder: Path,
     *,
     tile: tuple[int, int],
@@ -228,7 +228,7 @@ def build_tile(
         copies = copies.shifted(-origin)
     on_roofs, roofs = _roof_objects(plan, solids, lod=lod, problems=problems)
     added = np.isin(copies.feature, plan.furniture.feature[plan.furniture.source != "mapped"])
-    copies = Instances.concatenate([copies, on_roofs.shifted(-origin)])
+    copies = ShapeInstances.concatenate([copies, on_roofs.shifted(-origin)])
     layout = None if plan.facades is None else _facades(plan, plan.facades, solids=solids, problems=problems)
     attached = [layout.parts.mesh.shifted(-origin)] if layout else []
     mesh = concatenate([solids.shifted(-origin), *attached, rest])
@@ -265,7 +265,7 @@ def build_tile(
     )
 
 
-def _facades(plan: Plan, setting: Setting, *, solids: Mesh, problems: list[Problem]) -> Layout:
+def _facades(plan: BuildPlan, setting: FacadeSetting, *, solids: Mesh, problems: list[Problem]) -> Layout:
     """The relief of the walls of a tile's buildings and what stands out of them, scene metres."""
 
     def failed(row: int, error: Exception) -> None:
@@ -287,10 +287,10 @@ def _facades(plan: Plan, setting: Setting, *, solids: Mesh, problems: list[Probl
 
 
 def _roof_objects(
-    plan: Plan, solids: Mesh, *, lod: int, problems: list[Problem]
-) -> tuple[Instances, dict[str, int]]:
+    plan: BuildPlan, solids: Mesh, *, lod: int, problems: list[Problem]
+) -> tuple[ShapeInstances, dict[str, int]]:
     """What stands on the roofs of a tile's buildings, scene metres, and its number by shape."""
-    none = Instances.empty()
+    none = ShapeInstances.empty()
     if plan.rooftops is None or lod < 2:
         return none, {}
     rooftops = plan.rooftops
@@ -306,7 +306,7 @@ def _roof_objects(
     counts: Counter[str] = Counter()
     for _, some in made:
         counts.update(some)
-    return Instances.concatenate([none, *(copies for copies, _ in made)]), dict(sorted(counts.items()))
+    return ShapeInstances.concatenate([none, *(copies for copies, _ in made)]), dict(sorted(counts.items()))
 
 
 def _plan_area(mesh: Mesh) -> float:
@@ -316,7 +316,7 @@ def _plan_area(mesh: Mesh) -> float:
 
 
 def build_tiles(
-    plan: Plan,
+    plan: BuildPlan,
     folder: Path,
     *,
     tiles: Sequence[tuple[int, int]],
@@ -324,7 +324,7 @@ def build_tiles(
     keys: Keys,
     workers: int,
     former: Path | None,
-    cluster: Cluster | None = None,
+    cluster: DaskCluster | None = None,
 ) -> Iterator[TileReport]:
     """Build all tiles that are not in ``folder`` yet; yields reports of all tiles, in no particular order.
 
@@ -352,7 +352,7 @@ def build_tiles(
 
 
 def _reports(
-    job: _Job, tiles: Sequence[tuple[int, int]], *, workers: int, cluster: Cluster | None
+    job: _Job, tiles: Sequence[tuple[int, int]], *, workers: int, cluster: DaskCluster | None
 ) -> Iterator[TileReport]:
     """Reports of tiles as they are built: here, by processes, or by the workers of a cluster."""
     if cluster is None:
@@ -408,7 +408,7 @@ class _Former:
         except (LookupError, TypeError, AttributeError):  # damaged
             return cls(files, {}, all=False)
 
-    def build(self, plan: Plan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
+    def build(self, plan: BuildPlan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
         """Copy or build a tile; see `build_tile`."""
         former = self.files.tile(*tile)
         if tile not in self.reports or digest_of(former) != self.reports[tile].digest:
@@ -423,7 +423,7 @@ class _Former:
 class _Job:
     """Inputs of all tiles; pickled for spawned workers with the precision of its geometries."""
 
-    plan: Plan
+    plan: BuildPlan
     folder: Path
     lod: int
     source: _Former

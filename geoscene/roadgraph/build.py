@@ -9,7 +9,7 @@ from itertools import groupby
 import numpy as np
 
 from geoscene.geometry.frames import Frame
-from geoscene.roadgraph.chains import Chain, Runs, chains_of, link_chains
+from geoscene.roadgraph.chains import RoadChain, Runs, chains_of, link_chains
 from geoscene.roadgraph.controls import add_controls
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lane_uses import read_lane_uses
@@ -104,7 +104,7 @@ def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, Ints,
 
 
 def _edges(
-    chains: Sequence[Chain],
+    chains: Sequence[RoadChain],
     ways: Sequence[Way],
     *,
     streets: Sequence[Street],

@@ -27,7 +27,7 @@ class Runs:
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class RoadChain:
     """A line through nodes that becomes one edge or two; in the direction of its ways if that matters.
 
     node : (k,) int64 node index
@@ -38,7 +38,7 @@ class Chain:
     way: Ints
 
 
-class Kind(Protocol):
+class WayAttributes(Protocol):
     """Attributes of a way; equal ones may be joined."""
 
     @property
@@ -46,7 +46,7 @@ class Kind(Protocol):
         """Whether both directions have the same attributes."""
 
 
-def chains_of(runs: Runs, kinds: Sequence[Kind], *, nodes: int) -> list[Chain]:
+def chains_of(runs: Runs, kinds: Sequence[WayAttributes], *, nodes: int) -> list[RoadChain]:
     """The runs as chains from junction, dead end or change of kind (ways,) to the next."""
     number = {kind: k for k, kind in enumerate(dict.fromkeys(kinds))}
     kind = np.array([number[kind] for kind in kinds], np.int64)
@@ -76,7 +76,7 @@ def find_cuts(runs: Runs, kind: Ints, *, symmetric: Bools, nodes: int) -> Bools:
     return cut
 
 
-def link_chains(runs: Runs, cut: Bools) -> list[Chain]:
+def link_chains(runs: Runs, cut: Bools) -> list[RoadChain]:
     """The runs as chains from cut node to cut node; a loop without any starts at its own first node."""
     pieces = _pieces(runs, cut)
     loose: dict[int, list[int]] = {}
@@ -87,7 +87,7 @@ def link_chains(runs: Runs, cut: Bools) -> list[Chain]:
 
     used = [False] * len(pieces)
 
-    def follow(node: int) -> list[Chain]:
+    def follow(node: int) -> list[RoadChain]:
         """Pieces that follow from a node, each reversed where needed to begin where the previous one ends."""
         found = []
         while not cut[node]:
@@ -111,21 +111,21 @@ def link_chains(runs: Runs, cut: Bools) -> list[Chain]:
     return chains
 
 
-def _pieces(runs: Runs, cut: Bools) -> list[Chain]:
+def _pieces(runs: Runs, cut: Bools) -> list[RoadChain]:
     """The runs cut at cut nodes."""
     edge = np.flatnonzero(np.diff(runs.run, prepend=-1, append=-1))
     pieces = []
     for start, end in zip(edge[:-1].tolist(), edge[1:].tolist(), strict=True):
         inner = start + 1 + np.flatnonzero(cut[runs.node[start + 1 : end - 1]])
         stops = [start, *inner.tolist(), end - 1]
-        pieces += [Chain(runs.node[i : j + 1], runs.way[i:j]) for i, j in pairwise(stops)]
+        pieces += [RoadChain(runs.node[i : j + 1], runs.way[i:j]) for i, j in pairwise(stops)]
     return pieces
 
 
-def _turned(piece: Chain) -> Chain:
-    return Chain(piece.node[::-1], piece.way[::-1])
+def _turned(piece: RoadChain) -> RoadChain:
+    return RoadChain(piece.node[::-1], piece.way[::-1])
 
 
-def _joined(pieces: Sequence[Chain]) -> Chain:
+def _joined(pieces: Sequence[RoadChain]) -> RoadChain:
     nodes = [pieces[0].node, *(piece.node[1:] for piece in pieces[1:])]
-    return Chain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))
+    return RoadChain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from geoscene.roadgraph.chains import Chain
+from geoscene.roadgraph.chains import RoadChain
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import CLASSES
-from geoscene.sources.data import Point, Tags, Way
+from geoscene.sources.data import TaggedNode, Tags, Way
 from geoscene.typing import Bools, Ints
 
 # Metres before a node within which a signal or a sign is the node's own.
@@ -19,10 +19,10 @@ _REACH = 30.0
 
 def add_controls(
     graph: RoadGraph,
-    points: Iterable[Point],
+    points: Iterable[TaggedNode],
     *,
     sides: tuple[Ints, Bools],
-    lines: tuple[Sequence[Chain], Sequence[Way], Ints],
+    lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
 ) -> RoadGraph:
     """The graph with its traffic controls.
 
@@ -83,10 +83,10 @@ def add_controls(
 
 def _controls_on_edges(
     graph: RoadGraph,
-    points: Iterable[Point],
+    points: Iterable[TaggedNode],
     *,
     sides: tuple[Ints, Bools],
-    lines: tuple[Sequence[Chain], Sequence[Way], Ints],
+    lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
 ) -> Iterator[tuple[int, int, bool, Tags]]:
     """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, tags)."""
     chain_of, against = sides

@@ -16,7 +16,7 @@ from geoscene.roadgraph.carriageways import Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.sources.data import OsmData, Point, Tags, Way
+from geoscene.sources.data import OsmData, TaggedNode, Tags, Way
 from geoscene.support.columns import Columns
 from geoscene.tags import parse_length
 from geoscene.typing import Float, Ints
@@ -154,7 +154,7 @@ def _from_nodes(osm: OsmData, ways: list[Way], *, roads: Carriageways, frame: Fr
     return _crossings(shapes, [points[k] for k in which.tolist()])
 
 
-def _crossings(lines: NDArray[np.object_], of: Sequence[Way | Point]) -> _Crossings:
+def _crossings(lines: NDArray[np.object_], of: Sequence[Way | TaggedNode]) -> _Crossings:
     given = [parse_length(feature.tags.get("width")) for feature in of]
     paint = [_paint(feature.tags) for feature in of]
     return _Crossings(

@@ -22,7 +22,7 @@ from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.support.files import digest, digest_of, write_atomically
-from geoscene.support.storage import Stored, cache_folder, url_of
+from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
 
@@ -50,7 +50,7 @@ class SceneFiles:
     """
 
     folder: Path
-    stored: Stored | None = None
+    stored: StoredFolder | None = None
 
     def _local(self, name: str) -> Path:
         return self.folder / name if self.stored is None else self.stored.local(name, self.folder)
@@ -129,7 +129,7 @@ class Scene:
     path: Path
     manifest: dict[str, Any]
     frame: Frame
-    stored: Stored | None = None
+    stored: StoredFolder | None = None
     modelled: bool = False
 
     @property
@@ -364,7 +364,7 @@ def open_scene(path: str | Path) -> Scene:
 
 def _open_stored(url: str) -> Scene:
     """Open the scene at a URL; its cache is of these contents of ``scene.json``."""
-    stored, names = Stored(url), SceneFiles(Path())
+    stored, names = StoredFolder(url), SceneFiles(Path())
     data = stored.read(names.manifest.name)
     folder = cache_folder() / "stored" / digest(url.encode() + data)
     write_atomically(SceneFiles(folder).manifest, data)
@@ -374,7 +374,7 @@ def _open_stored(url: str) -> Scene:
     with reading(reports, SceneFormatError, remedy=BUILD_AGAIN):
         rows = json.loads(reports.read_text("utf-8"))["tiles"]
         tiles = {names.tile(int(r["i"]), int(r["j"])).as_posix(): str(r["digest"]) for r in rows}
-    return replace(scene, stored=Stored(url, {**scene.manifest.get("files", {}), **tiles}))
+    return replace(scene, stored=StoredFolder(url, {**scene.manifest.get("files", {}), **tiles}))
 
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:

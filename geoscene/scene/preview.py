@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from geoscene.drawing.previews import PAPER, Color, Plan, card
+from geoscene.drawing.previews import PAPER, Color, PreviewPlan, card
 
 if TYPE_CHECKING:
     from geoscene.scene.layout import Scene
@@ -27,7 +27,7 @@ _BLOCK, _MOST = 20_000, 200_000
 
 def scene_png(scene: Scene) -> bytes:
     """A PNG picture of a scene from above; of layers with very many features the first ones only."""
-    plan = Plan(scene.bounds, PAPER)
+    plan = PreviewPlan(scene.bounds, PAPER)
     for name, (fill, edge) in _LAYERS.items():
         count = min(scene.table_length(name), _MOST)
         for first in range(0, count, _BLOCK):

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.buildings.facades import Facades, Openings, WallRelief
+from geoscene.buildings.facades import FacadeTable, Openings, WallRelief
 from geoscene.classes import Class
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.forests import Forests, forest_instances
 from geoscene.support.files import digest, write_atomically
 from geoscene.support.untrusted import read_arrays
@@ -48,7 +48,7 @@ class Tile:
 
     origin: Float
     mesh: Mesh
-    instances: Instances = field(default_factory=Instances.empty)
+    instances: ShapeInstances = field(default_factory=ShapeInstances.empty)
     relief: WallRelief | None = None
     extras: Extras | None = None
 
@@ -58,7 +58,7 @@ def with_forests(tile: Tile, forests: Forests, *, box: Sequence[float]) -> Tile:
     if not (tile.mesh.klass == Class.FOREST_FLOOR).any():
         return tile
     trees = forest_instances(tile.mesh.shifted(tile.origin), forests, box=box).shifted(-tile.origin)
-    return replace(tile, instances=Instances.concatenate([tile.instances, trees]))
+    return replace(tile, instances=ShapeInstances.concatenate([tile.instances, trees]))
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -88,7 +88,7 @@ def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
 
 def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
-    instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(Instances)}
+    instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(ShapeInstances)}
     relief = {} if tile.relief is None else _relief_arrays(tile.relief)
     extras = {} if tile.extras is None else _extra_arrays(tile.extras)
     data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief, **extras})
@@ -103,16 +103,16 @@ def read_tile(path: Path) -> Tile:
     """
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = read_arrays(path)
-        instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(Instances)}
+        instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(ShapeInstances)}
         mesh = _mesh(arrays)
         relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
-        copies = Instances(**instances)
+        copies = ShapeInstances(**instances)
         extras = _extras(arrays, faces=len(mesh), copies=len(copies)) if "extra_faces" in arrays else None
         return Tile(arrays["origin"], mesh, copies, relief, extras)
 
 
 def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
-    facades = {f"facade_{f.name}": getattr(relief.facades, f.name) for f in fields(Facades)}
+    facades = {f"facade_{f.name}": getattr(relief.facades, f.name) for f in fields(FacadeTable)}
     openings = {f"opening_{f.name}": getattr(relief.openings, f.name) for f in fields(Openings)}
     return {**facades, **openings, "relief_cells": relief.cells, "relief_wall": relief.wall}
 
@@ -131,7 +131,7 @@ def _extras(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) -> E
 
 def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:
     """The relief in a tile's arrays; raises ValueError if its tables do not fit each other."""
-    facades = Facades(**{f.name: _column(arrays, f"facade_{f.name}") for f in fields(Facades)})
+    facades = FacadeTable(**{f.name: _column(arrays, f"facade_{f.name}") for f in fields(FacadeTable)})
     openings = Openings(**{f.name: _column(arrays, f"opening_{f.name}") for f in fields(Openings)})
     cells, wall = _column(arrays, "relief_cells"), _column(arrays, "relief_wall")
     for table in (facades, openings):

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from geoscene.sources.data import Area as Area
 from geoscene.sources.data import OsmData as OsmData
-from geoscene.sources.data import Point as Point
 from geoscene.sources.data import Relation as Relation
+from geoscene.sources.data import TaggedNode as TaggedNode
 from geoscene.sources.data import Tags as Tags
 from geoscene.sources.data import Way as Way
 from geoscene.sources.registry import SOURCES as SOURCES

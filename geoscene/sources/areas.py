@@ -11,7 +11,7 @@ import shapely
 
 from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
-from geoscene.sources.rings import Chain, assemble, close_cut_ring, polygons_of, tangled
+from geoscene.sources.rings import RingMember, assemble, close_cut_ring, polygons_of, tangled
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
 from geoscene.support.report import Problem
 from geoscene.typing import Float, Ints
@@ -122,7 +122,7 @@ def _relation_area(
     elements: Elements, places: Places, *, boundary: _Boundary, extent: Bounds
 ) -> tuple[Any, Problem | None]:
     """The geometry of a multipolygon, or None, and its problem, if any."""
-    chains: list[Chain] = []
+    chains: list[RingMember] = []
     missing_ways = cut = missing_nodes = 0
     for row, inner in boundary.ways:
         if row < 0:
@@ -134,11 +134,11 @@ def _relation_area(
             ring = close_cut_ring(nodes, places.xy, extent=extent)
             if ring is not None:
                 cut += 1
-                chains.append(Chain(ring, inner))
+                chains.append(RingMember(ring, inner))
                 continue
         missing_nodes += missing
         breaks = np.flatnonzero(np.diff((nodes >= 0).astype(np.int8))) + 1
-        chains += [Chain(run, inner) for run in np.split(nodes, breaks) if len(run) > 1 and run[0] >= 0]
+        chains += [RingMember(run, inner) for run in np.split(nodes, breaks) if len(run) > 1 and run[0] >= 0]
     incomplete = missing_ways + missing_nodes > 0
     made = assemble(chains, places.xy, complete=not incomplete)
     reason = "incomplete-relation" if incomplete else made.reason or ("missing-nodes" if cut else "")

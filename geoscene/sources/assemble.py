@@ -7,7 +7,7 @@ import shapely
 
 from geoscene.errors import SourceNotFoundError
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
-from geoscene.sources.data import Bounds, OsmData, Point, Relation, Way
+from geoscene.sources.data import Bounds, OsmData, Relation, TaggedNode, Way
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.extent import checked_bounds, located, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
@@ -190,10 +190,10 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     return data
 
 
-def _points(elements: Elements) -> list[Point]:
+def _points(elements: Elements) -> list[TaggedNode]:
     ids = np.array(list(elements.node_tags), np.int64)
     lonlat = elements.lonlat(np.searchsorted(elements.node_id, ids)).tolist()
     return [
-        Point(f"node/{i}", elements.node_tags[i], lon, lat)
+        TaggedNode(f"node/{i}", elements.node_tags[i], lon, lat)
         for i, (lon, lat) in zip(ids.tolist(), lonlat, strict=True)
     ]

@@ -53,7 +53,7 @@ class Area:
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class TaggedNode:
     """A node with tags. ``osm_id`` is ``node/6``."""
 
     osm_id: str
@@ -113,7 +113,7 @@ class OsmData:
     bounds: Bounds
     ways: list[Way]
     areas: list[Area]
-    points: list[Point]
+    points: list[TaggedNode]
     relations: list[Relation]
     problems: list[Problem] = field(default_factory=list)
     source: str = ""

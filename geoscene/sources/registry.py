@@ -14,7 +14,7 @@ from geoscene.sources.tags import is_building
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
+class MapSourceKind:
     """One row of the registry.
 
     name        : on the command line and in ``scene.json``
@@ -46,10 +46,10 @@ _TERRAIN_TILES = (
     " Survey"
 )
 
-SOURCES: dict[str, Source] = {
+SOURCES: dict[str, MapSourceKind] = {
     source.name: source
     for source in (
-        Source(
+        MapSourceKind(
             name="osm",
             gives="map",
             suffixes=(".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".o5m", ".json", ".json.gz", ".json.bz2"),
@@ -57,17 +57,17 @@ SOURCES: dict[str, Source] = {
             licence="ODbL-1.0",
             attribution=_OSM,
         ),
-        Source(
+        MapSourceKind(
             name="overpass", gives="map", reader="network:fetch_bbox", licence="ODbL-1.0", attribution=_OSM
         ),
-        Source(
+        MapSourceKind(
             name="terrain-tiles",
             gives="heights",
             reader="elevation:fetch_elevation",
             licence="open licences of several providers, named in the attribution",
             attribution=_TERRAIN_TILES,
         ),
-        Source(
+        MapSourceKind(
             name="overture",
             gives="buildings",
             suffixes=(".parquet", ".geoparquet"),

@@ -17,7 +17,7 @@ _LONG, _CROSSINGS = 200, 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Chain:
+class RingMember:
     """One member of an area's boundary.
 
     nodes : (k,) node indices, none missing
@@ -168,7 +168,7 @@ class Assembly:
     reason: str
 
 
-def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> Assembly:
+def assemble(chains: Sequence[RingMember], xy: Float, *, complete: bool = True) -> Assembly:
     """The area that chains enclose.
 
     A valid boundary (an even number of segments at every node, no crossing between nodes) is filled by the
@@ -179,7 +179,7 @@ def assemble(chains: Sequence[Chain], xy: Float, *, complete: bool = True) -> As
     xy : (n, 2) coordinates of all nodes
     """
     roles: dict[bytes, set[bool]] = {}
-    unique: list[Chain] = []
+    unique: list[RingMember] = []
     parts: list[Ints] = []
     spikes = False
     for chain in chains:

@@ -20,7 +20,7 @@ from geoscene.structures.lining import (
 )
 from geoscene.structures.table import Structures
 from geoscene.structures.tubes import (
-    Walls,
+    TubeWalls,
     between,
     mouths,
     place_in_tunnel,
@@ -56,7 +56,7 @@ def lamps(table: Structures, k: int) -> Bodies:
     length, width, tall = _LAMP
     stations, _ = stations_every(table, k, spacing=between(_LAMPS, random_shares(table, k, count=5)[4]))
     stations = np.clip(stations, length, max(polylines.length(table.line[k]) - length, length))
-    walls = Walls.of(table, k, stations=stations)
+    walls = TubeWalls.of(table, k, stations=stations)
     clear = _clear_of_ribs(table, k, stations=stations, reach=length / 2)
     rows = np.flatnonzero(np.isfinite(walls.metres).all(axis=1) & clear)
     across = (np.array(-width / 2), np.array(width / 2))
@@ -81,7 +81,7 @@ def signs(table: Structures, k: int) -> Bodies:
     escape = np.repeat([True, False], [2 * len(stations), len(niche_at)])
     at = np.concatenate([np.repeat(stations, 2), niche_at])
     side = np.concatenate([np.tile([0, 1], len(stations)), niche_side])
-    walls = Walls.of(table, k, stations=at)
+    walls = TubeWalls.of(table, k, stations=at)
     away = walls.metres[np.arange(len(at)), side] - GAP
     clear = _clear_of_ribs(table, k, stations=at, reach=0.3) & np.isfinite(away)
     clear &= (np.abs(at[:, None] - niche_at) > NICHE_WIDTH).all(axis=1) | ~escape
@@ -112,7 +112,7 @@ def fans(table: Structures, k: int) -> Bodies:
     stations = np.where(clear, stations, stations + spacing / 2)
     inside = (stations > _FAN_LENGTH) & (stations < polylines.length(table.line[k]) - _FAN_LENGTH)
     stations = stations[inside & _clear_of_ribs(table, k, stations=stations, reach=_FAN_LENGTH / 2)]
-    walls = Walls.of(table, k, stations=stations)
+    walls = TubeWalls.of(table, k, stations=stations)
     middle = walls.metres - GAP - _FAN / 2 - 0.05
     rows, side = np.nonzero(np.isfinite(middle))
     middle, half = middle[rows, side], _FAN_LENGTH / 2
@@ -140,7 +140,7 @@ def trays(table: Structures, k: int) -> Bodies:
     deep = rib_form(table, k).depth
     width, tall = _TRAY
     stops = np.linspace(0.1, length - 0.1, max(int(length / _TRAY_STEP), 1) + 1)
-    walls = Walls.of(table, k, stations=stops)
+    walls = TubeWalls.of(table, k, stations=stops)
     away = walls.metres[:, 1] - deep - 3 * GAP
     rings = []
     for low, across in ((-tall, 0.0), (0.0, 0.0), (0.0, width), (-tall, width)):

@@ -22,7 +22,7 @@ SIDE = -1
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class LayerTriangulation:
     """A conforming triangulation of an area.
 
     xy    : (n, 2) float64, scene metres
@@ -57,7 +57,7 @@ class Shell:
     triangle: Ints
 
 
-def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
+def cut_plan(area: object, lines: NDArray[np.object_]) -> LayerTriangulation:
     """The triangles of an area (Polygon or MultiPolygon), none of which crosses one of the lines.
 
     Lines are shapely geometries; parts outside the area are ignored. All is snap-rounded to a grid of 2 mm.
@@ -72,13 +72,13 @@ def cut_plan(area: object, lines: NDArray[np.object_]) -> Plan:
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(cells))
     corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
     grid, faces = distinct_places(np.rint(corners.reshape(-1, 2) / PRECISION).astype(np.int64))
-    plan = Plan(np.asarray(grid * PRECISION, float), faces.reshape(-1, 3))
+    plan = LayerTriangulation(np.asarray(grid * PRECISION, float), faces.reshape(-1, 3))
     twice = _twice_areas(plan)  # of multiples of the grid, so it is exact
     faces = np.where((twice < 0)[:, None], plan.faces[:, ::-1], plan.faces)
-    return without_slivers(Plan(plan.xy, faces[twice != 0]))
+    return without_slivers(LayerTriangulation(plan.xy, faces[twice != 0]))
 
 
-def without_slivers(plan: Plan) -> Plan:
+def without_slivers(plan: LayerTriangulation) -> LayerTriangulation:
     """The plan without triangles at its border that are thinner than `_THIN`, and connected at each vertex.
 
     Their sides would be walls so near to each other that rounding makes them cross. One with only its
@@ -95,16 +95,16 @@ def without_slivers(plan: Plan) -> Plan:
         for triangle in np.flatnonzero(needle):
             side = 3 * triangle + border[triangle].argmax()
             faces = np.where(plan.faces == end[side], start[side], plan.faces)
-            merged = Plan(plan.xy, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
+            merged = LayerTriangulation(plan.xy, faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)])
             if (_twice_areas(merged) > 0).all():
                 break
         else:
             kept = _unpinched(plan, ~thin, start=start, own=own, other=other)
-            merged = Plan(plan.xy, plan.faces[kept])
+            merged = LayerTriangulation(plan.xy, plan.faces[kept])
         plan = merged
 
 
-def _twice_areas(plan: Plan) -> Float:
+def _twice_areas(plan: LayerTriangulation) -> Float:
     """Twice the area (m,) of each triangle; negative if clockwise."""
     a, b, c = (plan.xy[plan.faces[:, k]] for k in range(3))
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
@@ -112,7 +112,7 @@ def _twice_areas(plan: Plan) -> Float:
     return twice
 
 
-def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
+def raise_shell(plan: LayerTriangulation, levels: Float, *, solid: Bools) -> Shell:
     """The closed surface around the solid layers of a plan's triangles.
 
     Where solids would touch along a vertical edge only, the smallest triangles there are left out, so that
@@ -149,7 +149,7 @@ def raise_shell(plan: Plan, levels: Float, *, solid: Bools) -> Shell:
     )
 
 
-def _unpinched(plan: Plan, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
+def _unpinched(plan: LayerTriangulation, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
     """The layer (m,) reduced so that the solid around each vertex is connected."""
     area = np.repeat(_twice_areas(plan), 3)
     solid = solid.copy()
@@ -165,7 +165,7 @@ def _unpinched(plan: Plan, solid: Bools, *, start: Ints, own: Ints, other: Ints)
         solid[own[least]] = False
 
 
-def half_edges(plan: Plan) -> tuple[Ints, Ints, Ints, Ints]:
+def half_edges(plan: LayerTriangulation) -> tuple[Ints, Ints, Ints, Ints]:
     """Edges of all triangles: (start, end, triangle, the triangle on the other side or -1), each (3 m,)."""
     start, end = plan.faces.ravel(), np.roll(plan.faces, -1, axis=1).ravel()
     own = np.repeat(np.arange(len(plan.faces)), 3)

@@ -16,7 +16,7 @@ from geoscene.structures.bodies import Bodies, between_rings, uprights
 from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.table import Structures
 from geoscene.structures.tubes import (
-    Walls,
+    TubeWalls,
     between,
     carriageway,
     has_walkway,
@@ -75,7 +75,7 @@ def read_lining(table: Structures, k: int) -> Lining:
     driven = carriageway(table, k)
     walkway = _tidy(table.inner[k].intersection(table.polygon[k]).difference(driven))
     stations, sides = niche_stations(table, k)
-    walls = Walls.of(table, k, stations=stations)
+    walls = TubeWalls.of(table, k, stations=stations)
     away = walls.metres[np.arange(len(sides)), sides]
     rows = np.flatnonzero(np.isfinite(away))
     boxes = shapely.polygons(
@@ -162,7 +162,7 @@ def _frames(
     if not len(stations):
         return Bodies.empty()
     wide, deep = size
-    walls = Walls.of(table, k, stations=stations)
+    walls = TubeWalls.of(table, k, stations=stations)
     ahead = np.array([-wide / 2, wide / 2])
     away = walls.beside(table, k, ahead=ahead)[..., None]
     ends = (walls.at + ahead[:, None, None] * walls.along)[:, :, None]

@@ -15,7 +15,7 @@ from geoscene.geometry.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
 from geoscene.structures.fittings import tunnel_fittings
 from geoscene.structures.ground_contact import tunnel_roof
 from geoscene.structures.heights import slopes_across, surface_heights
-from geoscene.structures.layered import SIDE, Plan, Shell, cut_plan, raise_shell
+from geoscene.structures.layered import SIDE, LayerTriangulation, Shell, cut_plan, raise_shell
 from geoscene.structures.lining import NICHE, WALKWAY, Lining, read_lining
 from geoscene.structures.table import StructureOptions, Structures
 from geoscene.typing import Bools, Float, Height, Ints
@@ -121,7 +121,7 @@ def _solid(
 
 
 def _bridge(
-    table: Structures, k: int, *, plan: Plan, z: Float, ground: Float, rim: Bools
+    table: Structures, k: int, *, plan: LayerTriangulation, z: Float, ground: Float, rim: Bools
 ) -> tuple[Float, Bools]:
     """Bridge with the levels below ground, soffit, deck, parapet; piers reach down, parapets up."""
     soffit = z - table.body[k]
@@ -134,7 +134,7 @@ def _tunnel(
     table: Structures,
     k: int,
     *,
-    plan: Plan,
+    plan: LayerTriangulation,
     z: Float,
     ground: Float,
     rim: Bools,
@@ -197,7 +197,9 @@ def _ribs(line: Float, reach: float) -> NDArray[np.object_]:
     return np.atleast_1d(ribs)
 
 
-def _with_surfaces(table: Structures, k: int, *, plan: Plan, shell: Shell, floor: int, rim: Bools) -> Mesh:
+def _with_surfaces(
+    table: Structures, k: int, *, plan: LayerTriangulation, shell: Shell, floor: int, rim: Bools
+) -> Mesh:
     """The shell as a mesh with the classes of its surfaces."""
     concrete = materials()["concrete"]
     body = Class.TUNNEL if table.tunnel[k] else Class.BRIDGE

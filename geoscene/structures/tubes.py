@@ -23,7 +23,7 @@ MOUTH = 0.7
 
 
 @dataclass(frozen=True, slots=True)
-class Walls:
+class TubeWalls:
     """Where the walls of a piece are at stations of its line.
 
     at     : (n, 2) points on the line
@@ -36,7 +36,7 @@ class Walls:
     metres: Float
 
     @classmethod
-    def of(cls, table: Structures, k: int, *, stations: Float) -> Walls:
+    def of(cls, table: Structures, k: int, *, stations: Float) -> TubeWalls:
         """The walls of piece ``k`` at stations (n,) of its line."""
         line = table.line[k][:, :2]
         at = polylines.points_at(line, stations)

@@ -22,7 +22,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-class Cluster:
+class DaskCluster:
     """A connection to a Dask scheduler; `connected` makes it."""
 
     def __init__(self, client: Any, *, address: str) -> None:
@@ -93,7 +93,7 @@ class Cluster:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[Cluster]:
+def connected(address: str) -> Iterator[DaskCluster]:
     """Yield a connection to the Dask scheduler at ``address``, such as ``tcp://HOST:8786``.
 
     Raises InputError if none answers or it has no workers, and MissingExtraError without Dask.
@@ -113,7 +113,7 @@ def connected(address: str) -> Iterator[Cluster]:
             raise InputError(
                 f"`scheduler` {address}: it has no workers; start some with: dask worker {address}"
             ) from error
-        yield Cluster(client, address=address)
+        yield DaskCluster(client, address=address)
 
 
 def _worker_sees(paths: Sequence[Path]) -> tuple[str, str, list[str]]:

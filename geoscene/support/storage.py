@@ -60,7 +60,7 @@ def cache_folder() -> Path:
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredFolder:
     """A folder in object storage; its methods raise StorageError, which names it.
 
     url     : such as s3://bucket/name, without a slash at the end
@@ -252,7 +252,7 @@ def published(
     if not (url := url_of(out)):
         yield out
         return
-    stored, name = Stored(url), url.rsplit("/", 1)[-1]
+    stored, name = StoredFolder(url), url.rsplit("/", 1)[-1]
     folder = cache_folder() / "spool" / digest(url.encode()) / name
     stored.check_writable()
     with exclusive(folder.parent):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.export.objects import expand, parts
-from geoscene.export.raster import Grid, draw, grid_of
+from geoscene.export.raster import RasterGrid, draw, grid_of
 from geoscene.geometry.mesh import concatenate
 from geoscene.geometry.watertight import volumes
 from geoscene.options import BuildOptions
@@ -25,7 +25,7 @@ from geoscene.scene import Scene, open_scene
 from geoscene.sources import OsmData
 from geoscene.support.memory import peak_memory
 from geoscene.support.progress import Progress, silent
-from geoscene.tradeoff.variants import Variant, coarse_elevation, full, variants
+from geoscene.tradeoff.variants import BuildVariant, coarse_elevation, full, variants
 
 MOST_CELLS = 16_000_000
 """Cells of the surface models that are compared; larger scenes have larger cells."""
@@ -47,7 +47,7 @@ _OBJECTS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class BuildCost:
     """Cost of a build in a process of its own, with imports and reading the map; bytes of the scene."""
 
     cpu_s: float
@@ -56,7 +56,7 @@ class Cost:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class BuildRow:
     """A build.
 
     costs   : of each repetition
@@ -68,26 +68,26 @@ class Row:
     """
 
     label: str
-    costs: tuple[Cost, ...]
+    costs: tuple[BuildCost, ...]
     error: dict[str, float]
     missing: dict[str, int]
     note: str = ""
 
     @property
-    def cost(self) -> Cost:
+    def cost(self) -> BuildCost:
         """The median of the repetitions."""
         columns = ([getattr(c, name) for c in self.costs] for name in ("cpu_s", "memory_bytes", "bytes"))
         cpu, memory, size = (float(np.median(column)) for column in columns)
-        return Cost(cpu, int(memory), int(size))
+        return BuildCost(cpu, int(memory), int(size))
 
 
 @dataclass(frozen=True, slots=True)
-class Tradeoff:
+class BuildTradeoff:
     """Rows of a place; the first is the full scene. ``resolution`` is that of the surface models, metres."""
 
     name: str
     resolution: float
-    rows: tuple[Row, ...]
+    rows: tuple[BuildRow, ...]
 
 
 def tradeoff(
@@ -98,7 +98,7 @@ def tradeoff(
     resolution: float = 1.0,
     repetitions: int = 1,
     progress: Progress = silent,
-) -> Tradeoff:
+) -> BuildTradeoff:
     """Errors and costs of builds of a map, each setting changed alone.
 
     read       : reads the map; called in the process of each build, so it must be picklable
@@ -111,7 +111,7 @@ def tradeoff(
     builds = [full(options), *chosen]
     with tempfile.TemporaryDirectory(prefix="geoscene-tradeoff-") as name:
         folder = Path(name)
-        costs: list[list[Cost]] = [[] for _ in builds]
+        costs: list[list[BuildCost]] = [[] for _ in builds]
         for turn in range(repetitions):  # in turn, so that a busy machine troubles all alike
             for k, variant in enumerate(builds):
                 progress("builds", turn * len(builds) + k, total=repetitions * len(builds))
@@ -121,15 +121,15 @@ def tradeoff(
         cell = max(resolution, float(np.sqrt((xmax - xmin) * (ymax - ymin) / MOST_CELLS)))
         grid = grid_of(scene, cell)
         exact = _Measures.of(scene, grid)
-        rows = [Row(builds[0].label, tuple(costs[0]), _errors(exact, exact), {})]
+        rows = [BuildRow(builds[0].label, tuple(costs[0]), _errors(exact, exact), {})]
         for k, variant in enumerate(chosen, start=1):
             progress("comparisons", k - 1, total=len(chosen))
             other = open_scene(folder / str(k) / "scene")
             rows.append(_row(variant, tuple(costs[k]), scene=other, exact=exact, grid=grid))
-    return Tradeoff(scene.manifest["name"] or scene.manifest["sources"][0]["from"], cell, tuple(rows))
+    return BuildTradeoff(scene.manifest["name"] or scene.manifest["sources"][0]["from"], cell, tuple(rows))
 
 
-def _measured(read: Callable[[], OsmData], variant: Variant, *, folder: Path) -> Cost:
+def _measured(read: Callable[[], OsmData], variant: BuildVariant, *, folder: Path) -> BuildCost:
     """The cost of a build into a folder, made in a process of its own."""
     folder.mkdir(exist_ok=True)
     options = variant.options
@@ -145,13 +145,13 @@ def _measured(read: Callable[[], OsmData], variant: Variant, *, folder: Path) ->
         return pool.submit(_build, read, options=options, out=folder / "scene").result()
 
 
-def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> Cost:
+def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> BuildCost:
     """Build a scene in this process and return all that it cost."""
     from geoscene.pipeline.build import build  # noqa: PLC0415 - part of the cost
 
     build(read(), out, options=options, overwrite=out.exists())
     size = sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
-    return Cost(time.process_time(), peak_memory(), size)
+    return BuildCost(time.process_time(), peak_memory(), size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +172,7 @@ class _Measures:
     counts: dict[str, int]
 
     @classmethod
-    def of(cls, scene: Scene, grid: Grid) -> _Measures:
+    def of(cls, scene: Scene, grid: RasterGrid) -> _Measures:
         counts = {name: int(scene.manifest["counts"][name]) for name in _OBJECTS}
         area = 0.0
         if scene.table_length("buildings"):
@@ -181,7 +181,7 @@ class _Measures:
         return cls(height, klass, building_volume(scene), area, counts)
 
 
-def surface_model(scene: Scene, grid: Grid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def surface_model(scene: Scene, grid: RasterGrid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Height and class (rows, columns) of the highest face over cells' middles; NaN and 0 without one."""
     height = np.full((grid.rows, grid.columns), np.nan, np.float32)
     labels = np.zeros(height.shape, np.uint8)
@@ -203,16 +203,18 @@ def building_volume(scene: Scene) -> float:
     return total
 
 
-def _row(variant: Variant, costs: tuple[Cost, ...], *, scene: Scene, exact: _Measures, grid: Grid) -> Row:
+def _row(
+    variant: BuildVariant, costs: tuple[BuildCost, ...], *, scene: Scene, exact: _Measures, grid: RasterGrid
+) -> BuildRow:
     counts = scene.manifest["counts"]
     lost = {_OBJECTS[name]: n - int(counts[name]) for name, n in exact.counts.items() if n > counts[name]}
     if not scene.has_tiles:
-        return Row(variant.label, costs, {}, lost, "no meshes")
+        return BuildRow(variant.label, costs, {}, lost, "no meshes")
     error = _errors(_Measures.of(scene, grid), exact)
     note = "" if any(error.values()) or lost else "no error here"
     if variant.options.use != "all":
         note = "; ".join(filter(None, (note, f"no {', '.join(_left_out(scene))}")))
-    return Row(variant.label, costs, error, lost, note)
+    return BuildRow(variant.label, costs, error, lost, note)
 
 
 def _left_out(scene: Scene) -> list[str]:
@@ -220,7 +222,7 @@ def _left_out(scene: Scene) -> list[str]:
 
 
 def _errors(found: _Measures, exact: _Measures) -> dict[str, Any]:
-    """The errors of `Row`."""
+    """The errors of `BuildRow`."""
     known = np.isfinite(exact.height) & np.isfinite(found.height)
     off = np.abs(found.height[known].astype(float) - exact.height[known])
     off = np.where(off > _SAME, off, 0.0) if len(off) else np.zeros(1)

@@ -9,7 +9,7 @@ from typing import Any
 
 from geoscene.drawing.charts import (
     Axes,
-    Point,
+    ChartPoint,
     html_page,
     html_picture,
     html_table,
@@ -19,7 +19,7 @@ from geoscene.drawing.charts import (
 )
 from geoscene.drawing.figures import metres, share, size
 from geoscene.support.files import write_atomically, write_json
-from geoscene.tradeoff.engine import Row, Tradeoff
+from geoscene.tradeoff.engine import BuildRow, BuildTradeoff
 
 TARGETS = (0.01, 0.1, 1.0)
 """Metres (rms) of the surface model for which a setting is recommended."""
@@ -33,7 +33,7 @@ _HEAD = (
 )
 
 
-def cells(row: Row) -> list[str]:
+def cells(row: BuildRow) -> list[str]:
     """Texts of a row of the table."""
     cpu = [cost.cpu_s for cost in row.costs]
     spread = f" ({min(cpu):.3g} to {max(cpu):.3g})" if len(cpu) > 1 else ""
@@ -53,14 +53,14 @@ def cells(row: Row) -> list[str]:
     ]
 
 
-def headline(found: Tradeoff) -> str:
+def headline(found: BuildTradeoff) -> str:
     """What was compared."""
     return f"{found.name}: surface models of {metres(found.resolution)} cells against the full scene"
 
 
-def pareto(found: Tradeoff) -> list[Row]:
+def pareto(found: BuildTradeoff) -> list[BuildRow]:
     """Builds for all uses of which no other is both cheaper and at least as exact, the cheapest first."""
-    best: list[Row] = []
+    best: list[BuildRow] = []
     shown = [row for row in found.rows if not row.label.startswith("for=")]
     for row in sorted(shown, key=lambda r: (r.cost.cpu_s, r.error["height_rms_m"])):
         if not best or row.error["height_rms_m"] < best[-1].error["height_rms_m"]:
@@ -68,7 +68,7 @@ def pareto(found: Tradeoff) -> list[Row]:
     return best
 
 
-def recommendations(found: Tradeoff) -> list[str]:
+def recommendations(found: BuildTradeoff) -> list[str]:
     """A sentence for each of `TARGETS`, and one for scenes for drives."""
     full, best = found.rows[0], pareto(found)
     most = (1 - SAVING) * full.cost.cpu_s
@@ -92,20 +92,20 @@ def recommendations(found: Tradeoff) -> list[str]:
     ]
 
 
-def _saving(row: Row, full: Row) -> str:
+def _saving(row: BuildRow, full: BuildRow) -> str:
     return (
         f"{row.cost.cpu_s:.3g} instead of {full.cost.cpu_s:.3g} CPU s,"
         f" {size(row.cost.bytes)} instead of {size(full.cost.bytes)}"
     )
 
 
-def print_tables(found: Tradeoff) -> None:
+def print_tables(found: BuildTradeoff) -> None:
     """Print the table and the recommendations."""
     print_table(_HEAD, [cells(row) for row in found.rows], title=headline(found))
     print_lines(recommendations(found))
 
 
-def document(found: Tradeoff) -> dict[str, Any]:
+def document(found: BuildTradeoff) -> dict[str, Any]:
     """The contents of ``tradeoff.json``."""
     rows = [
         {
@@ -128,18 +128,18 @@ def document(found: Tradeoff) -> dict[str, Any]:
     }
 
 
-def plot(found: Tradeoff) -> bytes:
+def plot(found: BuildTradeoff) -> bytes:
     """A PNG: error of the surface model against CPU time."""
     best = [row.label for row in pareto(found)]
     points = [
-        Point(row.label, row.cost.cpu_s, row.error["height_rms_m"], row.label in best)
+        ChartPoint(row.label, row.cost.cpu_s, row.error["height_rms_m"], row.label in best)
         for row in found.rows
         if row.error
     ]
     return scatter(points, Axes(headline(found), "CPU s of the build", "height error, rms", metres))
 
 
-def write_report(found: Tradeoff, out: Path) -> None:
+def write_report(found: BuildTradeoff, out: Path) -> None:
     """Write ``tradeoff.json``, ``tradeoff.html`` and ``pareto.png`` into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     picture = plot(found)

@@ -28,7 +28,7 @@ _COARSER = (2, 4, 8)
 
 
 @dataclass(frozen=True, slots=True)
-class Variant:
+class BuildVariant:
     """A build with a setting changed.
 
     coarser : posts of the elevation files along each side of which one is made; 1 for the files as they are
@@ -39,12 +39,12 @@ class Variant:
     coarser: int = 1
 
 
-def full(options: BuildOptions) -> Variant:
+def full(options: BuildOptions) -> BuildVariant:
     """The reference: everything, at the highest level of detail, with the relief of the options."""
-    return Variant(FULL, replace(options, lod=2, only=KINDS, use="all"))
+    return BuildVariant(FULL, replace(options, lod=2, only=KINDS, use="all"))
 
 
-def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
+def variants(options: BuildOptions, settings: Sequence[str]) -> list[BuildVariant]:
     """Builds to compare with the full scene, one setting changed in each, and a combination of cheap ones.
 
     Raises InputError for unknown settings, ``terrain`` without elevation files, and options that are
@@ -57,22 +57,22 @@ def variants(options: BuildOptions, settings: Sequence[str]) -> list[Variant]:
     if options.lod != 2 or set(options.only) != set(KINDS) or options.use != "all":
         raise InputError("`lod`, `only` and `use` are compared, all values of them; leave them out")
     chosen, base = settings or SETTINGS, full(options).options
-    found: list[Variant] = []
+    found: list[BuildVariant] = []
     if "lod" in chosen:
-        found += [Variant(f"lod={lod}", replace(base, lod=lod)) for lod in (1, 0)]
+        found += [BuildVariant(f"lod={lod}", replace(base, lod=lod)) for lod in (1, 0)]
     if "relief" in chosen:
         others = (relief for relief in RELIEFS if relief != base.relief)
-        found += [Variant(f"relief={relief}", replace(base, relief=relief)) for relief in others]
+        found += [BuildVariant(f"relief={relief}", replace(base, relief=relief)) for relief in others]
     if "only" in chosen:
-        found += [Variant(label, replace(base, only=kinds)) for label, kinds in _KINDS.items()]
+        found += [BuildVariant(label, replace(base, only=kinds)) for label, kinds in _KINDS.items()]
     if "terrain" in chosen and base.dem:
-        found += [Variant(f"terrain={n} x {n} posts", base, coarser=n) for n in _COARSER]
-        found.append(Variant("terrain=level", replace(base, dem=(), dem_tolerance=None)))
+        found += [BuildVariant(f"terrain={n} x {n} posts", base, coarser=n) for n in _COARSER]
+        found.append(BuildVariant("terrain=level", replace(base, dem=(), dem_tolerance=None)))
     if "for" in chosen:
-        found += [Variant(f"for={use}", replace(base, use=use)) for use in USES if use != "all"]
+        found += [BuildVariant(f"for={use}", replace(base, use=use)) for use in USES if use != "all"]
     if {"lod", "only"} <= set(chosen):
         cheap = replace(base, lod=0, only=("buildings",))
-        found.append(Variant("lod=0 only=buildings", cheap))
+        found.append(BuildVariant("lod=0 only=buildings", cheap))
     return found
 
 

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.export.files import plain
-from geoscene.export.objects import Features
+from geoscene.export.objects import FeatureAttributes
 from geoscene.typing import Bools, Ints
 
 Rows = Ints
 
 
-def tables(features: Features, present: Bools) -> list[dict[str, Any]]:
+def tables(features: FeatureAttributes, present: Bools) -> list[dict[str, Any]]:
     """One table per layer with the features in the page, in the layers' order, empty ones left out.
 
     present : (n,) bool by feature number: it has faces or copies in the page
@@ -35,7 +35,7 @@ def tables(features: Features, present: Bools) -> list[dict[str, Any]]:
 
 
 def _chosen(
-    layer: str, columns: dict[str, NDArray[Any]], *, own: Bools, features: Features, present: Bools
+    layer: str, columns: dict[str, NDArray[Any]], *, own: Bools, features: FeatureAttributes, present: Bools
 ) -> Rows:
     """Rows of a layer that are in the page, or belong to a feature that is."""
     keep = own.copy()

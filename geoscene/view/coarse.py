@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from geoscene.classes import Class
-from geoscene.geometry.mesh import FLOOR, Instances, Mesh
+from geoscene.geometry.mesh import FLOOR, Mesh, ShapeInstances
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 
@@ -89,7 +89,9 @@ def _nearest(points: Float, *, sides: Float, apart: Float) -> Ints:
     return out
 
 
-def fewer_instances(copies: Instances, sizes: Float, *, cell: float, share: float, seed: int) -> Instances:
+def fewer_instances(
+    copies: ShapeInstances, sizes: Float, *, cell: float, share: float, seed: int
+) -> ShapeInstances:
     """A share of the instances that are at least half a cell thick, widened so that they cover as much.
 
     Which are kept depends on their places and the seed alone.
@@ -104,4 +106,4 @@ def fewer_instances(copies: Instances, sizes: Float, *, cell: float, share: floa
     kept = copies.take((np.sort(sides, axis=1)[:, 1] >= _THINNEST * cell) & (drawn < share))
     matrix = kept.transform.copy()
     matrix[:, :, :2] *= wide
-    return Instances(kept.shape, matrix, kept.feature)
+    return ShapeInstances(kept.shape, matrix, kept.feature)

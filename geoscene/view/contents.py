@@ -30,7 +30,7 @@ _BUSY = 0.9
 """Share of the things along each axis that the first view shows."""
 
 
-class Contents:
+class PageContents:
     """The chosen layers of a scene as a page shows them; tiles are read one by one, and counted meanwhile.
 
     Raises InputError for an unknown layer.

@@ -9,9 +9,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.guesses import WINDOWS, Guesses, guess_looks, region_at
+from geoscene.buildings.guesses import WINDOWS, AppearanceGuesses, guess_looks, region_at
 from geoscene.classes import Class, materials
-from geoscene.export.objects import Features
+from geoscene.export.objects import FeatureAttributes
 from geoscene.geometry.mesh import ROOF, WALL, Mesh
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
@@ -34,7 +34,7 @@ _COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Facades(Columns):
+class FacadeLooks(Columns):
     """How windows are drawn on the walls of buildings, one row each.
 
     feature : (b,) int32, feature numbers
@@ -48,7 +48,7 @@ class Facades(Columns):
     codes: NDArray[np.uint8]
 
     @classmethod
-    def none(cls) -> Facades:
+    def none(cls) -> FacadeLooks:
         """Facades of no building."""
         return cls(np.empty(0, np.int32), np.empty(0, np.float32), np.empty((0, 4), np.uint8))
 
@@ -63,8 +63,8 @@ class Looks:
     region  : whose usual looks the guesses are
     """
 
-    facades: Facades
-    guesses: Guesses
+    facades: FacadeLooks
+    guesses: AppearanceGuesses
     walls: Bools
     roofs: Bools
     storeys: Bools
@@ -90,11 +90,11 @@ class Looks:
             surface[faces] |= GUESSED
         return replace(tile, mesh=replace(mesh, color=color, surface=surface))
 
-    def facades_of(self, mesh: Mesh) -> Facades:
+    def facades_of(self, mesh: Mesh) -> FacadeLooks:
         """The facades of the buildings in a mesh."""
         return self.facades.take(np.isin(self.facades.feature, mesh.feature[mesh.klass == Class.BUILDING]))
 
-    def told(self, features: Features) -> Features:
+    def told(self, features: FeatureAttributes) -> FeatureAttributes:
         """The attributes with columns that say what is guessed of each building; null where it is mapped."""
         if "buildings" not in features.layers:
             return features
@@ -142,7 +142,7 @@ def read_looks(scene: Scene) -> Looks:
     storey = np.clip(walls / guesses.storeys, 2.0, 12.0)
     codes = np.column_stack([guesses.windows, guesses.storeys, _steps(storey), _steps(guesses.bay)])
     feature, base = columns["feature"].astype(np.int32), columns["base"].astype(np.float32)
-    facades = Facades(feature, base, codes.astype(np.uint8))
+    facades = FacadeLooks(feature, base, codes.astype(np.uint8))
     walls_guessed, roofs_guessed = (
         columns[name] == "default" for name in ("wall_source", "roof_look_source")
     )

@@ -18,7 +18,7 @@ from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
 from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
-from geoscene.view.contents import Contents, tiles_within
+from geoscene.view.contents import PageContents, tiles_within
 from geoscene.view.lonlat import ACCURACY
 from geoscene.view.streamed import MARK, NAMES, write_streamed
 
@@ -54,7 +54,7 @@ def view_scene(
     elif out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     chosen = tiles_within(scene, options.bounds_deg)
-    contents = Contents(scene, options.layers)
+    contents = PageContents(scene, options.layers)
     if out.suffix:
         head = _write_file(contents, chosen, out=out, max_mb=options.max_mb, progress=progress)
     else:
@@ -72,7 +72,7 @@ def view_scene(
 
 
 def _write_file(
-    contents: Contents, chosen: Ints, *, out: Path, max_mb: float, progress: Progress
+    contents: PageContents, chosen: Ints, *, out: Path, max_mb: float, progress: Progress
 ) -> dict[str, Any]:
     """Write the page as one file; returns its header."""
     chosen = chosen[np.lexsort([chosen[:, 1], chosen[:, 0], _rings(chosen)])]  # from the middle outwards
@@ -97,7 +97,7 @@ def _write_file(
     return head
 
 
-def _write_folder(contents: Contents, chosen: Ints, *, out: Path, progress: Progress) -> dict[str, Any]:
+def _write_folder(contents: PageContents, chosen: Ints, *, out: Path, progress: Progress) -> dict[str, Any]:
     """Write the page as a folder; returns its header."""
     with atomic_folder(out, mark=MARK, names=NAMES) as folder:
         more = write_streamed(contents, chosen, folder=folder, progress=progress)

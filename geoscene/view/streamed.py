@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from geoscene.export.files import compact_json
-from geoscene.geometry.mesh import Instances, concatenate
+from geoscene.geometry.mesh import ShapeInstances, concatenate
 from geoscene.scene.tile_files import Tile
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from geoscene.view.coarse import coarser_mesh, fewer_instances
-from geoscene.view.contents import Contents
+from geoscene.view.contents import PageContents
 
 NAMES = r"index\.html|attributes\.js|nodes/\d+\.js"
 """Paths of the files of a page's folder, a regular expression."""
@@ -38,7 +38,7 @@ _ROOTS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class StreamedPart:
     """A part of the scene in one file.
 
     low, high : (3,) whole metres
@@ -59,8 +59,8 @@ class NodeWriter:
     cells. Nodes of level 0 are tiles, whole; so is any node that a single larger tile fills.
     """
 
-    def __init__(self, folder: Path, contents: Contents, *, tiles: Ints, progress: Progress) -> None:
-        self.nodes: list[Node] = []
+    def __init__(self, folder: Path, contents: PageContents, *, tiles: Ints, progress: Progress) -> None:
+        self.nodes: list[StreamedPart] = []
         self.step = 0.0
         self._folder, self._contents, self._progress = folder / "nodes", contents, progress
         self._tiles, self._corner = tiles, tiles[:, :2].min(axis=0)
@@ -92,7 +92,7 @@ class NodeWriter:
         low = self._corner * self._contents.scene.tile_size + np.array(cell) * side
         size = _CELL * self._contents.scene.tile_size * _FACTOR ** (level - 1)
         mesh = concatenate([tile.mesh.shifted(tile.origin) for _, tile in below])
-        copies = Instances.concatenate([tile.instances.shifted(tile.origin) for _, tile in below])
+        copies = ShapeInstances.concatenate([tile.instances.shifted(tile.origin) for _, tile in below])
         tile = Tile(
             np.zeros(3),
             coarser_mesh(mesh, cell=size, box=(*low, *(low + side))),
@@ -107,12 +107,14 @@ class NodeWriter:
         write_atomically(self._folder / f"{number}.js", text.encode())
         below = [self.nodes[k] for k in children]
         low, high = (np.array([told[name], *(getattr(n, name) for n in below)]) for name in ("low", "high"))
-        self.nodes.append(Node(low.min(axis=0), high.max(axis=0), error, children))
+        self.nodes.append(StreamedPart(low.min(axis=0), high.max(axis=0), error, children))
         self.step = max(self.step, told["step"])
         return number
 
 
-def write_streamed(contents: Contents, tiles: Ints, *, folder: Path, progress: Progress) -> dict[str, Any]:
+def write_streamed(
+    contents: PageContents, tiles: Ints, *, folder: Path, progress: Progress
+) -> dict[str, Any]:
     """Write the nodes and attributes of a page into an empty folder; returns the header's part about them."""
     writer = NodeWriter(folder, contents, tiles=tiles, progress=progress)
     roots = writer.roots()

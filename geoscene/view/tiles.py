@@ -14,7 +14,7 @@ from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints
 from geoscene.view.assembly import gzip
-from geoscene.view.looks import Facades
+from geoscene.view.looks import FacadeLooks
 
 STEP = 1 / 128
 """Quantisation step of vertices in metres; a power of two, so that tiles share one grid and
@@ -69,7 +69,7 @@ def only(tile: Tile, groups: Groups, *, kept: Bools) -> Tile:
     return Tile(tile.origin, tile.mesh.take(faces), copies.take(whole))
 
 
-def pack_tile(tile: Tile, groups: Groups, *, facades: Facades) -> tuple[dict[str, Any], bytes]:
+def pack_tile(tile: Tile, groups: Groups, *, facades: FacadeLooks) -> tuple[dict[str, Any], bytes]:
     """Header of a tile and its bytes, deflated.
 
     Vertex q of the bytes lies at (base + q) * step in scene metres. Faces are in order of group, ``ends`` of

@@ -276,12 +276,12 @@ def sign(
         Directory to write to; without it, the hash chain is added to the dataset itself.
     """
     from lidar.tools.integrity.keys import read_secret, read_signer  # noqa: PLC0415
-    from lidar.tools.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.tools.integrity.watermark import WatermarkKey  # noqa: PLC0415
     from lidar.tools.sign import sign_dataset  # noqa: PLC0415
 
     if out is not None:
         note_new_folder(out)
-    mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
+    mark = None if options.watermark is None else WatermarkKey(read_secret(options.watermark), options.step)
     signer = None if options.chain is None else read_signer(options.chain)
     with progress_bar(quiet=report.quiet) as progress:
         summary = sign_dataset(
@@ -333,10 +333,10 @@ def verify(
         Show no progress bars.
     """
     from lidar.tools.integrity.keys import read_secret, read_signer  # noqa: PLC0415
-    from lidar.tools.integrity.watermark import Watermark  # noqa: PLC0415
+    from lidar.tools.integrity.watermark import WatermarkKey  # noqa: PLC0415
     from lidar.tools.verify import verify_dataset  # noqa: PLC0415
 
-    mark = None if options.watermark is None else Watermark(read_secret(options.watermark), options.step)
+    mark = None if options.watermark is None else WatermarkKey(read_secret(options.watermark), options.step)
     signer = None if options.chain is None else read_signer(options.chain)
     with progress_bar(quiet=quiet) as progress:
         found = verify_dataset(

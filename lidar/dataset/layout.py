@@ -35,7 +35,7 @@ from pyproj import CRS
 from geoscene.errors import reading
 from geoscene.geometry.frames import Frame
 from geoscene.support.files import delete_leftovers, digest, write_json
-from geoscene.support.storage import Stored, cache_folder, url_of
+from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import Format
@@ -160,7 +160,7 @@ class Dataset:
 
     path: Path
     manifest: dict[str, Any]
-    stored: Stored | None = None
+    stored: StoredFolder | None = None
     _fetched: set[Path] = field(default_factory=set, repr=False, compare=False)
 
     @property
@@ -239,7 +239,7 @@ class Dataset:
         """The path of a file of a frame; of a dataset in storage, its folder is fetched first."""
         folder = path.parent
         if self.stored is not None and folder not in self._fetched:
-            Stored(f"{self.stored.url}/{folder.relative_to(self.path).as_posix()}").mirror(folder)
+            StoredFolder(f"{self.stored.url}/{folder.relative_to(self.path).as_posix()}").mirror(folder)
             self._fetched.add(folder)
         return path
 
@@ -254,7 +254,7 @@ def open_dataset(path: str | Path) -> Dataset:
     """
     folder, stored = Path(path), None
     if url := url_of(path):
-        stored, folder = Stored(url), cache_folder() / "datasets" / digest(url.encode())
+        stored, folder = StoredFolder(url), cache_folder() / "datasets" / digest(url.encode())
         stored.read(MANIFEST)
         stored.mirror(folder, depth=_DEPTH_OF_TABLES)
     manifest_path = Paths(folder).manifest

@@ -24,7 +24,7 @@ from lidar.sensors.navigation.nmea import satellites_used
 
 
 @dataclass(frozen=True, slots=True)
-class Heights:
+class FixHeights:
     """What the heights of fixes are above.
 
     vertical   : as in `geoscene.geometry.frames.Frame`
@@ -37,7 +37,7 @@ class Heights:
     geoid: str = ""
 
 
-def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, Heights]:
+def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, FixHeights]:
     """The fixes of a receiver of a dataset, and what their heights are above.
 
     vertical : of the dataset's frame
@@ -69,7 +69,7 @@ def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, Height
         used=used,
         names=names,
     )
-    return fixes, Heights(vertical, value.get("geoid"), found[1] if found else "")
+    return fixes, FixHeights(vertical, value.get("geoid"), found[1] if found else "")
 
 
 _TEXTS = ("timestamp", "h_above", "time_ns", "quality", "satellites")

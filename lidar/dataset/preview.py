@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.drawing.previews import DARK, Plan, around, card
+from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.typing import Float
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds
@@ -30,7 +30,7 @@ def dataset_png(dataset: Dataset) -> bytes:
     """A PNG picture of a drive from above, points coloured by class."""
     trajectory = dataset.trajectory()
     way = trajectory.position[:: max(len(trajectory) // _POSES, 1), :2]
-    plan = Plan(around(way, margin=_MARGIN), DARK)
+    plan = PreviewPlan(around(way, margin=_MARGIN), DARK)
     name = next(iter(dataset.sensors("lidar")), None)
     clouds = None if name is None else labelled_clouds(dataset, name)
     if clouds is not None:

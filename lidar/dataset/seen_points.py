@@ -36,7 +36,7 @@ _CELL = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class Returns(Columns):
+class SceneReturns(Columns):
     """Returns of a scanner in the scene.
 
     place    : (n, 3) scene metres, at their times
@@ -75,7 +75,7 @@ class Sight:
 
 
 @dataclass(frozen=True)
-class View:
+class ImageView:
     """A camera with colour images of a dataset.
 
     images : its stream
@@ -116,7 +116,7 @@ class View:
                 raise ValueError("no depth image of the camera")
         return counts_to_depth(counts.astype(np.uint16))
 
-    def sight(self, returns: Returns, row: int) -> Sight:
+    def sight(self, returns: SceneReturns, row: int) -> Sight:
         """Where an image shows returns, each at the time of the row of pixels that shows it.
 
         A return is hidden if the depth image shows a nearer surface there; without depth images, if another
@@ -183,17 +183,17 @@ def _nearest_of_all(pixel: Float, depth: Float, *, size: tuple[int, int]) -> Boo
     return near
 
 
-def views_of(dataset: Dataset) -> list[View]:
+def views_of(dataset: Dataset) -> list[ImageView]:
     """The cameras of a dataset that have colour images."""
     with reading_file(dataset.paths.manifest):
         rig = rig_of(dataset.manifest["recipe"]["rig"])
     streams = {spec.name: color_images(dataset, spec.name) for spec in rig.cameras}
-    return [View(dataset, spec, s) for spec in rig.cameras if (s := streams[spec.name]) is not None]
+    return [ImageView(dataset, spec, s) for spec in rig.cameras if (s := streams[spec.name]) is not None]
 
 
 def returns_of(
     table: Table, trajectory: Trajectory, *, start_ns: int, mount: Float, motions: Mapping[int, Float]
-) -> Returns:
+) -> SceneReturns:
     """The returns of a recorded cloud in the scene.
 
     start_ns : of the frame
@@ -204,7 +204,7 @@ def returns_of(
     velocity = np.zeros((len(placed), 3))
     for instance, speed in motions.items():
         velocity[table["instance"] == instance] = speed
-    return Returns(placed, time_ns, velocity)
+    return SceneReturns(placed, time_ns, velocity)
 
 
 def motions_of(dataset: Dataset, name: str) -> dict[int, dict[int, Float]]:

@@ -15,7 +15,7 @@ from geoscene.typing import Float
 from lidar.errors import BlockedError
 from lidar.geometry.poses import release
 from lidar.motion.blockwise import mean_gap
-from lidar.motion.steering import Pose, Track
+from lidar.motion.steering import Pose, SteeredTrack
 from lidar.motion.vehicle import Vehicle
 
 ASIDE = 4.0
@@ -26,7 +26,7 @@ _SWEEP = 0.5  # metres between the poses that are checked for collisions
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class PathParameters:
     """Parameters of path planning.
 
     tree   : obstacles, polygons in scene metres
@@ -44,7 +44,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class Line(Columns):
+class RouteLine(Columns):
     """The line of a route, resampled evenly.
 
     xyz   : (n, 3) scene metres
@@ -83,7 +83,7 @@ def body_outlines(
 
 
 def touching(
-    track: Track, line: Line, *, setting: Setting
+    track: SteeredTrack, line: RouteLine, *, setting: PathParameters
 ) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
     """Rows of a track where the body intersects obstacles, its outlines there, and these obstacles."""
     every = max(round(_SWEEP / track.step), 1)
@@ -104,7 +104,9 @@ def touching(
     return at, outlines, obstacles
 
 
-def pushes(track: Track, line: Line, *, setting: Setting) -> tuple[Float, NDArray[np.int64]]:
+def pushes(
+    track: SteeredTrack, line: RouteLine, *, setting: PathParameters
+) -> tuple[Float, NDArray[np.int64]]:
     """Lateral shifts (k,) in metres, positive to the left, and the rows (k,) of the line that need them.
 
     NaN where no shift within `ASIDE` frees the body.
@@ -148,7 +150,7 @@ def _way_out(low: Float, high: Float, *, half: float) -> float:
     return float(ways[free][np.argmin(np.abs(ways[free]))]) if free.any() else np.nan
 
 
-def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
+def turns_at(line: RouteLine, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
     """Turns (edge, edge) to avoid so that rows of a line are not passed; an edge twice if no turn is near."""
     near = math.ceil(_NEAR / line.gap)
     change = np.flatnonzero(line.edge[1:] != line.edge[:-1]) + 1
@@ -160,7 +162,7 @@ def turns_at(line: Line, rows: NDArray[np.int64]) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def turning_manoeuvre(pose: Pose, line: Line, *, setting: Setting) -> list[Track]:
+def turning_manoeuvre(pose: Pose, line: RouteLine, *, setting: PathParameters) -> list[SteeredTrack]:
     """A U-turn in 3, 5, 7 or 9 arcs, alternately forwards and backwards.
 
     Raises BlockedError if the body touches an obstacle with any number of arcs.
@@ -170,7 +172,7 @@ def turning_manoeuvre(pose: Pose, line: Line, *, setting: Setting) -> list[Track
     hand = 1.0 if setting.side == "right" else -1.0
     here = len(line.edge) - 1
     for arcs in (3, 5, 7, 9):
-        tracks: list[Track] = []
+        tracks: list[SteeredTrack] = []
         x, y, th = pose
         for k in range(arcs):
             gear = 1 if k % 2 == 0 else -1
@@ -181,7 +183,7 @@ def turning_manoeuvre(pose: Pose, line: Line, *, setting: Setting) -> list[Track
             cx, cy = x - r * math.sin(th), y + r * math.cos(th)
             xy = np.stack([cx + r * np.sin(heading), cy - r * np.cos(heading)], axis=1)
             span = math.pi / arcs * radius / (n - 1)
-            tracks.append(Track(xy, heading, np.full(n, hand / radius), np.full(n, here), gear, span))
+            tracks.append(SteeredTrack(xy, heading, np.full(n, hand / radius), np.full(n, here), gear, span))
             x, y, th = tracks[-1].end
         if not any(len(touching(t, line, setting=setting)[0]) for t in tracks):
             return tracks

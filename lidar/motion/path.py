@@ -26,9 +26,9 @@ from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
 from lidar.geometry.poses import blocks_of, release, room
 from lidar.motion.blockwise import extended, fill, headings, joined, rowwise, smoothed, sums
-from lidar.motion.clearance import ASIDE, Line, Setting, pushes, turning_manoeuvre, turns_at
+from lidar.motion.clearance import ASIDE, PathParameters, RouteLine, pushes, turning_manoeuvre, turns_at
 from lidar.motion.route import Route
-from lidar.motion.steering import Pose, Track, follow, relaxed
+from lidar.motion.steering import Pose, SteeredTrack, follow, relaxed
 from lidar.motion.vehicle import Vehicle
 
 Ground = Callable[[Float, Float], Float]
@@ -119,11 +119,11 @@ def plan_path(
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
     # aircraft have no lane, and larger turning radii
     step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
-    setting = Setting(vehicle, frame, obstacles, margin, step, route.side)
+    setting = PathParameters(vehicle, frame, obstacles, margin, step, route.side)
     line = _resampled(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
     cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
-    legs: list[Track] = []
-    lines: list[Line] = []
+    legs: list[SteeredTrack] = []
+    lines: list[RouteLine] = []
     pose: Pose | None = None
     for first, last in itertools.pairwise(cuts):
         part = line.take(slice(first, last))
@@ -139,7 +139,7 @@ def plan_path(
     return _joined(legs, lines, setting=setting, ground=ground)
 
 
-def _resampled(route: Route, spacing: float) -> Line:
+def _resampled(route: Route, spacing: float) -> RouteLine:
     """The route's line with points about ``spacing`` apart; its turning points stay points."""
     stretches = []
     ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
@@ -153,7 +153,7 @@ def _resampled(route: Route, spacing: float) -> Line:
         count = max(math.ceil(s[-1] / spacing), 4) + 1
         stretches.append((xyz, s, np.arange(first, last)[keep], count))
 
-    def parts() -> Iterator[Line]:
+    def parts() -> Iterator[RouteLine]:
         for xyz, s, point, count in stretches:
             for rows in blocks_of(count):
                 at = np.arange(rows.start, rows.stop) * (s[-1] / (count - 1))
@@ -163,18 +163,18 @@ def _resampled(route: Route, spacing: float) -> Line:
                     turn[-1] = point[-1] < len(route.line) - 1
                 index = point[np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
                 new = polylines.points_at(xyz, at, along=s)
-                yield Line(new, route.edge[index], route.limit[index], route.free[index], turn)
+                yield RouteLine(new, route.edge[index], route.limit[index], route.free[index], turn)
 
     return joined(sum(count for *_, count in stretches), parts())
 
 
-def _shortened(line: Line, vehicle: Vehicle) -> Line:
+def _shortened(line: RouteLine, vehicle: Vehicle) -> RouteLine:
     """The line without its last metres, so that the front of the body stops at its end."""
     spare = min(round(vehicle.front / line.gap), len(line.edge) - 5)
     return line.take(slice(0, len(line.edge) - max(spare, 0)))
 
 
-def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
+def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None) -> SteeredTrack:
     """A leg along the line on which the body touches no obstacle, from a pose if one is given.
 
     Raises BlockedError if the line cannot be pushed clear, or bends too tightly.
@@ -227,7 +227,7 @@ def _clear_track(line: Line, setting: Setting, *, pose: Pose | None) -> Track:
     )
 
 
-def _departure(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
+def _departure(track: SteeredTrack, line: RouteLine, *, xy: Float, vehicle: Vehicle) -> NDArray[np.int64]:
     """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
     if track.row[-1] < len(line.edge) - 1:
         return track.row[-1:]
@@ -246,7 +246,9 @@ def _departure(track: Track, line: Line, *, xy: Float, vehicle: Vehicle) -> NDAr
     return track.row[-1:] if off[-1] > _FINISH else track.row[:0]
 
 
-def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None) -> Path:
+def _joined(
+    legs: list[SteeredTrack], lines: list[RouteLine], *, setting: PathParameters, ground: Surface | None
+) -> Path:
     """One path of all legs, with heights."""
     whole = joined(sum(len(leg.row) for leg in legs), _leg_paths(legs, lines, setting=setting, ground=ground))
     # headings of consecutive legs may differ by whole turns
@@ -255,7 +257,7 @@ def _joined(legs: list[Track], lines: list[Line], *, setting: Setting, ground: S
 
 
 def _leg_paths(
-    legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None
+    legs: list[SteeredTrack], lines: list[RouteLine], *, setting: PathParameters, ground: Surface | None
 ) -> Iterator[Path]:
     """The paths of legs, one after another."""
     start = 0.0
@@ -293,7 +295,7 @@ def _whole_turns(heading: Float) -> Float:
     return turns
 
 
-def _from_line(leg: Track, line: Line) -> Float:
+def _from_line(leg: SteeredTrack, line: RouteLine) -> Float:
     """Scene metres (n, 2) by which a track's rows are ahead of their rows of the line, and to its left."""
     heading = headings(line.xyz)
 
@@ -306,7 +308,7 @@ def _from_line(leg: Track, line: Line) -> Float:
 
 
 def _heights(
-    legs: list[Track], lines: list[Line], *, setting: Setting, ground: Surface | None
+    legs: list[SteeredTrack], lines: list[RouteLine], *, setting: PathParameters, ground: Surface | None
 ) -> Iterator[tuple[Float, Float, Float, Float]]:
     """Height of the rear axle, slope of its path, pitch and bank of the body on its wheels, of each leg.
 
@@ -358,7 +360,7 @@ def _heights(
 
 
 def _raw_heights(
-    leg: Track, line: Line, *, setting: Setting, ground: Surface | None
+    leg: SteeredTrack, line: RouteLine, *, setting: PathParameters, ground: Surface | None
 ) -> tuple[Float, Float, Float]:
     """Height, rise per metre ahead to the front axle and to the left, at the rows of a leg (n,).
 
@@ -411,7 +413,7 @@ def _runs(xy: Float) -> Iterator[slice]:
 
 
 def _on_wheels(
-    xy: Float, heading: Float, *, z: Float, rise: Float, setting: Setting, ground: Surface
+    xy: Float, heading: Float, *, z: Float, rise: Float, setting: PathParameters, ground: Surface
 ) -> tuple[Float, Float, Float]:
     """Height of the rear axle, and rise to the front axle and to the left, of a body on the ground.
 
@@ -431,7 +433,7 @@ def _on_wheels(
 
 
 def _axle(
-    xy: Float, heading: Float, *, z: Float, ahead: Float | float, setting: Setting, ground: Surface
+    xy: Float, heading: Float, *, z: Float, ahead: Float | float, setting: PathParameters, ground: Surface
 ) -> tuple[Float, Float]:
     """Mean height of the ground under the wheels of an axle, and its rise to the left, near heights (n,).
 

@@ -24,7 +24,7 @@ _FOLLOWED = 1 << 14  # rows of a track up to which it is in memory
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class SteeredTrack:
     """Poses of a vehicle that follows a line, in plan.
 
     xy        : (n, 2) scene metres, the rear axle
@@ -106,7 +106,9 @@ def _smoothed(xy: Float, weight: Float, *, stiffness: float) -> Float:
     return out
 
 
-def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None = None) -> Track:
+def follow(
+    xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None = None
+) -> SteeredTrack:
     """The track of a vehicle that follows a line (m, 2) from its start, or from a pose, to its end.
 
     The controller adds feedback of lateral and heading error to the line's curvature. The curvature of the
@@ -119,7 +121,7 @@ def follow(xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose
     """
     rows = gathered(_followed(xy, vehicle, scale=scale, step=step, pose=pose))
     row = rowwise(lambda part: part[:, 4].astype(np.int64), rows)
-    return Track(rows[:, :2], rows[:, 2], rows[:, 3], row, 1, step)
+    return SteeredTrack(rows[:, :2], rows[:, 2], rows[:, 3], row, 1, step)
 
 
 def _followed(

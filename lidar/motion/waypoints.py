@@ -36,7 +36,7 @@ _CANDIDATES = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class RecordedTrack:
     """Points read from a file.
 
     lat_lon : (latitude, longitude) in degrees, in order
@@ -49,7 +49,7 @@ class Track:
     dense: bool
 
 
-def read_track(path: Path, frame: Frame) -> Track:
+def read_track(path: Path, frame: Frame) -> RecordedTrack:
     """The points of a GPX or GeoJSON file; see `geoscene.sources.tracks.read_track`, whose errors it raises.
 
     Raises RouteError for a missing file and for one with fewer than two points.
@@ -66,7 +66,7 @@ def read_track(path: Path, frame: Frame) -> Track:
     xyz = np.column_stack([x, y, h])
     gaps = np.hypot(*np.diff(xyz[:, :2], axis=0).T)
     dense = len(points) > 2 and float(np.median(gaps)) <= DENSE_M
-    return Track(list(zip(lat.tolist(), lon.tolist(), strict=True)), xyz, dense)
+    return RecordedTrack(list(zip(lat.tolist(), lon.tolist(), strict=True)), xyz, dense)
 
 
 # ------------------------------------------------------------------------------------------- waypoints
@@ -127,7 +127,7 @@ def _both_sides(graph: RoadGraph, edge: int, *, offset: float) -> list[Place]:
 
 def match_track(
     graph: RoadGraph,
-    track: Track,
+    track: RecordedTrack,
     *,
     frame: Frame,
     tolerance: float,

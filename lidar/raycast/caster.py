@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
-from lidar.raycast.columns import Rays
+from lidar.raycast.columns import RayColumns
 from lidar.raycast.device import CPU
 from lidar.raycast.device import device as warp_device
 from lidar.raycast.embree import EmbreeScene
-from lidar.raycast.geometry import ALL, Geometry, Instances, checked, middle, split
+from lidar.raycast.geometry import ALL, Geometry, MeshInstances, checked, middle, split
 from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
 from lidar.raycast.rays import EXACTLY, beyond, free_rays, limited, posed_rays, taken
@@ -91,7 +91,7 @@ class Caster:
         faces: ArrayLike = (),
         *,
         mask: ArrayLike | None = None,
-        instances: Sequence[Instances] = (),
+        instances: Sequence[MeshInstances] = (),
         origin: ArrayLike | None = None,
         dynamic: bool = False,
         backend: str = "auto",
@@ -100,7 +100,7 @@ class Caster:
         v, f = checked(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
         self.scene = _scene(self.origin, backend=backend, device=device, dynamic=dynamic)
-        self.instances: tuple[Instances, ...] = ()
+        self.instances: tuple[MeshInstances, ...] = ()
         self.update(attach=dict(enumerate(split(v - self.origin, f, mask=mask))), instances=instances)
 
     def update(
@@ -109,7 +109,7 @@ class Caster:
         detach: Iterable[int] = (),
         attach: Mapping[int, Geometry] = _NOTHING,
         first: Mapping[int, int] = _NUMBERS,
-        instances: Sequence[Instances] | None = None,
+        instances: Sequence[MeshInstances] | None = None,
     ) -> None:
         """Exchange parts of the mesh in place; unchanged parts keep their acceleration structures.
 
@@ -257,7 +257,9 @@ class Caster:
         rays = limited(rays, near=near, far=far, mask=mask, time=time, retrace=retrace)
         return self._any_hit(rays, on, threads=threads)
 
-    def _first_hits(self, rays: Rays, on: NDArray[np.int32] | None, *, normals: bool, threads: int) -> Hits:
+    def _first_hits(
+        self, rays: RayColumns, on: NDArray[np.int32] | None, *, normals: bool, threads: int
+    ) -> Hits:
         """The first hits of checked rays."""
         if on is None or not self.refiners:
             hits = self.scene.cast(rays, normals=normals, threads=threads)
@@ -273,7 +275,7 @@ class Caster:
                     column[row] = new
         return hits
 
-    def _any_hit(self, rays: Rays, on: NDArray[np.int32] | None, *, threads: int) -> NDArray[np.bool_]:
+    def _any_hit(self, rays: RayColumns, on: NDArray[np.int32] | None, *, threads: int) -> NDArray[np.bool_]:
         """Whether checked rays hit anything."""
         if on is not None and self.refiners:
             hits, at = self._left(rays, on, normals=False)
@@ -290,7 +292,7 @@ class Caster:
             blocked[row] = self._first_hits(part, None, normals=False, threads=threads).face >= 0
         return blocked
 
-    def _left(self, rays: Rays, on: NDArray[np.int32], *, normals: bool) -> tuple[Hits, Float]:
+    def _left(self, rays: RayColumns, on: NDArray[np.int32], *, normals: bool) -> tuple[Hits, Float]:
         """Hits of rays on the surface in which they start, and the ray parameter at which others leave it."""
         n = len(rays.directions)
         if on.shape != (n,):
@@ -303,7 +305,7 @@ class Caster:
         return hits, at
 
 
-def _parts(rays: Rays, at: Float) -> Iterator[tuple[NDArray[np.intp], Rays]]:
+def _parts(rays: RayColumns, at: Float) -> Iterator[tuple[NDArray[np.intp], RayColumns]]:
     """Rays that start in front of all planes, and those that cross one from behind, from there on."""
     for row in (np.flatnonzero(at == 0.0), np.flatnonzero((at > 0.0) & (at < np.inf))):
         if len(row):

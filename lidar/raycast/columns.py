@@ -16,7 +16,7 @@ COPIES = 256
 numbers up to the highest."""
 
 PRECISIONS = ("exact", "refined", "float32")
-"""Precisions of ranges, see `lidar.raycast.Caster.cast`; `Rays.precision` is the index of one."""
+"""Precisions of ranges, see `lidar.raycast.Caster.cast`; `RayColumns.precision` is the index of one."""
 
 EXACT, REFINED, FLOAT32 = range(len(PRECISIONS))
 """Indices of `PRECISIONS`."""
@@ -25,7 +25,7 @@ CHUNK = 2048
 """Threads share rays in multiples of this number, which is one of all packet widths: packets never change."""
 
 
-class Target(NamedTuple):
+class RayTarget(NamedTuple):
     """The target of rays.
 
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
@@ -67,7 +67,7 @@ class Target(NamedTuple):
 class Packed(NamedTuple):
     """A target as kernels are given it: numba takes a microsecond for each array.
 
-    lanes : as of `Target`
+    lanes : as of `RayTarget`
     words : int64, its other numbers, and addresses and lengths of its columns
     """
 
@@ -75,7 +75,7 @@ class Packed(NamedTuple):
     words: NDArray[np.int64]
 
 
-def packed(target: Target) -> Packed:
+def packed(target: RayTarget) -> Packed:
     """A target for kernels, of which the caller keeps the columns."""
     columns = target[4:]
     words = [target.scene, target.packet, target.single]
@@ -88,7 +88,7 @@ def packed(target: Target) -> Packed:
 def unpacked(given: Packed) -> Any:
     """The target of `packed`."""
     w = given.words
-    return Target(
+    return RayTarget(
         w[0],
         w[1],
         w[2],
@@ -108,7 +108,7 @@ def unpacked(given: Packed) -> Any:
     )
 
 
-class Rays(NamedTuple):
+class RayColumns(NamedTuple):
     """Rays as contiguous columns.
 
     directions : (n, 3) float64, in the axes of the pose if ``pose`` is not empty

@@ -37,7 +37,7 @@ def check_device(name: str) -> None:
 
 
 @functools.cache
-def device(name: str) -> Device:
+def device(name: str) -> WarpDevice:
     """The device of a name other than ``cpu``; one object in a process.
 
     Raises InputError if there is none, MissingExtraError if Warp is not installed.
@@ -50,12 +50,12 @@ def device(name: str) -> Device:
     wp.config.log_level = wp.LOG_ERROR
     wp.init()
     if name == WARP_CPU:
-        return Device(wp.get_device("cpu"))
+        return WarpDevice(wp.get_device("cpu"))
     number, count = int(name.partition(":")[2] or 0), wp.get_cuda_device_count()
     if number >= count:
         there = f"devices 0 to {count - 1} are there" if count else "no CUDA device is there"
         raise InputError(f"`device` {name}: {there}; leave the option out to use the CPU")
-    return Device(wp.get_device(f"cuda:{number}"))
+    return WarpDevice(wp.get_device(f"cuda:{number}"))
 
 
 def _has_driver() -> bool:
@@ -67,7 +67,7 @@ def _has_driver() -> bool:
     return True
 
 
-class Device:
+class WarpDevice:
     """A device of Warp.
 
     lock : held while kernels are launched; threads take turns on a device

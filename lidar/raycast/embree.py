@@ -14,8 +14,8 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
 from lidar.raycast import library as rtc
-from lidar.raycast.columns import COPIES, Rays, packed
-from lidar.raycast.geometry import Geometry, Instances
+from lidar.raycast.columns import COPIES, RayColumns, packed
+from lidar.raycast.geometry import Geometry, MeshInstances
 from lidar.raycast.rays import share
 from lidar.raycast.scene import Float64Scene
 
@@ -78,7 +78,7 @@ class EmbreeScene(Float64Scene):
             self._lib.call("rtcDetachGeometry", self.address, COPIES + number)
         super().detach(number)
 
-    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[Self]]) -> int:
+    def place(self, groups: Sequence[MeshInstances], scenes: Sequence[Sequence[Self]]) -> int:
         """Replace all instances; ``scenes`` holds each group's shapes. Returns how many leading groups stay.
 
         Raises InputError for more than `COPIES` masks.
@@ -138,7 +138,7 @@ class EmbreeScene(Float64Scene):
         )
         self.packed = packed(self.target)
 
-    def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
+    def occluded(self, rays: RayColumns, *, threads: int) -> NDArray[np.bool_]:
         """Whether each ray hits anything."""
         out, target = np.empty(len(rays.directions), np.bool_), self.packed
         share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar.raycast.columns import Target
+from lidar.raycast.columns import RayTarget
 from lidar.raycast.lanes import GRAZING, START
 from lidar.raycast.memory import called, float32_at, float64_at, inlined, int32_at, int64_at, vector
 from lidar.raycast.planes import PLANE, beside, transform_of
@@ -68,7 +68,7 @@ def _next_leaf(nodes: int, slopes: Any, near: float, far: float, stack: Any, bot
 
 
 @called
-def _within(target: Target, instance: int, ray: Any, time: float) -> Any:
+def _within(target: RayTarget, instance: int, ray: Any, time: float) -> Any:
     """A ray in the frame of an instance."""
     ox, oy, oz, dx, dy, dz = ray
     a, b, c, x, e, f, g, y, h, i, j, z = transform_of(target, instance, time)
@@ -149,7 +149,9 @@ def _first_of_part(part: int, ray: Any, slopes: Any, near: float, far: float, st
 
 
 @called
-def first_hit(target: Target, near: float, far: float, mask: int, ray: Any, time: float, stack: Any) -> Any:
+def first_hit(
+    target: RayTarget, near: float, far: float, mask: int, ray: Any, time: float, stack: Any
+) -> Any:
     """The first face that a ray hits: row of ``parts``, number in it, instance; row -1 for a miss.
 
     stack : (`STACK`,) int64, overwritten

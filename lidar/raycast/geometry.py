@@ -143,7 +143,7 @@ def _tree(vertices: Float, faces: NDArray[np.int32]) -> Tree:
 
 
 @dataclass(frozen=True, slots=True)
-class Instances(Columns):
+class MeshInstances(Columns):
     """Instances of other casters' meshes, static or moving.
 
     shapes    : the instanced casters (without instances of their own)

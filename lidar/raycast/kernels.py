@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, Rays, Target, unpacked
+from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, RayColumns, RayTarget, unpacked
 from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.hull import LONG, REACH, ROUNDING
 from lidar.raycast.lanes import (
@@ -88,7 +88,7 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
 
 
 @inlined
-def _identify(target: Target, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
+def _identify(target: RayTarget, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
     """Write planes, faces and instances of the lanes' hits; what it writes for a miss means nothing."""
     for k in range(W):
         work[SCALE * W + k] = work[INVERSE * W + k]
@@ -173,7 +173,7 @@ def _miss(i: int, columns: Any) -> None:
 
 @called
 def _keep(
-    target: Target,
+    target: RayTarget,
     row: int,
     prim: int,
     instance: int,
@@ -196,7 +196,16 @@ def _keep(
 
 @inlined
 def _decide(
-    target: Target, rays: Rays, k: int, W: int, work: Any, ids: Any, f: Any, u: Any, stack: Any, columns: Any
+    target: RayTarget,
+    rays: RayColumns,
+    k: int,
+    W: int,
+    work: Any,
+    ids: Any,
+    f: Any,
+    u: Any,
+    stack: Any,
+    columns: Any,
 ) -> bool:
     """Decide in float64 what lane k hits, where in doubt; write a miss. Whether it is a hit."""
     t, cosine, far = work[RANGE * W + k], work[COSINE * W + k], work[FAR * W + k]
@@ -227,8 +236,8 @@ def _decide(
 
 @inlined
 def _again(
-    target: Target,
-    rays: Rays,
+    target: RayTarget,
+    rays: RayColumns,
     m: int,
     work: Any,
     ids: Any,
@@ -259,7 +268,7 @@ def _again(
 @njit(nogil=True, cache=True, error_model="numpy")
 def cast(
     given: Packed,
-    rays: Rays,
+    rays: RayColumns,
     lo: int,
     hi: int,
     ranges: Float,
@@ -358,7 +367,7 @@ def cast(
 @njit(nogil=True, cache=True, error_model="numpy")
 def cast_float64(
     given: Packed,
-    rays: Rays,
+    rays: RayColumns,
     lo: int,
     hi: int,
     ranges: Float,
@@ -382,7 +391,7 @@ def cast_float64(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def occluded(given: Packed, rays: Rays, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
+def occluded(given: Packed, rays: RayColumns, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
     """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
     target = unpacked(given)
     W = len(target.lanes)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar.raycast.columns import Rays, Target
+from lidar.raycast.columns import RayColumns, RayTarget
 from lidar.raycast.lanes import HUGE, fill, settle, shift, shorten, spread, turn
 from lidar.raycast.memory import (
     float32_at,
@@ -48,7 +48,9 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
 
 
 @inlined
-def gather(target: Target, rays: Rays, at: int, m: int, lanes: Any, ids: Any, work: Any, f: Any) -> bool:
+def gather(
+    target: RayTarget, rays: RayColumns, at: int, m: int, lanes: Any, ids: Any, work: Any, f: Any
+) -> bool:
     """Load rays ``at`` to ``at + m`` of the order; spare lanes repeat the last. Whether all are valid.
 
     Embree's packet ``f`` gets unit directions and far rounded up.
@@ -109,7 +111,7 @@ def alike(W: int, work: Any) -> bool:
 
 
 @inlined
-def trace(target: Target, W: int, rows: int, f: Any, valid: Any, together: bool, one: Any) -> None:  # noqa: FBT001
+def trace(target: RayTarget, W: int, rows: int, f: Any, valid: Any, together: bool, one: Any) -> None:  # noqa: FBT001
     """Trace the valid lanes of a packet, all at once or one by one."""
     if together and W > 1:
         v, p = valid.ctypes.data, f.ctypes.data

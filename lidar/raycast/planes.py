@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar.raycast.columns import COPIES, Target
+from lidar.raycast.columns import COPIES, RayTarget
 from lidar.raycast.lanes import GRAZING
 from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
 from lidar.raycast.rows import CORNERS, DX, DY, DZ, NUMBERS, OX, OY, OZ, PART, START_NUMBER, VERTICES
@@ -20,7 +20,7 @@ INVALID = np.uint32(0xFFFFFFFF)
 
 
 @inlined
-def transform_of(target: Target, instance: int, time: float) -> Any:
+def transform_of(target: RayTarget, instance: int, time: float) -> Any:
     """The transform of an instance at a ray time: twelve numbers, row by row."""
     M = target.transforms.ctypes.data + 96 * target.first[instance]
     steps = target.steps[instance]
@@ -48,7 +48,7 @@ def transform_of(target: Target, instance: int, time: float) -> Any:
 
 
 @inlined
-def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
+def placed(target: RayTarget, geom: Any, inst: Any, place: Any) -> Any:
     """Row of ``parts`` and instance for Embree's geometry, instance geometry and index within it."""
     if inst == INVALID:
         return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
@@ -57,7 +57,7 @@ def placed(target: Target, geom: Any, inst: Any, place: Any) -> Any:
 
 
 @inlined
-def numbered(target: Target, row: int, prim: int) -> Any:
+def numbered(target: RayTarget, row: int, prim: int) -> Any:
     """The number of a face."""
     part = target.parts.ctypes.data + 8 * PART * row
     numbers = int64_at(part, NUMBERS)
@@ -65,7 +65,7 @@ def numbered(target: Target, row: int, prim: int) -> Any:
 
 
 @inlined
-def plane_of(target: Target, row: int, prim: int, instance: int, time: float) -> Any:
+def plane_of(target: RayTarget, row: int, prim: int, instance: int, time: float) -> Any:
     """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
     plane = int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim
     nx, ny, nz, d = float64_at(plane, 0), float64_at(plane, 1), float64_at(plane, 2), float64_at(plane, 3)
@@ -86,7 +86,7 @@ def plane_of(target: Target, row: int, prim: int, instance: int, time: float) ->
 
 
 @inlined
-def _corner(target: Target, row: int, corner: int, instance: int, time: float) -> Any:
+def _corner(target: RayTarget, row: int, corner: int, instance: int, time: float) -> Any:
     """A corner of a face in the caster's axes; corners of face f are 3 f to 3 f + 2."""
     x, y, z = vector(target.parts[row, VERTICES], np.int64(int32_at(target.parts[row, CORNERS], corner)))
     if instance >= 0:
@@ -100,7 +100,7 @@ def _corner(target: Target, row: int, corner: int, instance: int, time: float) -
 
 
 @called
-def _extent(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
+def _extent(target: RayTarget, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
     """Least and greatest ray parameter of a face's corners, measured along the ray."""
     ox, oy, oz, dx, dy, dz = ray
     low, high = np.inf, -np.inf
@@ -135,7 +135,7 @@ def beside(ray: Any, a: Any, b: Any, c: Any) -> float:
 
 
 @called
-def outside(target: Target, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
+def outside(target: RayTarget, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
     """Metres by which a ray passes outside a face, as in `beside`."""
     ox, oy, oz, _, _, _ = ray
     ax, ay, az = _corner(target, row, 3 * prim, instance, time)
@@ -162,7 +162,7 @@ def ray_of(W: int, k: int, work: Any) -> Any:
 
 @called
 def intersection(
-    target: Target, row: int, prim: int, instance: int, ray: Any, inverse: float, time: float
+    target: RayTarget, row: int, prim: int, instance: int, ray: Any, inverse: float, time: float
 ) -> Any:
     """Range, cosine and normal (not unit), in float64, where a ray intersects the plane of a face."""
     ox, oy, oz, dx, dy, dz = ray

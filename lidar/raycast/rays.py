@@ -16,7 +16,7 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
-from lidar.raycast.columns import CHUNK, EXACT, PRECISIONS, Rays
+from lidar.raycast.columns import CHUNK, EXACT, PRECISIONS, RayColumns
 from lidar.raycast.geometry import ALL
 
 EXACTLY = (0.0, 0.0)
@@ -37,7 +37,7 @@ def _rows(values: ArrayLike, name: str) -> Float:
     return rows
 
 
-def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
+def free_rays(origins: ArrayLike, directions: ArrayLike) -> RayColumns:
     """Rays in the caster's frame from origins (n, 3) or (3,) and directions (n, 3)."""
     d = _rows(directions, "directions")
     o = np.ascontiguousarray(origins, np.float64)
@@ -49,7 +49,7 @@ def free_rays(origins: ArrayLike, directions: ArrayLike) -> Rays:
 
 def posed_rays(
     poses: Poses, pose_index: NDArray[np.integer], *, directions: ArrayLike, offsets: ArrayLike | None
-) -> Rays:
+) -> RayColumns:
     """Rays in the frames of poses; see `lidar.raycast.Caster.cast_posed`."""
     d = _rows(directions, "directions")
     o = _NO_OFFSETS if offsets is None else _rows(offsets, "offsets")
@@ -62,8 +62,8 @@ def posed_rays(
     return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), np.ascontiguousarray(matrix))
 
 
-def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> Rays:
-    return Rays(
+def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> RayColumns:
+    return RayColumns(
         d, o, pose, position, matrix, _NONE, _NO_TIMES, 0.0, _ENDLESS, ALL, EXACT, True, EXACTLY, False
     )
 
@@ -98,7 +98,7 @@ def _permutes(order: Any, named: Any) -> Any:
 
 
 def limited(
-    rays: Rays,
+    rays: RayColumns,
     *,
     near: float,
     far: float | Float,
@@ -109,7 +109,7 @@ def limited(
     retrace: bool = True,
     footprint: tuple[float, float] = EXACTLY,
     scattered: bool = False,
-) -> Rays:
+) -> RayColumns:
     """The rays with bounds, mask, times, order of work, precision and footprint.
 
     Raises InputError unless 0 <= near <= far, times lie within 0 to 1, the order is a permutation, the
@@ -137,7 +137,7 @@ def limited(
         if not (work.ndim == 1 and _permutes(work, np.zeros(n, np.bool_))):
             raise InputError(f"order is not a permutation of {n} rays")
     # A microsecond, where `_replace` takes six.
-    return Rays(
+    return RayColumns(
         rays.directions,
         rays.offsets,
         rays.pose,
@@ -155,7 +155,7 @@ def limited(
     )
 
 
-def in_scene(rays: Rays) -> tuple[Float, Float]:
+def in_scene(rays: RayColumns) -> tuple[Float, Float]:
     """Origins and directions (n, 3) in the caster's frame.
 
     Raises InputError for an invalid ray, as the kernels do.
@@ -175,7 +175,7 @@ def in_scene(rays: Rays) -> tuple[Float, Float]:
     return o, d
 
 
-def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
+def taken(rays: RayColumns, row: NDArray[np.int64]) -> RayColumns:
     """Selected rays, without an order."""
     return rays._replace(
         directions=_rows(rays.directions.take(row, axis=0), "directions"),
@@ -187,7 +187,7 @@ def taken(rays: Rays, row: NDArray[np.int64]) -> Rays:
     )
 
 
-def beyond(rays: Rays, at: Float) -> Rays:
+def beyond(rays: RayColumns, at: Float) -> RayColumns:
     """The rest of rays from the ray parameters (n,) on; it is exact, as the rays start on a face."""
     if rays.pose.size:
         origin, direction = in_scene(rays)
@@ -215,7 +215,7 @@ def _advance(start: Any, direction: Any, at: Any, out: Any) -> None:
             out[i, k] = start[o, k] + at[i] * direction[i, k]
 
 
-def _refusal(rays: Rays, bad: int) -> InputError:
+def _refusal(rays: RayColumns, bad: int) -> InputError:
     where = f" at the pose {rays.position[rays.pose[bad]].tolist()}" if rays.pose.size else ""
     if len(rays.offsets):
         where = f" from {rays.offsets[bad if len(rays.offsets) > 1 else 0].tolist()}" + where
@@ -247,7 +247,7 @@ def _parts(n: int, threads: int) -> list[tuple[int, int]]:
     return list(pairwise(bounds))
 
 
-def share(work: Callable[[int, int], int], rays: Rays, *, threads: int) -> None:
+def share(work: Callable[[int, int], int], rays: RayColumns, *, threads: int) -> None:
     """Call ``work`` for parts of the order of rays in threads; it returns an invalid ray, or -1.
 
     Raises InputError for an invalid ray.

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.raycast.columns import Rays
+from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
 
 
@@ -21,14 +21,14 @@ class Refiner(Protocol):
     whatever else lies behind the plane.
     """
 
-    def refine(self, rays: Rays, hits: Hits, *, threads: int) -> None:
+    def refine(self, rays: RayColumns, hits: Hits, *, threads: int) -> None:
         """Change the hits in place: range, face, cosine and, unless it is empty, the normal.
 
         A hit beyond the ray's ``far`` becomes a miss.
         """
         ...
 
-    def leave(self, rays: Rays, on: NDArray[np.int32], hits: Hits) -> Float:
+    def leave(self, rays: RayColumns, on: NDArray[np.int32], hits: Hits) -> Float:
         """Follow rays that start between the surface and the plane of a face.
 
         on : (n,) the face, as in ``hits.face`` after `refine`; -1 for none

@@ -21,7 +21,7 @@ PACKET_RAY_ROWS, PACKET_ROWS = 12, 21
 """Number of rows of RTCRayN and of RTCRayHitN."""
 
 PLANES, VERTICES, CORNERS, NUMBERS, START_NUMBER, NODES, ORDER, COUNT, MASK = range(9)
-"""Columns of `lidar.raycast.columns.Target.parts`: addresses of a geometry's planes, vertices, faces, face
+"""Columns of `lidar.raycast.columns.RayTarget.parts`: addresses of a geometry's planes, vertices, faces, face
 numbers (0: consecutive), nodes and order of its tree; its first number, number of faces and mask."""
 PART = 9
 """Number of columns of a part."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast import kernels
-from lidar.raycast.columns import Packed, Rays, Target, packed
-from lidar.raycast.geometry import ALL, Geometry, Instances
+from lidar.raycast.columns import Packed, RayColumns, RayTarget, packed
+from lidar.raycast.geometry import ALL, Geometry, MeshInstances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share
 from lidar.raycast.rows import PART
@@ -26,7 +26,7 @@ class Group(NamedTuple):
     tree   : of the instances' boxes, at all of their times
     """
 
-    copies: Instances
+    copies: MeshInstances
     shapes: Sequence[Float64Scene]
     placed: Float
     tree: Tree
@@ -52,7 +52,7 @@ class Float64Scene:
         self.origin = origin
         self.parts: dict[int, Geometry] = {}
         self.groups: list[Group] = []
-        self.target: Target
+        self.target: RayTarget
         self.packed: Packed
         self._own: tuple[list[Geometry], NDArray[np.int64]]
 
@@ -64,7 +64,7 @@ class Float64Scene:
         """Remove the geometry of a number."""
         del self.parts[number]
 
-    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[Self]]) -> int:
+    def place(self, groups: Sequence[MeshInstances], scenes: Sequence[Sequence[Self]]) -> int:
         """Replace all instances; ``scenes`` holds each group's shapes. Returns how many leading groups stay.
 
         Raises BackendError if a shape has another backend.
@@ -99,7 +99,7 @@ class Float64Scene:
         self.target = self.tables()
         self.packed = packed(self.target)
 
-    def tables(self) -> Target:
+    def tables(self) -> RayTarget:
         """The tables for the kernels, without those of Embree."""
         parts = [self.parts[number] for number in sorted(self.parts)]
         # Keep the columns alive while the kernels use their addresses.
@@ -123,7 +123,7 @@ class Float64Scene:
         starts = np.cumsum([0, *(len(group.copies) for group in self.groups)])
         counts = np.concatenate(steps)
         self._kept = kept, trees
-        return Target(
+        return RayTarget(
             scene=0,
             packet=0,
             single=0,
@@ -153,7 +153,7 @@ class Float64Scene:
         return column.ctypes.data
 
     def _row(self, part: Geometry) -> tuple[int, ...]:
-        """Row of `Target.parts`."""
+        """Row of `RayTarget.parts`."""
         return (
             self.pointer(part.planes),
             self.pointer(part.vertices),
@@ -166,7 +166,7 @@ class Float64Scene:
             part.mask,
         )
 
-    def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:
+    def cast(self, rays: RayColumns, *, normals: bool, threads: int) -> Hits:
         """The first hit of each ray."""
         n = len(rays.directions)
         columns = np.empty(n), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.float32)
@@ -175,6 +175,6 @@ class Float64Scene:
         share(lambda lo, hi: int(kernel(target, rays, lo, hi, *columns, hits.normal)), rays, threads=threads)
         return hits
 
-    def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:
+    def occluded(self, rays: RayColumns, *, threads: int) -> NDArray[np.bool_]:
         """Whether each ray hits anything."""
         return self.cast(rays, normals=False, threads=threads).face >= 0

@@ -30,7 +30,7 @@ DEPTH = wp.constant(tree.DEPTH)
 
 
 @wp.struct
-class Node:
+class WarpNode:
     """A row of `lidar.raycast.tree.Tree.nodes`."""
 
     low: wp.vec3f
@@ -49,7 +49,7 @@ class Plane:
 
 
 @wp.struct
-class Beam:
+class WarpBeam:
     """A ray with the inverse of its direction; the latter is huge where the direction is zero."""
 
     start: wp.vec3d
@@ -58,8 +58,8 @@ class Beam:
 
 
 @wp.struct
-class Target:
-    """Columns of `lidar.raycast.columns.Target`; addresses are of the device."""
+class WarpTarget:
+    """Columns of `lidar.raycast.columns.RayTarget`; addresses are of the device."""
 
     origin: wp.vec3d
     parts: wp.array2d[wp.int64]
@@ -73,8 +73,8 @@ class Target:
 
 
 @wp.struct
-class Rays:
-    """Columns of `lidar.raycast.columns.Rays`."""
+class WarpRays:
+    """Columns of `lidar.raycast.columns.RayColumns`."""
 
     directions: wp.array[wp.vec3d]
     offsets: wp.array[wp.vec3d]
@@ -99,7 +99,7 @@ class Pose:
 
 
 @wp.struct
-class Found:
+class WarpHit:
     """A face: row of ``parts`` (-1: none), number in it, instance (-1: none)."""
 
     row: wp.int32
@@ -115,8 +115,8 @@ def _inverted(x: wp.float64) -> wp.float64:
 
 
 @wp.func
-def _beam(start: wp.vec3d, way: wp.vec3d) -> Beam:
-    beam = Beam()
+def _beam(start: wp.vec3d, way: wp.vec3d) -> WarpBeam:
+    beam = WarpBeam()
     beam.start = start
     beam.way = way
     beam.inverse = wp.vec3d(_inverted(way[0]), _inverted(way[1]), _inverted(way[2]))
@@ -124,7 +124,7 @@ def _beam(start: wp.vec3d, way: wp.vec3d) -> Beam:
 
 
 @wp.func
-def _enters(node: Node, beam: Beam, near: wp.float64, far: wp.float64) -> wp.float64:
+def _enters(node: WarpNode, beam: WarpBeam, near: wp.float64, far: wp.float64) -> wp.float64:
     """The ray parameter at which a ray enters the box of a node; inf if it does not."""
     entry = near
     leaving = far
@@ -140,8 +140,8 @@ def _enters(node: Node, beam: Beam, near: wp.float64, far: wp.float64) -> wp.flo
 
 @wp.func
 def _next_leaf(
-    nodes: wp.array[Node],
-    beam: Beam,
+    nodes: wp.array[WarpNode],
+    beam: WarpBeam,
     near: wp.float64,
     far: wp.float64,
     stack: wp.array[wp.int32],
@@ -183,7 +183,7 @@ def _entry(
 
 
 @wp.func
-def _pose_of(target: Target, instance: int, time: wp.float64) -> Pose:
+def _pose_of(target: WarpTarget, instance: int, time: wp.float64) -> Pose:
     """The transform of an instance at a ray time."""
     row = target.first[instance]
     steps = target.steps[instance]
@@ -208,7 +208,7 @@ def _pose_of(target: Target, instance: int, time: wp.float64) -> Pose:
 
 
 @wp.func
-def _within(pose: Pose, beam: Beam) -> Beam:
+def _within(pose: Pose, beam: WarpBeam) -> WarpBeam:
     """A ray in the frame of an instance."""
     u = wp.cross(pose.y, pose.z)
     v = wp.cross(pose.z, pose.x)
@@ -234,7 +234,7 @@ def _passed(a: wp.vec3d, b: wp.vec3d, way: wp.vec3d, length: wp.float64, size: w
 
 
 @wp.func
-def _beside(beam: Beam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> bool:
+def _beside(beam: WarpBeam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> bool:
     """Whether a ray passes outside the edges of a triangle; corners relative to the ray's origin."""
     length = wp.sqrt(wp.dot(beam.way, beam.way))
     size = wp.abs(beam.start[0]) + wp.abs(beam.start[1]) + wp.abs(beam.start[2])
@@ -245,7 +245,7 @@ def _beside(beam: Beam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> bool:
 
 
 @wp.func
-def _clipped(t: wp.float64, beam: Beam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.float64:
+def _clipped(t: wp.float64, beam: WarpBeam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.float64:
     """A ray parameter, clipped to the extent of corners along the ray; they are relative to its origin."""
     squared = wp.dot(beam.way, beam.way)
     one = wp.dot(a, beam.way) / squared
@@ -262,7 +262,7 @@ def _clipped(t: wp.float64, beam: Beam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -
 
 @wp.func
 def _range(
-    plane: Plane, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, beam: Beam, near: wp.float64, far: wp.float64
+    plane: Plane, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, beam: WarpBeam, near: wp.float64, far: wp.float64
 ) -> wp.float64:
     """The ray parameter at which a ray hits a face after near, not at its start, and before far; else inf."""
     n = plane.normal
@@ -284,7 +284,7 @@ def _range(
 
 @wp.func
 def _first_of_part(
-    target: Target, row: int, beam: Beam, near: wp.float64, far: wp.float64, stack: wp.array[wp.int32]
+    target: WarpTarget, row: int, beam: WarpBeam, near: wp.float64, far: wp.float64, stack: wp.array[wp.int32]
 ) -> tuple[int, wp.float64]:
     """The first face of a part that a ray hits before ``far``, or -1, and its ray parameter."""
     count = int(target.parts[row, COUNT])
@@ -292,7 +292,7 @@ def _first_of_part(
     nearest = wp.float64(far)
     if count == 0:
         return best, nearest
-    nodes = wp.array(ptr=wp.uint64(target.parts[row, NODES]), shape=(count,), dtype=Node)
+    nodes = wp.array(ptr=wp.uint64(target.parts[row, NODES]), shape=(count,), dtype=WarpNode)
     order = wp.array(ptr=wp.uint64(target.parts[row, ORDER]), shape=(count,), dtype=wp.int32)
     faces = wp.array(ptr=wp.uint64(target.parts[row, CORNERS]), shape=(count,), dtype=wp.vec3i)
     planes = wp.array(ptr=wp.uint64(target.parts[row, PLANES]), shape=(count,), dtype=Plane)
@@ -321,17 +321,17 @@ def _first_of_part(
 
 @wp.func
 def _first_hit(
-    target: Target,
+    target: WarpTarget,
     near: wp.float64,
     far: wp.float64,
     mask: wp.int64,
-    beam: Beam,
+    beam: WarpBeam,
     time: wp.float64,
     any_hit: bool,  # noqa: FBT001 - kernels have no keywords
-) -> Found:
+) -> WarpHit:
     """The first face that a ray hits; some face if any hit will do."""
     stack = wp.zeros(shape=(STACK,), dtype=wp.int32)
-    found = Found()
+    found = WarpHit()
     found.row = -1
     found.prim = -1
     found.instance = -1
@@ -339,7 +339,7 @@ def _first_hit(
     for group in range(target.groups.shape[0]):
         count = int(target.groups[group, 2])
         start = int(target.groups[group, 3])
-        nodes = wp.array(ptr=wp.uint64(target.groups[group, 0]), shape=(count,), dtype=Node)
+        nodes = wp.array(ptr=wp.uint64(target.groups[group, 0]), shape=(count,), dtype=WarpNode)
         order = wp.array(ptr=wp.uint64(target.groups[group, 1]), shape=(count,), dtype=wp.int32)
         stack[0] = 0
         first, top = _next_leaf(nodes, beam, near, nearest, stack, 0, wp.min(count, 1))
@@ -382,7 +382,7 @@ def _turned(matrix: wp.array3d[wp.float64], p: wp.int64, v: wp.vec3d) -> wp.vec3
 
 
 @wp.func
-def _ray(target: Target, rays: Rays, i: int) -> Beam:
+def _ray(target: WarpTarget, rays: WarpRays, i: int) -> WarpBeam:
     """A ray relative to the origin of the target."""
     way = rays.directions[i]
     start = wp.vec3d(ZERO, ZERO, ZERO)
@@ -404,28 +404,28 @@ def _ray(target: Target, rays: Rays, i: int) -> Beam:
 
 
 @wp.func
-def _is_valid(beam: Beam) -> bool:
+def _is_valid(beam: WarpBeam) -> bool:
     squared = wp.dot(beam.way, beam.way)
     size = wp.abs(beam.start[0]) + wp.abs(beam.start[1]) + wp.abs(beam.start[2])
     return squared > ZERO and squared < HUGE and size < HUGE
 
 
 @wp.func
-def _far(rays: Rays, i: int) -> wp.float64:
+def _far(rays: WarpRays, i: int) -> wp.float64:
     if rays.far.shape[0] > 1:
         return rays.far[i]
     return rays.far[0]
 
 
 @wp.func
-def _time(rays: Rays, i: int) -> wp.float64:
+def _time(rays: WarpRays, i: int) -> wp.float64:
     if rays.time.shape[0] > 0:
         return wp.float64(rays.time[i])
     return ZERO
 
 
 @wp.func
-def _number(rays: Rays, at: int) -> int:
+def _number(rays: WarpRays, at: int) -> int:
     if rays.order.shape[0] > 0:
         return int(rays.order[at])
     return at
@@ -433,8 +433,8 @@ def _number(rays: Rays, at: int) -> int:
 
 @wp.kernel
 def cast(
-    target: Target,
-    rays: Rays,
+    target: WarpTarget,
+    rays: WarpRays,
     ranges: wp.array[wp.float64],
     faces: wp.array[wp.int32],
     instances: wp.array[wp.int32],
@@ -531,7 +531,7 @@ def _moved(pose: Pose, p: wp.vec3d) -> wp.vec3d:
 
 
 @wp.kernel
-def occluded(target: Target, rays: Rays, out: wp.array[wp.bool], bad: wp.array[wp.int32]) -> None:
+def occluded(target: WarpTarget, rays: WarpRays, out: wp.array[wp.bool], bad: wp.array[wp.int32]) -> None:
     """Write whether rays hit anything, and the number of the first invalid ray to ``bad``."""
     i = _number(rays, wp.tid())
     beam = _ray(target, rays, i)

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast import warp_kernels
-from lidar.raycast.columns import Rays
-from lidar.raycast.columns import Target as Tables
-from lidar.raycast.device import Device
-from lidar.raycast.geometry import Instances
+from lidar.raycast.columns import RayColumns
+from lidar.raycast.columns import RayTarget as Tables
+from lidar.raycast.device import WarpDevice
+from lidar.raycast.geometry import MeshInstances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share
 from lidar.raycast.scene import Float64Scene
@@ -30,7 +30,7 @@ _COLUMNS = {
     "time": wp.float32,
     "far": wp.float64,
 }
-"""Columns of `Rays` that travel to the device, and the types of their items."""
+"""Columns of `RayColumns` that travel to the device, and the types of their items."""
 
 
 class WarpScene(Float64Scene):
@@ -42,7 +42,7 @@ class WarpScene(Float64Scene):
     origin : (3,) float64, origin of the geometries' vertices
     """
 
-    def __init__(self, origin: Float, *, device: Device) -> None:
+    def __init__(self, origin: Float, *, device: WarpDevice) -> None:
         super().__init__(origin)
         self.device = device
         self._copies: dict[int, tuple[NDArray[Any], Any]] = {}
@@ -55,7 +55,7 @@ class WarpScene(Float64Scene):
         self._copies[key] = copy
         return int(copy[1].ptr or 0)
 
-    def place(self, groups: Sequence[Instances], scenes: Sequence[Sequence[Self]]) -> int:
+    def place(self, groups: Sequence[MeshInstances], scenes: Sequence[Sequence[Self]]) -> int:
         """Replace all instances; see `Float64Scene.place`."""
         kept = super().place(groups, scenes)
         if any(shape.device is not self.device for shapes in scenes for shape in shapes):
@@ -68,35 +68,35 @@ class WarpScene(Float64Scene):
             self._former, self._copies = self._copies, {}
             tables = super().tables()
             self._former = {}
-            upload, target = self.device.upload, warp_kernels.Target()
+            upload, target = self.device.upload, warp_kernels.WarpTarget()
             target.origin = wp.vec3d(*self.origin)
             for name in ("parts", "shape", "sizes", "masks", "first", "steps", "transforms", "groups"):
                 setattr(target, name, upload(getattr(tables, name)))
             self._on_device = target
         return tables
 
-    def cast(self, rays: Rays, *, normals: bool, threads: int) -> Hits:  # noqa: ARG002
+    def cast(self, rays: RayColumns, *, normals: bool, threads: int) -> Hits:  # noqa: ARG002
         """The first hit of each ray."""
         n = len(rays.directions)
         kinds = (wp.float64, wp.int32, wp.int32, wp.float32)
         out = self._run(warp_kernels.cast, rays, [*((n, k) for k in kinds), (n if normals else 0, wp.vec3d)])
         return Hits(*out)
 
-    def occluded(self, rays: Rays, *, threads: int) -> NDArray[np.bool_]:  # noqa: ARG002
+    def occluded(self, rays: RayColumns, *, threads: int) -> NDArray[np.bool_]:  # noqa: ARG002
         """Whether each ray hits anything."""
         blocked: NDArray[np.bool_] = self._run(
             warp_kernels.occluded, rays, [(len(rays.directions), wp.bool)]
         )[0]
         return blocked
 
-    def _run(self, kernel: Any, rays: Rays, results: Sequence[tuple[int, Any]]) -> list[NDArray[Any]]:
+    def _run(self, kernel: Any, rays: RayColumns, results: Sequence[tuple[int, Any]]) -> list[NDArray[Any]]:
         """The results of a kernel, given their lengths and types."""
         found: list[NDArray[Any]] = []
 
         def launch(_: int, n: int) -> int:
             """Cast all rays; returns the first invalid one, or -1."""
             with self.device.lock:
-                there = warp_kernels.Rays()
+                there = warp_kernels.WarpRays()
                 for name, kind in _COLUMNS.items():
                     setattr(there, name, self.device.upload(getattr(rays, name), kind))
                 there.near, there.mask = rays.near, rays.mask

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter
 
@@ -18,7 +18,7 @@ class LostRows(Stage):
     loss: float = parameter(0.01, "probability that a band is lost", low=0, high=1)
     rows: int = parameter(8, "image rows a band", low=1, high=100_000)
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame with its lost bands black; depth and labels stay."""
         del at
         rgb = frame.rgb

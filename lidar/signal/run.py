@@ -26,7 +26,7 @@ from lidar.signal.situation import Situation
 from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
 
 if TYPE_CHECKING:
-    from lidar.sensors.camera.render import Frame
+    from lidar.sensors.camera.render import CameraImage
 
 _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
 
@@ -148,7 +148,7 @@ def altered_cloud(cloud: TracedCloud, stages: Stages, *, at: Situation) -> Trace
     return replace(cloud, hidden=np.where(moved, cloud.source, cloud.hidden))
 
 
-def altered_image(image: Frame, stages: Stages, *, at: Situation) -> Frame:
+def altered_image(image: CameraImage, stages: Stages, *, at: Situation) -> CameraImage:
     """An image with colours after the stages on it."""
     for named in stages.at("image", at.sensor):
         rng = named.rng(stages.seed, at.sensor, frame=at.frame)
@@ -210,7 +210,7 @@ def cloud_truth(
     }
 
 
-def image_truth(image: Frame, original: Frame) -> dict[str, NDArray[Any]]:
+def image_truth(image: CameraImage, original: CameraImage) -> dict[str, NDArray[Any]]:
     """What stages did to the colours of an image, as `changed_pixels`."""
     assert image.rgb is not None  # noqa: S101
     assert original.rgb is not None  # noqa: S101
@@ -227,7 +227,7 @@ def changed_pixels(rgb: NDArray[np.uint8], original: NDArray[np.uint8]) -> dict[
     return {"changed": changed, "removed": original[changed]}
 
 
-def image_past(image: Frame, truth: Mapping[str, NDArray[Any]] | None) -> Frame:
+def image_past(image: CameraImage, truth: Mapping[str, NDArray[Any]] | None) -> CameraImage:
     """A recorded image without the stages that its truth file tells of.
 
     Raises ValueError for the truth of another image.

@@ -22,7 +22,7 @@ from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 
 if TYPE_CHECKING:
-    from lidar.sensors.camera.render import Frame
+    from lidar.sensors.camera.render import CameraImage
     from lidar.sensors.navigation.gnss import Fixes
     from lidar.sensors.navigation.imu import Inertial
 
@@ -212,7 +212,7 @@ class CloudStage(Protocol):
 class ImageStage(Protocol):
     """A stage on camera images."""
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame that is recorded. Only its colours are used: depth and labels stay ground truth."""
 
 

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from geoscene.support.cluster import Cluster
+from geoscene.support.cluster import DaskCluster
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.journal import Journal
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.signal.effects import Counts
-from lidar.simulation.plan import DrivePlan, Job
+from lidar.simulation.plan import DrivePlan, SensorFrame
 from lidar.simulation.record import record_frame
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import Region
@@ -62,8 +62,8 @@ def record_on_cluster(
     plan: DrivePlan,
     *,
     recording: Recording,
-    chunks: Iterable[tuple[Sequence[Job], Region]],
-    cluster: Cluster,
+    chunks: Iterable[tuple[Sequence[SensorFrame], Region]],
+    cluster: DaskCluster,
     journal: Journal,
     progress: Progress = silent,
 ) -> None:

@@ -42,7 +42,7 @@ _ROUNDING = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class DriveCourse:
     """Where a drive goes, in plan; scene metres.
 
     path  : (n, 2) the vehicle's path, all that can be recorded
@@ -53,20 +53,20 @@ class Course:
     tried: Sequence[Float] = ()
 
 
-def drive_course(roads: RoadMap, options: DriveOptions) -> Course:
+def drive_course(roads: RoadMap, options: DriveOptions) -> DriveCourse:
     """The course of a drive through the scene of a map; raises RouteError as the drive would."""
     rig = load_rig(options.rig)
     vehicle = load_vehicle(options.vehicle or rig.vehicle)
     route = options.route or "random"
     if isinstance(route, Path) and route.suffix == ".csv" and not options.survey:
-        return Course(read_replay(route, roads.frame).position[:, :2])
+        return DriveCourse(read_replay(route, roads.frame).position[:, :2])
     if vehicle.kind == "air":
         sensors = sensors_of(rig, options)
-        return Course(
+        return DriveCourse(
             flight_course(roads, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
         )
     options.check_on_roads(vehicle.name)
-    return Course(
+    return DriveCourse(
         *road_course(
             roads,
             route,

@@ -18,7 +18,7 @@ from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
 from geoscene.scene import Scene
-from geoscene.support.cluster import Cluster, connected
+from geoscene.support.cluster import DaskCluster, connected
 from geoscene.support.files import exclusive, json_bytes, write_json
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.checksums import write_checksums
@@ -33,7 +33,7 @@ from lidar.simulation.boxes import merge_box_files, merge_signal_files
 from lidar.simulation.frame_loop import check_attackers, recording_chunks, run_jobs
 from lidar.simulation.measured import MeasuredCloud, MeasuredImages
 from lidar.simulation.metadata import write_metadata
-from lidar.simulation.plan import DrivePlan, Job, Jobs, plan_drive
+from lidar.simulation.plan import DrivePlan, Jobs, SensorFrame, plan_drive
 from lidar.simulation.record import record_frame
 from lidar.simulation.recording import Recording
 from lidar.world.thread_worlds import Worlds
@@ -142,7 +142,7 @@ def _driven(
     *,
     options: DriveOptions,
     overwrite: bool,
-    cluster: Cluster | None,
+    cluster: DaskCluster | None,
     progress: Progress,
     notes: Mapping[str, Any],
     check: Callable[[DrivePlan], Mapping[str, Any]] | None,
@@ -216,7 +216,9 @@ def _driven(
     )
 
 
-def _finish(recording: Recording, jobs: Sequence[Job], *, manifest: dict[str, Any], journal: Journal) -> None:
+def _finish(
+    recording: Recording, jobs: Sequence[SensorFrame], *, manifest: dict[str, Any], journal: Journal
+) -> None:
     """Write the checksums of all files and then the manifest, which marks a finished drive."""
     path, known = Paths(recording.out).manifest, dict[str, bytes]()
     for job in jobs:
@@ -256,7 +258,7 @@ def _write_plan(plan: DrivePlan, recording: Recording) -> None:
     )
 
 
-def _verified(recording: Recording, jobs: Sequence[Job], *, progress: Progress) -> Journal:
+def _verified(recording: Recording, jobs: Sequence[SensorFrame], *, progress: Progress) -> Journal:
     """The journal of the dataset, with only those of the frames whose files are as they were written."""
     path = Paths(recording.out).journal
     old, journal = read_journal(path), Journal(path)
@@ -310,7 +312,7 @@ def _begun(out: Path, manifest: Mapping[str, Any], *, overwrite: bool) -> Iterat
 
 def record_all(
     recording: Recording,
-    jobs: Sequence[Job],
+    jobs: Sequence[SensorFrame],
     *,
     scene: Scene,
     journal: Journal,
@@ -329,7 +331,7 @@ def record_all(
 
 
 def _record(
-    job: Job, worlds: Worlds, *, recording: Recording, journal: Journal, keep: bool
+    job: SensorFrame, worlds: Worlds, *, recording: Recording, journal: Journal, keep: bool
 ) -> MeasuredCloud | MeasuredImages | None:
     """Record one frame and add it to the journal; return it if it is to be kept."""
     measured = record_frame(recording, job.sensor, frame=job.frame, worlds=worlds)

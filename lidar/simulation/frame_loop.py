@@ -18,7 +18,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.attacks.sight import Seen, check_sight, sent_only
 from lidar.signal.situation import Situation
-from lidar.simulation.plan import DrivePlan, Job
+from lidar.simulation.plan import DrivePlan, SensorFrame
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of
 from lidar.world.thread_worlds import Worlds
@@ -34,8 +34,8 @@ _FORGET_NS = 60 * 10**9
 
 
 def run_jobs(
-    task: Callable[[Job, Worlds], T],
-    jobs: Sequence[Job],
+    task: Callable[[SensorFrame, Worlds], T],
+    jobs: Sequence[SensorFrame],
     *,
     recording: Recording,
     scene: Scene,
@@ -111,14 +111,16 @@ def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Sit
                 yield at, partial(seen, job.sensor, job.frame, region=region)
 
 
-def recording_chunks(jobs: Sequence[Job], recording: Recording) -> Iterator[tuple[Sequence[Job], Region]]:
+def recording_chunks(
+    jobs: Sequence[SensorFrame], recording: Recording
+) -> Iterator[tuple[Sequence[SensorFrame], Region]]:
     """`chunks` whose boxes also cover the places of earlier frames that stages ask for."""
     back_ns = recording.contents.stages.lookback_ns
     for run, box in chunks(jobs, recording.trajectory):
         yield run, _widened(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
 
 
-def _widened(box: Region, jobs: Sequence[Job], *, trajectory: Trajectory, back_ns: int) -> Region:
+def _widened(box: Region, jobs: Sequence[SensorFrame], *, trajectory: Trajectory, back_ns: int) -> Region:
     """A box that also covers where the vehicle was within some time before jobs."""
     until, spans = 0, []
     for job in jobs:  # in order of time
@@ -130,7 +132,9 @@ def _widened(box: Region, jobs: Sequence[Job], *, trajectory: Trajectory, back_n
     return _box(xy.min(axis=0), xy.max(axis=0))
 
 
-def chunks(jobs: Sequence[Job], trajectory: Trajectory) -> Iterator[tuple[Sequence[Job], Region]]:
+def chunks(
+    jobs: Sequence[SensorFrame], trajectory: Trajectory
+) -> Iterator[tuple[Sequence[SensorFrame], Region]]:
     """Runs of jobs during which the vehicle stays within a square of `CHUNK`, with the box it covers."""
     first = 0
     low = high = np.zeros(2)

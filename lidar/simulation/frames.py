@@ -18,7 +18,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.options import DriveOptions
-from lidar.sensors.camera.render import Frame as Image
+from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.gnss import Fixes
 from lidar.sensors.navigation.imu import Inertial, observe_imu
@@ -29,7 +29,7 @@ from lidar.signal.situation import Situation
 from lidar.simulation.frame_loop import check_attackers, run_jobs
 from lidar.simulation.measured import Columns, MeasuredCloud, MeasuredImages
 from lidar.simulation.navigation_files import observed_fixes
-from lidar.simulation.plan import DrivePlan, Job, plan_drive
+from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.record import measure_frame
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of_unit
@@ -165,7 +165,7 @@ def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = silent
     return Simulation(plan)
 
 
-def _measured(job: Job, worlds: Worlds, *, recording: Recording) -> MeasuredCloud | MeasuredImages:
+def _measured(job: SensorFrame, worlds: Worlds, *, recording: Recording) -> MeasuredCloud | MeasuredImages:
     return measure_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
 
 

@@ -18,13 +18,13 @@ from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.specs import CameraSpec
 
 if TYPE_CHECKING:
-    from lidar.sensors.camera.render import Frame as Image
+    from lidar.sensors.camera.render import CameraImage as Image
 
 Columns = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredFrame:
     """A frame of a sensor.
 
     sensor     : name on the rig
@@ -57,7 +57,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class MeasuredCloud(Measured):
+class MeasuredCloud(MeasuredFrame):
     """A frame of a scanner.
 
     cloud     : its returns, in the sensor frame at each return's own time; a `TracedCloud` with stages
@@ -93,7 +93,7 @@ class MeasuredCloud(Measured):
 
 
 @dataclass(frozen=True)
-class MeasuredImages(Measured):
+class MeasuredImages(MeasuredFrame):
     """A frame of a camera.
 
     camera  : intrinsics and exposure

@@ -25,7 +25,7 @@ from lidar.sensors.navigation.imu import observe_imu
 from lidar.sensors.rig.camera_model import intrinsic_matrix
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import Rig
-from lidar.settings import Contents
+from lidar.settings import RecordingSettings
 from lidar.signal.effects import Effects
 from lidar.simulation.navigation_files import heights_of, observed_fixes, record_fixes, record_samples
 from lidar.simulation.situations import situation_of_unit
@@ -125,7 +125,7 @@ def write_metadata(
     trajectory: Trajectory,
     start: datetime,
     frames: Mapping[str, int],
-    contents: Contents,
+    contents: RecordingSettings,
     effects: Effects | None = None,
 ) -> None:
     """Write all files of a dataset but clouds, images and boxes.

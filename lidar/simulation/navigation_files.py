@@ -18,7 +18,7 @@ from geoscene.scene import Scene
 from geoscene.support.csv_tables import table_blocks, write_blocks, write_columns
 from geoscene.support.files import atomic_path
 from lidar.dataset.layout import Paths, opened_rows, reading_file
-from lidar.dataset.navigation_files import Heights
+from lidar.dataset.navigation_files import FixHeights
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import iso_times
 from lidar.sensors.navigation.geoid import geoid_at
@@ -39,10 +39,10 @@ from lidar.signal.situation import Situation
 from lidar.world.world import World
 
 
-def heights_of(frame: Frame, fixes: Fixes) -> Heights:
+def heights_of(frame: Frame, fixes: Fixes) -> FixHeights:
     """What the heights of fixes in a scene are above."""
     geoid = None if frame.vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
-    return Heights(frame.vertical, geoid.separation, geoid.name) if geoid else Heights(frame.vertical)
+    return FixHeights(frame.vertical, geoid.separation, geoid.name) if geoid else FixHeights(frame.vertical)
 
 
 def observed_fixes(
@@ -77,7 +77,7 @@ def record_fixes(
     at: Situation,
     stages: Stages,
     start: datetime,
-    heights: Heights,
+    heights: FixHeights,
     past: Path | None = None,
 ) -> None:
     """Write the fixes of the receiver ``at.sensor`` after the stages on them, with the truth of changes.
@@ -92,7 +92,7 @@ def record_fixes(
     _write_fixes(paths, at.sensor, fixes=fixes, start=start, heights=heights)
 
 
-def _write_fixes(paths: Paths, name: str, *, fixes: Fixes, start: datetime, heights: Heights) -> None:
+def _write_fixes(paths: Paths, name: str, *, fixes: Fixes, start: datetime, heights: FixHeights) -> None:
     columns = gnss_columns(fixes) | {"h_above": np.full(len(fixes), HEIGHTS[heights.vertical].split()[-1])}
     if heights.separation is not None:
         columns["geoid"] = heights.separation

@@ -47,7 +47,7 @@ _RANDOM_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class SensorFrame:
     """One frame of one sensor."""
 
     start_ns: int
@@ -57,7 +57,7 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True)
-class Jobs(Sequence[Job]):
+class Jobs(Sequence[SensorFrame]):
     """Frames of several sensors in order of time; a job is made when it is asked for.
 
     sensors : the sensors
@@ -74,18 +74,18 @@ class Jobs(Sequence[Job]):
         return len(self.frame)
 
     @overload
-    def __getitem__(self, row: int) -> Job: ...
+    def __getitem__(self, row: int) -> SensorFrame: ...
     @overload
     def __getitem__(self, row: slice) -> Jobs: ...
-    def __getitem__(self, row: int | slice) -> Job | Jobs:
+    def __getitem__(self, row: int | slice) -> SensorFrame | Jobs:
         """A job, or the jobs of some rows."""
         if isinstance(row, slice):
             return Jobs(self.sensors, self.order[row], self.frame[row])
         order, frame = int(self.order[row]), int(self.frame[row])
         sensor = self.sensors[order]
-        return Job(sensor.frame_start_ns(frame), order, frame, sensor)
+        return SensorFrame(sensor.frame_start_ns(frame), order, frame, sensor)
 
-    def where(self, keep: Callable[[Job], bool]) -> Jobs:
+    def where(self, keep: Callable[[SensorFrame], bool]) -> Jobs:
         """The jobs for which ``keep`` is true."""
         mask = np.fromiter(map(keep, self), bool, len(self))
         return Jobs(self.sensors, self.order[mask], self.frame[mask])

@@ -13,7 +13,7 @@ from geoscene.support.csv_tables import write_columns
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
 from lidar.sensors.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
-from lidar.sensors.camera.render import Frame as Image
+from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.camera.render import exposure_times, optical_flow, render
 from lidar.sensors.camera.signal_lamps import Lamps
 from lidar.sensors.rig.devices import Camera

@@ -22,7 +22,7 @@ from lidar.dataset.layout import Paths
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.settings import Contents
+from lidar.settings import RecordingSettings
 from lidar.signal.effects import Effects
 from lidar.world.actors import Actors
 from lidar.world.visibility import Visibility
@@ -77,7 +77,7 @@ class Recording:
     trajectory: Trajectory
     start: datetime
     geo: Georeference
-    contents: Contents
+    contents: RecordingSettings
     watch: Stopwatch = field(default_factory=Stopwatch)
     effects: Effects = field(default_factory=Effects)
     actors: Actors | None = None

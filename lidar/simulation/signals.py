@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from lidar.geometry.poses import Poses
-from lidar.sensors.camera.render import Frame as Image
+from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.camera.signal_lamps import Lamps
 from lidar.traffic.signal_heads import STATES, SignalStates
 

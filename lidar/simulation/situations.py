@@ -40,7 +40,7 @@ def situation_of(
     frame: int,
     world: World | None = None,
     cloud_of: Callable[[int], Cloud] | None = None,
-    surroundings: Surroundings | None = None,
+    surroundings: RecordedSurroundings | None = None,
 ) -> Situation:
     """Where and when a sensor takes a frame.
 
@@ -84,7 +84,7 @@ def situation_of(
     )
 
 
-class Surroundings:
+class RecordedSurroundings:
     """The scene that recorded data were driven in, of which the part around points is loaded."""
 
     def __init__(self, scene: Scene) -> None:
@@ -101,14 +101,14 @@ class Surroundings:
         return self._world
 
 
-def surroundings_of(dataset: Dataset) -> Surroundings | None:
+def surroundings_of(dataset: Dataset) -> RecordedSurroundings | None:
     """The scene that a dataset was driven in; None if it is not there, or another one by now."""
     try:
         scene = open_scene(dataset.scene_path)
     except (GeosceneError, OSError):
         return None
     same = scene.manifest.get("fingerprint", scene.path.name) == dataset.manifest["recipe"].get("scene")
-    return Surroundings(scene) if same else None
+    return RecordedSurroundings(scene) if same else None
 
 
 def situation_of_unit(

@@ -34,7 +34,7 @@ from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.options import ApplyOptions, with_stage_settings
 from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png, write_png
-from lidar.sensors.camera.render import Frame as Image
+from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.scanner import Sensor, load_sensor
 from lidar.sensors.rig.specs import GnssSpec, ImuSpec, Rig, rig_of
@@ -51,7 +51,7 @@ from lidar.simulation.boxes import merge_box_files
 from lidar.simulation.navigation_files import record_fixes, record_samples
 from lidar.simulation.record_clouds import sent_pulses
 from lidar.simulation.recording import Recording
-from lidar.simulation.situations import Surroundings, situation_of, situation_of_unit, surroundings_of
+from lidar.simulation.situations import RecordedSurroundings, situation_of, situation_of_unit, surroundings_of
 from lidar.tools.earlier_stages import Former, read_foreign, read_foreign_past, read_past, select_labels
 from lidar.tools.rerecord import (
     acted_stages,
@@ -237,7 +237,7 @@ def _apply_to_frame(
     form: Format,
     scanner: Scanner,
     frame: int,
-    around: Surroundings | None,
+    around: RecordedSurroundings | None,
 ) -> int:
     """Write a cloud after the stages with its labels, boxes and truth; return the number of points."""
     contents = recording.contents
@@ -277,7 +277,7 @@ def _check_sight(
     *,
     form: Format,
     jobs: Sequence[tuple[Scanner | Camera, int]],
-    around: Surroundings | None,
+    around: RecordedSurroundings | None,
 ) -> None:
     """Raise InputError for an attacker that no scanner sees in any of the frames."""
 

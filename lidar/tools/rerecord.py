@@ -20,7 +20,7 @@ from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import with_stage_settings
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.settings import Contents, settings_of
+from lidar.settings import RecordingSettings, settings_of
 from lidar.signal.recorded_pulses import completed
 from lidar.signal.registry import NO_STAGES, Stages, acts_on
 from lidar.signal.run import Altered, write_truth
@@ -59,7 +59,7 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
         recorded = [(name, text) for name, text in recipe["settings"]]
         settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages.stages))
         formats, labels = tuple(recipe["formats"]), tuple(recipe["labels"])
-        contents = Contents(formats, labels, recipe["deskew"], seed, *settings, stages)
+        contents = RecordingSettings(formats, labels, recipe["deskew"], seed, *settings, stages)
         crs = export_crs(dataset.frame, recipe["crs"])
         on = dataset.manifest.get("scanners_on_ns")
         scanning_ns = None if on is None else np.array(on, np.int64).reshape(-1, 2)
@@ -74,7 +74,7 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
     )
 
 
-def richest_format(contents: Contents) -> Format:
+def richest_format(contents: RecordingSettings) -> Format:
     """The format in the sensor frame that keeps most columns.
 
     Raises InputError if there is none.

@@ -36,7 +36,7 @@ from lidar.tools.integrity.merkle import (
     link,
     signed_message,
 )
-from lidar.tools.integrity.watermark import Cells, Watermark
+from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey
 from lidar.tools.rerecord import recording_again
 
 SCHEMA = 1
@@ -66,16 +66,16 @@ def marked_formats(formats: tuple[str, ...]) -> list[Format]:
     return [form for form in found if form.frame == "sensor" and {"ring", "column"} <= set(form.columns)]
 
 
-def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> Cells:
+def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> WatermarkCells:
     """Which pulses the returns of a cloud belong to."""
-    return Cells(sensor, frame, cloud.ring, cloud.column, cloud.echo)
+    return WatermarkCells(sensor, frame, cloud.ring, cloud.column, cloud.echo)
 
 
 def sign_dataset(
     source: str | Path,
     out: str | Path | None,
     *,
-    watermark: Watermark | None = None,
+    watermark: WatermarkKey | None = None,
     signer: Signer | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -125,7 +125,7 @@ def sign_dataset(
 
 
 def _marked(
-    dataset: Dataset, summary: SignSummary, *, watermark: Watermark, progress: Progress
+    dataset: Dataset, summary: SignSummary, *, watermark: WatermarkKey, progress: Progress
 ) -> SignSummary:
     """Copy a dataset with a watermark in its clouds, in all their formats."""
     recipe, out = dataset.manifest["recipe"], summary.path
@@ -162,7 +162,7 @@ def _marked(
 
 
 def _marked_clouds(
-    source: Path, summary: SignSummary, *, watermark: Watermark, progress: Progress
+    source: Path, summary: SignSummary, *, watermark: WatermarkKey, progress: Progress
 ) -> SignSummary:
     """Copy a folder of KITTI or nuScenes with a watermark in its clouds."""
     out, clouds = summary.path, foreign_clouds(source)
@@ -211,7 +211,7 @@ def _mark_frame(
     scanner: Scanner,
     frame: int,
     form: Format,
-    watermark: Watermark,
+    watermark: WatermarkKey,
 ) -> Float:
     """Write a cloud with the watermark; return the distances (n,) in metres by which points moved."""
     source = replace(recording, out=dataset.path).paths(scanner, frame)

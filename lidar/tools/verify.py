@@ -14,7 +14,7 @@ import numpy as np
 from geoscene.scene.layout import SceneFiles
 from geoscene.support.files import digest
 from geoscene.support.progress import Progress, silent
-from geoscene.support.storage import Stored, cache_folder, shown, url_of
+from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
 from lidar.dataset.layout import Paths, open_dataset, reading_file
@@ -26,7 +26,7 @@ from lidar.tools.integrity.keys import Signer
 from lidar.tools.integrity.marked_clouds import MarkedCloud, cloud_files
 from lidar.tools.integrity.merkle import START, link, signed_message
 from lidar.tools.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
-from lidar.tools.integrity.watermark import SPREAD, Watermark
+from lidar.tools.integrity.watermark import SPREAD, WatermarkKey
 from lidar.tools.sign import SCHEMA, blocks_in
 
 
@@ -205,7 +205,7 @@ def _findings(found: tuple[Finding, ...]) -> str:
 def verify_dataset(
     path: str | Path,
     *,
-    watermark: Watermark | None = None,
+    watermark: WatermarkKey | None = None,
     signer: Signer | None = None,
     noise: float = NOISE,
     false_alarms: float = 0.01,
@@ -240,7 +240,7 @@ def _checksum_report(path: str | Path, *, progress: Progress) -> ChecksumReport:
     folder = Path(path)
     if url := url_of(path):
         folder = cache_folder() / "datasets" / digest(url.encode())
-        Stored(url).mirror(folder, progress=progress)
+        StoredFolder(url).mirror(folder, progress=progress)
     place = Paths(folder).checksums
     if not place.is_file():
         _check_lost(folder, shown(Path(path)))
@@ -294,7 +294,7 @@ def block_text(blocks: Ints, *, world: bool, rings: bool = True, most: int = 4) 
 
 
 def _watermark_report(
-    data: Signable, watermark: Watermark, *, noise: float, false_alarms: float, progress: Progress
+    data: Signable, watermark: WatermarkKey, *, noise: float, false_alarms: float, progress: Progress
 ) -> WatermarkReport:
     found = WatermarkReport(noise, watermark.error_rate(noise))
     jobs = list(cloud_files(data))
@@ -331,7 +331,7 @@ def _watermark_report(
     return found
 
 
-def _check_coarseness(cloud: MarkedCloud, watermark: Watermark) -> None:
+def _check_coarseness(cloud: MarkedCloud, watermark: WatermarkKey) -> None:
     """Raise InputError for coordinates that are rounded so much that no bit can be read."""
     least = (1 - SPREAD) * watermark.step / 2
     if cloud.step >= least:

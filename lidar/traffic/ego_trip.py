@@ -14,7 +14,7 @@ from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.speed_profile import desired_speed
 from lidar.motion.vehicle import Vehicle
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.trips import Course, Driver, driver_on
+from lidar.traffic.trips import Driver, TripCourse, driver_on
 
 _ROOM = (0.4, 0.2)
 """Metres added to length and width of the ego's bounding box, for its deviation from the simulated motion."""
@@ -32,7 +32,7 @@ class EgoTrip:
     xy, heading : (n, 2) and (n,) of the box's centre at each station
     """
 
-    course: Course
+    course: TripCourse
     driver: Driver
     length: float
     width: float
@@ -43,7 +43,7 @@ class EgoTrip:
     leaves: bool = False
     on_foot: bool = False
 
-    def draw(self) -> Course:
+    def draw(self) -> TripCourse:
         """Its course."""
         return self.course
 
@@ -87,5 +87,5 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     if not at_speed:
         desired = rowwise(lambda v, at: np.minimum(v, np.sqrt(2 * acceleration * (at + 0.2))), desired, at)
     path.release()
-    course = Course(actor_path, desired)
+    course = TripCourse(actor_path, desired)
     return EgoTrip(course, driver, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)

@@ -23,9 +23,9 @@ from lidar.traffic.populate import TrafficOptions, TrafficSetup, parked_vehicles
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
-from lidar.traffic.tracks import Tracks, actors_on_ground
+from lidar.traffic.tracks import RoadUserTracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
-from lidar.world.actor_shapes import Shape
+from lidar.world.actor_shapes import ActorShape
 from lidar.world.actors import KNOTS, Actors, existing_actors, first_feature, joined, states
 
 _KINDS: dict[str, tuple[str, ...]] = {
@@ -141,7 +141,7 @@ def _moving(
     speed = np.concatenate([_monotone(np.diff(part[:, 4]) / STEP_S) for part in parts]) / scale
     middle = np.column_stack([x, y])
     foot = np.repeat([shape.kind in _KINDS["pedestrian"] for shape in shapes], knots)
-    tracks = Tracks(
+    tracks = RoadUserTracks(
         shapes=shapes,
         stretch=stretch,
         knots=knots,
@@ -179,7 +179,7 @@ def scene_positions(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
 
 def _body(
     vclass: str, length: float, *, rng: np.random.Generator
-) -> tuple[Shape, tuple[float, float, float]]:
+) -> tuple[ActorShape, tuple[float, float, float]]:
     """A body of a class and its scale factors; not longer than SUMO's vehicle if `_SHORTER` permits."""
     kinds = _KINDS[vclass]
     weight = np.cumsum([VEHICLE_SHARES.get(kind, 1.0) for kind in kinds])

@@ -14,7 +14,7 @@ from lidar.motion.blockwise import rowwise
 from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.trips import Course, Trip
+from lidar.traffic.trips import Trip, TripCourse
 
 _LINE_REACH = 20.0  # metres before a junction within which lines to stop at are heeded
 _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
@@ -22,7 +22,7 @@ _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at whic
 
 def passages(
     trip: Trip | EgoTrip,
-    course: Course,
+    course: TripCourse,
     *,
     graph: RoadGraph,
     plan: JunctionPlan,

@@ -15,8 +15,8 @@ from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
-from lidar.traffic.surroundings import Surroundings
-from lidar.traffic.trips import Course, Drawings, Driver, Trip, random_shape, random_stretch
+from lidar.traffic.surroundings import TrafficArea
+from lidar.traffic.trips import Drawings, Driver, Trip, TripCourse, random_shape, random_stretch
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
@@ -46,7 +46,7 @@ class Sidewalks:
 
 
 def sidewalks_around(
-    lanes: Lanes, area: Surroundings, *, pavement: shapely.Geometry | None, obstacles: NDArray[np.object_]
+    lanes: Lanes, area: TrafficArea, *, pavement: shapely.Geometry | None, obstacles: NDArray[np.object_]
 ) -> Sidewalks:
     """Stretches of sidewalk around the ego, clear of obstacles.
 
@@ -91,7 +91,7 @@ def _clear(line: Float, pavement: shapely.Geometry, *, tree: shapely.STRtree) ->
 
 
 def pedestrian_trips(
-    lanes: Lanes, area: Surroundings, *, walks: Sidewalks, seed: int, density: float
+    lanes: Lanes, area: TrafficArea, *, walks: Sidewalks, seed: int, density: float
 ) -> list[Trip]:
     """Trips of pedestrians that start at random places; each takes a crossing with probability one half.
 
@@ -201,7 +201,7 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
     return found
 
 
-def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, scale: float) -> Course:
+def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, scale: float) -> TripCourse:
     """The course along lines with their crossings, at an even pace."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
@@ -223,7 +223,7 @@ def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, sca
         if number < 0:
             first, last = max(first - _TURN, 0), min(last + _TURN, len(path) - 1)
         crossed.append((first + 1, max(last - 1, first + 2), number))
-    return Course(path, np.full(len(path), pace), tuple(crossed))
+    return TripCourse(path, np.full(len(path), pace), tuple(crossed))
 
 
 def _nearest(path: ActorPath, point: Float, *, about: float) -> int:

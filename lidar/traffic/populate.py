@@ -26,7 +26,7 @@ from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
 from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
-from lidar.traffic.surroundings import Surroundings, ego_line, surroundings_of
+from lidar.traffic.surroundings import TrafficArea, ego_line, surroundings_of
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import moving_actors
 from lidar.traffic.trips import Trip, vehicle_trips
@@ -93,7 +93,7 @@ class TrafficSetup:
 
     lanes: Lanes
     plan: JunctionPlan
-    area: Surroundings
+    area: TrafficArea
     trips: list[Trip]
     obstacles: NDArray[np.object_]
     surfaces: Layer | None
@@ -245,7 +245,7 @@ def parked_vehicles(
 
 
 def _passable(
-    road: shapely.Geometry, obstacles: NDArray[np.object_], *, lanes: Lanes, area: Surroundings
+    road: shapely.Geometry, obstacles: NDArray[np.object_], *, lanes: Lanes, area: TrafficArea
 ) -> shapely.Geometry:
     """The carriageways without buildings that stand on them; bridges and tunnels are kept."""
     buildings = obstacles[shapely.area(obstacles) > _BUILDING_AREA]
@@ -266,7 +266,7 @@ def _swept(trips: list[Trip]) -> Iterator[NDArray[np.object_]]:
         )
 
 
-def _strips(lanes: Lanes, area: Surroundings) -> NDArray[np.object_]:
+def _strips(lanes: Lanes, area: TrafficArea) -> NDArray[np.object_]:
     """Strips (k,) along the lanes around the ego, as wide as a car."""
     lines = [
         polylines.parallel(

@@ -19,7 +19,7 @@ from lidar.traffic.ego_trip import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, signal_group, zone_at
 from lidar.traffic.passages import passages
 from lidar.traffic.simulation_kernel import MOTION, STEP_S
-from lidar.traffic.simulation_windows import EgoBox, Log, Simulation, records
+from lidar.traffic.simulation_windows import EgoBox, Log, TrafficSimulation, records
 from lidar.traffic.trips import Trip
 
 _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
@@ -64,7 +64,7 @@ def simulate_trips(
         return SimulatedTrips(none, none, np.empty(0), np.empty(0))
     known = ego_motion(ego, ego_box, graph=graph)
     signals = plan.signals if obeys_signals else plan.signals._replace(window=green_windows(plan, known))
-    simulation = Simulation(trips, graph, plan=plan, ego=known, signals=signals, radius=radius)
+    simulation = TrafficSimulation(trips, graph, plan=plan, ego=known, signals=signals, radius=radius)
     excluded = np.zeros(len(trips), bool)
     with closing(Log()) as log:
         for _ in range(_ROUNDS):
@@ -114,7 +114,7 @@ def simulate_ego(
     steps = int(np.ceil(seconds / STEP_S)) + 1
     motion = EgoBox(room((steps,), MOTION), np.full(2, -np.inf))
     motion.motion[:] = 0
-    simulation = Simulation(
+    simulation = TrafficSimulation(
         [ego, *trips], graph, plan=plan, ego=motion, signals=plan.signals, radius=radius, ego_row=0
     )
     travelled = np.zeros(steps)

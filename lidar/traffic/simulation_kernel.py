@@ -68,7 +68,7 @@ STATION = np.dtype([(name, np.float64) for name in ("desired_speed", "x", "y", "
 """A station of a path, `STEP` metres after the last: m/s, and pose of the body's centre."""
 
 CELL = np.dtype([(name, np.int32) for name in ("number", "first", "last", "leave")])
-"""A cell that a path covers, see `lidar.traffic.sweep.Sweep`; cells are numbered from 0."""
+"""A cell that a path covers, see `lidar.traffic.sweep.SweptCells`; cells are numbered from 0."""
 
 BLOCK = np.dtype(
     [

@@ -32,7 +32,7 @@ from lidar.traffic.simulation_kernel import (
     unreserved,
 )
 from lidar.traffic.surroundings import LEFT
-from lidar.traffic.sweep import CELL_SIZE, Sweep, cells_under, sweep
+from lidar.traffic.sweep import CELL_SIZE, SweptCells, cells_under, sweep
 from lidar.traffic.trips import Trip
 
 _HORIZON = 60  # steps that the ego's path is known ahead: 6 s
@@ -86,7 +86,7 @@ class _Tables:
     level: Ints
     scale: float
     block: Float
-    sweep: Sweep
+    sweep: SweptCells
 
 
 class Log:
@@ -115,7 +115,7 @@ class Log:
             yield np.frombuffer(block, float).reshape(-1, 4)
 
 
-class Simulation:
+class TrafficSimulation:
     """A simulation of trips around the ego vehicle.
 
     trips   : in the order in which they move within a step; a simulated ego is one of them
@@ -208,7 +208,7 @@ class Simulation:
         level = rowwise(
             lambda edge: np.where(edge >= 0, self._covered[edge], False).astype(np.int64), path.edge
         )
-        return _Tables(station, level, path.scale, block, Sweep.empty())
+        return _Tables(station, level, path.scale, block, SweptCells.empty())
 
     def _around(self, row: int, tables: _Tables, *, state: NDArray[np.void]) -> _Tables:
         """The tables of a trip with its cells in the next window; its ``state`` (1,) is made to fit them."""
@@ -247,7 +247,7 @@ class Simulation:
     ) -> tuple[Movers, EgoMotion, Ints]:
         """The tables of road users with cells numbered from 0, and the numbered cells."""
         trips = [self._trips[row] for row in rows.tolist()]
-        columns = Sweep.concatenate([Sweep.empty(), *(part.sweep for part in tables)])
+        columns = SweptCells.concatenate([SweptCells.empty(), *(part.sweep for part in tables)])
         used, number = np.unique(np.concatenate([columns.cell, known.event_cell]), return_inverse=True)
         mine, its = np.split(number.astype(np.int32), [len(columns)])
         counted = {"station_start": "station", "cell_start": "sweep", "block_start": "block"}

@@ -19,7 +19,7 @@ LEFT = 100.0
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class TrafficArea:
     """The area within ``radius`` of the ego over time.
 
     lines  : (m,) the graph's edges in plan
@@ -57,7 +57,7 @@ class Surroundings:
         return float(self.time[np.argmax(left)] if left.any() else self.time[-1])
 
 
-def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: float) -> Surroundings:
+def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: float) -> TrafficArea:
     """The surroundings of an ego trajectory."""
     lines = edge_lines(lanes.graph)
     seconds = ego.duration_ns * 1e-9
@@ -65,7 +65,7 @@ def surroundings_of(lanes: Lanes, ego: Trajectory, *, radius: float, scale: floa
     xy = ego.at(np.round(time * 1e9).astype(np.int64)).position[:, :2]
     near = shapely.dwithin(lines, ego_line(ego), radius * scale)
     start = shapely.get_coordinates(shapely.get_point(lines, 0)).reshape(-1, 2)
-    return Surroundings(lines, shapely.STRtree(lines), start, near, time, xy, radius, scale)
+    return TrafficArea(lines, shapely.STRtree(lines), start, near, time, xy, radius, scale)
 
 
 def ego_line(ego: Trajectory) -> shapely.Geometry:
@@ -74,7 +74,7 @@ def ego_line(ego: Trajectory) -> shapely.Geometry:
     return shapely.linestrings(xy).simplify(0.2) if np.ptp(xy, axis=0).max() > 0.5 else shapely.points(xy[0])
 
 
-def entrances(lanes: Lanes, area: Surroundings, *, t: float) -> list[tuple[int, float]]:
+def entrances(lanes: Lanes, area: TrafficArea, *, t: float) -> list[tuple[int, float]]:
     """Edges, and shares of their lengths, at which traffic enters the surroundings of the ego at a time.
 
     That is where edges cross the rim inwards, and where they come into the map.

@@ -23,7 +23,7 @@ _SPARE = 0.05 + CELL_SIZE * math.sqrt(0.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep(Columns):
+class SweptCells(Columns):
     """Cells that a body covers along its path, in the order of ``first``.
 
     cell : (q,) int64, the cell's row, column and level as one number
@@ -38,7 +38,7 @@ class Sweep(Columns):
     leave: NDArray[np.int32]
 
     @classmethod
-    def empty(cls) -> Sweep:
+    def empty(cls) -> SweptCells:
         """No cells."""
         none = np.empty(0, np.int32)
         return cls(np.empty(0, np.int64), none, none, none)
@@ -46,7 +46,7 @@ class Sweep(Columns):
 
 def sweep(
     xy: Float, heading: Float, *, length: float, width: float, level: NDArray[np.int64], scale: float
-) -> Sweep:
+) -> SweptCells:
     """The cells that a body covers along a path.
 
     xy, heading : (n, 2) and (n,) of its middle
@@ -58,7 +58,7 @@ def sweep(
     most = int(math.ceil(2 * half[0] / CELL_SIZE) + 2) * int(math.ceil(2 * half[1] / CELL_SIZE) + 2)
     cell, first, last, count = _cover(xy, heading, half, level, most)
     cell, first, last = cell[:count], first[:count], last[:count]
-    return Sweep(cell, first, last, np.argsort(last, kind="stable").astype(np.int32))
+    return SweptCells(cell, first, last, np.argsort(last, kind="stable").astype(np.int32))
 
 
 def body_poses(path: ActorPath, axle: float) -> tuple[Float, Float]:

@@ -16,7 +16,7 @@ from lidar.traffic.lanes import STEP
 from lidar.traffic.simulation import SimulatedTrips
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
-from lidar.world.actor_shapes import STRIDE, Shape, catalogue
+from lidar.world.actor_shapes import STRIDE, ActorShape, catalogue
 from lidar.world.actors import Actors
 from lidar.world.ground import ground_heights
 
@@ -34,7 +34,7 @@ _STEEP, _BANKED = 0.3, 0.15  # radians, maximum pitch and roll
 
 
 def actor_table(
-    shapes: Sequence[Shape],
+    shapes: Sequence[ActorShape],
     stretch: ArrayLike,
     *,
     knots: Ints,
@@ -151,7 +151,7 @@ def _together(rows: Ints, trips: Sequence[Trip], *, counts: Ints) -> Iterator[li
             yield some.tolist()
 
 
-def _tracks(trips: Sequence[Trip], flow: SimulatedTrips, *, counts: Ints) -> Tracks:
+def _tracks(trips: Sequence[Trip], flow: SimulatedTrips, *, counts: Ints) -> RoadUserTracks:
     """Tracks of trips from their motion (k,), one after another; ``counts`` are their numbers of rows."""
     ends = np.concatenate([[0], np.cumsum(counts)])
     n = len(flow.trip)
@@ -164,7 +164,7 @@ def _tracks(trips: Sequence[Trip], flow: SimulatedTrips, *, counts: Ints) -> Tra
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
         hint[part] = np.interp(at, stations, path.xyz[:, 2])
-    return Tracks(
+    return RoadUserTracks(
         shapes=[trip.shape for trip in trips],
         stretch=[trip.stretch for trip in trips],
         knots=counts,
@@ -189,7 +189,7 @@ class Knots(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
+class RoadUserTracks:
     """Motion of road users (n) in plan; each has ``knots`` of the rows (k), which are `STEP_S` apart.
 
     shapes      : (n,) bodies
@@ -201,7 +201,7 @@ class Tracks:
     speed, travelled : (k,) m/s and metres covered
     """
 
-    shapes: Sequence[Shape]
+    shapes: Sequence[ActorShape]
     stretch: Sequence[tuple[float, float, float]]
     knots: NDArray[np.int64]
     step: NDArray[np.int64]
@@ -212,7 +212,7 @@ class Tracks:
     travelled: Float
 
 
-def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
+def actors_on_ground(scene: Scene, tracks: RoadUserTracks, *, scale: float) -> Actors:
     """Actors (n) that follow tracks on the scene's ground."""
     motion = knots_on_ground(scene, tracks, scale=scale)
     return actor_table(
@@ -220,7 +220,7 @@ def actors_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Actors:
     )
 
 
-def knots_on_ground(scene: Scene, tracks: Tracks, *, scale: float) -> Knots:
+def knots_on_ground(scene: Scene, tracks: RoadUserTracks, *, scale: float) -> Knots:
     """Knots (k) of actors that follow tracks on the scene's ground."""
     shapes, stretch, knots = tracks.shapes, tracks.stretch, tracks.knots
     middle, yaw, travelled = tracks.middle, tracks.yaw, tracks.travelled

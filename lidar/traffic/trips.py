@@ -13,9 +13,9 @@ from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
 from lidar.motion.road_conditions import DRY, GRAVITY, RoadConditions
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
-from lidar.traffic.surroundings import Surroundings, entrances
+from lidar.traffic.surroundings import TrafficArea, entrances
 from lidar.traffic.sweep import body_poses, rectangles
-from lidar.world.actor_shapes import PAINTS, Shape, catalogue
+from lidar.world.actor_shapes import PAINTS, ActorShape, catalogue
 
 _STATIONS = 1 << 19
 """Stations of courses that are kept in memory: 40 MB."""
@@ -94,7 +94,7 @@ VEHICLE_SHARES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class TripCourse:
     """The path of a trip, and how fast it is followed.
 
     path          : n stations
@@ -111,10 +111,10 @@ class Drawings:
     """Courses and the functions that draw them; those drawn last are kept, up to `_STATIONS` in total."""
 
     def __init__(self) -> None:
-        self._kept: dict[Callable[[], Course], Course] = {}
+        self._kept: dict[Callable[[], TripCourse], TripCourse] = {}
         self._stations = 0
 
-    def of(self, draw: Callable[[], Course]) -> Course:
+    def of(self, draw: Callable[[], TripCourse]) -> TripCourse:
         """The course that a function draws, the same at each call."""
         course = self._kept.get(draw)
         if course is None:
@@ -139,9 +139,9 @@ class Trip:
     on_foot  : whether it is a pedestrian
     """
 
-    shape: Shape
+    shape: ActorShape
     stretch: tuple[float, float, float]
-    draw: Callable[[], Course]
+    draw: Callable[[], TripCourse]
     driver: Driver
     begin: int
     appear_s: float
@@ -170,7 +170,7 @@ class Trip:
 
 def vehicle_trips(
     lanes: Lanes,
-    area: Surroundings,
+    area: TrafficArea,
     *,
     seed: int,
     density: float,
@@ -215,7 +215,7 @@ def vehicle_trips(
 
 def _trip(
     lanes: Lanes,
-    area: Surroundings,
+    area: TrafficArea,
     *,
     drawings: Drawings,
     rng: np.random.Generator,
@@ -271,13 +271,13 @@ def _trip(
     return None
 
 
-def _course(whole: Callable[[], ActorPath], stations: slice, *, driver: Driver, pace: float) -> Course:
+def _course(whole: Callable[[], ActorPath], stations: slice, *, driver: Driver, pace: float) -> TripCourse:
     """The course along some stations of a path."""
     path = whole().take(stations)
-    return Course(path, speed_profile(path, driver, pace=pace))
+    return TripCourse(path, speed_profile(path, driver, pace=pace))
 
 
-def random_shape(kind: str, rng: np.random.Generator) -> Shape:
+def random_shape(kind: str, rng: np.random.Generator) -> ActorShape:
     """A body of a kind in a random colour; pedestrians and riders in the first of their poses."""
     bodies = [
         s
@@ -299,7 +299,7 @@ def random_stretch(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _stations_on_carriageway(
-    path: ActorPath, shape: Shape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
+    path: ActorPath, shape: ActorShape, *, grow: Sequence[float], ground: shapely.Geometry | None, begin: int
 ) -> tuple[int, int]:
     """First and last station (exclusive) around ``begin`` between which the body stays on the carriageway."""
     if ground is None:

@@ -32,7 +32,7 @@ from lidar.world.people import person, rider
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class ActorShape:
     """A body that actors are instances of.
 
     name   : kind and variant: ``sedan/white``
@@ -356,7 +356,7 @@ def _parts(kind: str, paint: Rgb) -> list[Mesh]:
 
 
 @functools.cache
-def catalogue() -> dict[str, Shape]:
+def catalogue() -> dict[str, ActorShape]:
     """All shapes by name, in a fixed order. People have `STRIDE` walking poses and one standing."""
     made: list[tuple[str, str, float, list[Mesh]]] = []
     paints = {name: color for name, (color, _) in PAINTS.items()}
@@ -391,14 +391,14 @@ def catalogue() -> dict[str, Shape]:
     return {shape.name: shape for poses in figures.values() for shape in _shapes(poses)}
 
 
-def _shapes(poses: list[tuple[str, str, float, Mesh]]) -> list[Shape]:
+def _shapes(poses: list[tuple[str, str, float, Mesh]]) -> list[ActorShape]:
     """The poses of one figure, in one box that holds all of them."""
     points = np.concatenate([mesh.vertices for _, _, _, mesh in poses])
     low, high = points.min(axis=0), points.max(axis=0)
     length, width, _ = (high - low).tolist()
     middle = [*(-(low + high)[:2] / 2), 0.0]
     return [
-        Shape(
+        ActorShape(
             name, kind, Class(int(mesh.klass[0])), length, width, float(high[2]), base, mesh.shifted(middle)
         )
         for name, kind, base, mesh in poses

@@ -15,7 +15,7 @@ from geoscene.support.columns import Columns, row_blocks
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.geometry.poses import BLOCK_POSES, release, room
-from lidar.world.actor_shapes import Shape
+from lidar.world.actor_shapes import ActorShape
 
 Region = tuple[float, float, float, float]
 
@@ -47,7 +47,7 @@ class Actors(Columns):
     scale    : scene metres per true metre
     """
 
-    shapes: tuple[Shape, ...]
+    shapes: tuple[ActorShape, ...]
     shape: NDArray[np.int32]
     poses: NDArray[np.int32]
     stride: Float
@@ -212,7 +212,7 @@ def _within(actors: Actors, rows: NDArray[np.int64], *, region: Region, time_ns:
 
 def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
     """Actors of several groups as one, features numbered from ``first_feature``."""
-    shapes: dict[str, Shape] = {}
+    shapes: dict[str, ActorShape] = {}
     for group in groups:
         shapes |= {shape.name: shape for shape in group.shapes}
     number = {name: k for k, name in enumerate(shapes)}

@@ -18,20 +18,20 @@ _ROOM = "plaster"
 """Material of the rooms behind panes."""
 
 
-class Openings(NamedTuple):
+class TileOpenings(NamedTuple):
     """The openings of a tile: tables of their geometry, and the surfaces of their additional faces."""
 
     tables: WallTables
     surfaces: Surfaces
 
 
-def openings_of(relief: WallRelief, *, origin: Float, bits: NDArray[np.uint32]) -> Openings:
+def openings_of(relief: WallRelief, *, origin: Float, bits: NDArray[np.uint32]) -> TileOpenings:
     """The openings of a tile with its origin (3,) in scene metres; ``bits`` (256,) are masks by material."""
     pairs = pairs_of(relief)
     kinds = relief.openings.take(pairs.kind)
     n = PARTS * len(pairs.kind)
     room = np.full(len(pairs.kind), materials()[_ROOM].code, np.uint8)
-    return Openings(
+    return TileOpenings(
         tables_of(relief, pairs, origin=origin, bits=bits),
         Surfaces(
             feature=np.repeat(relief.facades.feature[pairs.wall], PARTS).astype(np.int32),

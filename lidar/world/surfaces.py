@@ -50,7 +50,7 @@ class Surfaces(Columns):
     color: NDArray[np.uint8]
 
 
-class Faces(NamedTuple):
+class SurfaceFaces(NamedTuple):
     """Attributes of the faces of a world, for compiled code.
 
     A hit is on row ``face + start[instance]`` of ``packed``, a miss (both -1) on its last.
@@ -71,7 +71,7 @@ class Faces(NamedTuple):
 
 
 def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
-    """The column `Faces.packed` of surfaces and of their kinds of leaves (none by default)."""
+    """The column `SurfaceFaces.packed` of surfaces and of their kinds of leaves (none by default)."""
     column = surfaces.feature.astype(np.int64) << 32
     if leaves is not None:
         column |= leaves.astype(np.int64) << 16
@@ -88,7 +88,7 @@ def surfaces_at(
     start: NDArray[np.int64],
     named: NDArray[np.int32],
 ) -> Surfaces:
-    """Rows of a table of surfaces for hits (n,), as `Faces` describes ``start`` and ``named``."""
+    """Rows of a table of surfaces for hits (n,), as `SurfaceFaces` describes ``start`` and ``named``."""
     n = len(face)
     out = Surfaces(*(np.empty((n, *column.shape[1:]), column.dtype) for column in table.columns().values()))
     _take(tuple(table.columns().values()), face, instance, start, named, tuple(out.columns().values()))
@@ -115,7 +115,7 @@ def _take_one(table: Any, face: Any, instance: Any, start: Any, named: Any, out:
 
 
 @njit(cache=True, nogil=True)
-def label_hits(faces: Faces, face: Any, instance: Any, klass: Any, feature: Any) -> None:
+def label_hits(faces: SurfaceFaces, face: Any, instance: Any, klass: Any, feature: Any) -> None:
     """Fill ``klass`` and ``feature`` of hits (n,): 0 and -1 for misses."""
     start, named, rows = faces.start, faces.named, faces.packed
     for i in range(len(face)):

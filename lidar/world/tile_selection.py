@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from lidar.world.settings import WorldSettings
@@ -60,7 +60,7 @@ def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: M
         mesh=tile.mesh.take(keep),
         relief=None if relief is None else replace(relief, wall=relief.wall[keep]),
         extras=None,
-        instances=Instances.concatenate([mapped.take(np.flatnonzero(kept)), forest]),
+        instances=ShapeInstances.concatenate([mapped.take(np.flatnonzero(kept)), forest]),
     )
 
 

@@ -16,7 +16,7 @@ from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.raycast import Caster, Geometry, Hits, Instances
+from lidar.raycast import Caster, Geometry, Hits, MeshInstances
 from lidar.raycast.geometry import split
 from lidar.raycast.refine import Refiner
 from lidar.raycast.relief import (
@@ -39,7 +39,7 @@ from lidar.world.surfaces import (
     OPEN,
     SOLID,
     WATER,
-    Faces,
+    SurfaceFaces,
     Surfaces,
     mask_bits,
     packed,
@@ -96,7 +96,7 @@ def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Ca
 class _Placed(NamedTuple):
     """Instances, and the number (k,) of each one's shape among all shapes, and its feature (k,)."""
 
-    instances: Instances
+    instances: MeshInstances
     shape: NDArray[np.int32]
     feature: NDArray[np.int32]
 
@@ -129,7 +129,7 @@ class _Shapes:
             raise InputError(f"an instance has a shape number beyond the {len(self.meshes)} shapes")
         used, own = np.unique(shape, return_inverse=True)
         casters = tuple(self._caster(number) for number in used.tolist())
-        return _Placed(Instances(casters, own.astype(np.int32), transform), shape, feature)
+        return _Placed(MeshInstances(casters, own.astype(np.int32), transform), shape, feature)
 
 
 class World:
@@ -294,7 +294,7 @@ class World:
         return self.settings.reach
 
     @property
-    def faces(self) -> Faces:
+    def faces(self) -> SurfaceFaces:
         """Attributes of all faces, for compiled code."""
         return self._faces
 
@@ -404,7 +404,7 @@ class World:
         if len(self._feature):
             low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
         leaves = np.array([0.0, *self._leaves.values()])
-        self._faces = Faces(self._base, self._feature, self._packed, low, high, leaves)
+        self._faces = SurfaceFaces(self._base, self._feature, self._packed, low, high, leaves)
 
     def _static(self) -> _Placed:
         tiles = self._tiles.values()
@@ -416,7 +416,7 @@ class World:
         )
 
     @property
-    def _instances(self) -> list[Instances]:
+    def _instances(self) -> list[MeshInstances]:
         return [self._still.instances, self._moving.instances]
 
 

@@ -8,7 +8,7 @@ from helpers import ROOT
 from helpers.programs import ENVIRONMENT, command
 
 from lidar.tools.selftest import run
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.cases import CASES, GROUPS
 from lidar.tools.selftest.regions import CASES as REGIONS
 from lidar.tools.selftest.scale import CASES as SCALE
@@ -32,8 +32,8 @@ def broken(count):
 
 
 FAILING = (
-    Case("rays", "too much", 1.0, "m", too_much, "rays", 1, 1, "nothing"),
-    Case("rays", "an error", 1.0, "m", broken, "rays", 1, 1, "nothing"),
+    ExtremeCase("rays", "too much", 1.0, "m", too_much, "rays", 1, 1, "nothing"),
+    ExtremeCase("rays", "an error", 1.0, "m", broken, "rays", 1, 1, "nothing"),
 )
 
 

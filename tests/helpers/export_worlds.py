@@ -8,7 +8,7 @@ import shapely
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Mesh, ShapeInstances, concatenate
 from geoscene.objects.shapes import place, shapes
 from geoscene.objects.solids import prism, rectangle
 from geoscene.scene import open_scene
@@ -142,7 +142,7 @@ def write_world(path, crs="utm", *, at=(13.35, 52.51)):
     x, y, height = np.array(TREES).T
     base = np.column_stack([x, y, SLOPE * x])
     feature = tree + np.arange(3)
-    copies = Instances.concatenate(
+    copies = ShapeInstances.concatenate(
         [
             place(
                 "trunk", base, size=np.column_stack([0.03 * height, 0.03 * height, 0.6 * height]),

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from geoscene.buildings.facades import Facades, Openings, WallRelief
+from geoscene.buildings.facades import FacadeTable, Openings, WallRelief
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import WALL, Mesh
 
@@ -64,7 +64,7 @@ def random_relief(rng, *, columns=3, rows=3, kinds=4, angle=None, foot=None, fea
     cell, ground = rng.uniform(2, 4, 2), rng.uniform(3.0, 5.0)
     start = rng.uniform(0.1, 1.0, 2)
     size = 2 * start + [columns * cell[0], ground + (rows - 1) * cell[1]]
-    facades = Facades(
+    facades = FacadeTable(
         feature=np.array([feature], np.int32),
         foot=foot[None],
         tangent=np.array([[np.cos(angle), np.sin(angle)]]),
@@ -213,7 +213,7 @@ def with_windows(mesh):
             rows.append((feature, foot, tangent, (np.ptp(along), high - low), grid))
     feature, foot, tangent, size, grid = (np.array(column) for column in zip(*rows, strict=True))
     k, cells = len(rows), grid.prod(axis=1)
-    facades = Facades(
+    facades = FacadeTable(
         feature.astype(np.int32),
         foot,
         tangent,

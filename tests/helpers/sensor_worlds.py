@@ -14,7 +14,7 @@ from lidar.raycast.relief import NO_WALLS, WallRefiner, joined
 from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of
-from lidar.world.surfaces import MISS, Faces, Surfaces, mask_bits, packed, surfaces_of
+from lidar.world.surfaces import MISS, SurfaceFaces, Surfaces, mask_bits, packed, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 
@@ -57,7 +57,9 @@ class MeshWorld:
         surfaces = self.surfaces
         what = np.append(packed(surfaces, surfaces.klass == Class.HEDGE), np.int64(-1) << 32)
         low, high = int(surfaces.feature.min()), int(surfaces.feature.max())
-        return Faces(np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES]))
+        return SurfaceFaces(
+            np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES])
+        )
 
     def lookup(self, hits):
         return Surfaces.concatenate([self.surfaces, MISS]).take(hits.face)

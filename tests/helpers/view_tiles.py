@@ -4,9 +4,9 @@ import zlib
 
 import numpy as np
 
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.scene.tile_files import Tile
-from geoscene.view.looks import Facades
+from geoscene.view.looks import FacadeLooks
 from geoscene.view.tiles import SCALE, TURN, _turned
 
 
@@ -29,7 +29,7 @@ def unpack_tile(header, data):
     owner, base = column("<i4", b), column("<f4", b)
     vertices = column("<u2", n, 3) * header["step"]
     klass, material, surface, color = column("u1", m), column("u1", m), column("u1", m), column("u1", m, 3)
-    facades = Facades(owner, base, column("u1", b, 4))
+    facades = FacadeLooks(owner, base, column("u1", b, 4))
     columns, size, kind = (6, 2, "<u2") if header["upright"] else (12, 4, "<f4")
     planes = np.moveaxis(column("u1", columns, size, k), 1, 2)
     places = np.ascontiguousarray(planes).view(kind).reshape(columns, k)
@@ -42,7 +42,7 @@ def unpack_tile(header, data):
     shape = np.repeat(
         np.array([run[1] for run in header["runs"]], np.int32), [run[2] for run in header["runs"]]
     ).astype(np.int32)
-    tile = Tile(np.array(header["base"]) * header["step"], mesh, Instances(shape, transform, copied))
+    tile = Tile(np.array(header["base"]) * header["step"], mesh, ShapeInstances(shape, transform, copied))
     return tile, facades
 
 

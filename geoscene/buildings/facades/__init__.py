@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 from geoscene.support.lazy import lazily
 
 if TYPE_CHECKING:
-    from geoscene.buildings.facades.description import Facades as Facades
+    from geoscene.buildings.facades.description import FacadeTable as FacadeTable
     from geoscene.buildings.facades.description import Openings as Openings
     from geoscene.buildings.facades.description import WallRelief as WallRelief
     from geoscene.buildings.facades.layout import Layout as Layout
     from geoscene.buildings.facades.layout import wall_relief as wall_relief
-    from geoscene.buildings.facades.setting import Setting as Setting
+    from geoscene.buildings.facades.setting import FacadeSetting as FacadeSetting
     from geoscene.buildings.facades.setting import read_setting as read_setting
 
 __getattr__ = lazily(
     __name__,
     {
-        "Facades": "description",
+        "FacadeTable": "description",
         "Layout": "layout",
         "Openings": "description",
-        "Setting": "setting",
+        "FacadeSetting": "setting",
         "WallRelief": "description",
         "read_setting": "setting",
         "wall_relief": "layout",

@@ -20,7 +20,7 @@ T = TypeVar("T", bound=np.generic)
 
 @dataclass(frozen=True, slots=True)
 class Openings(Columns):
-    """Kinds of openings, one row each; many cells of `Facades` share one. Metres.
+    """Kinds of openings, one row each; many cells of `FacadeTable` share one. Metres.
 
     A cell is a rectangle of the wall with the coordinates x to the right (seen from outside) and y up from
     its lower left corner, and z the depth behind the plane of the wall. Behind the plane lie three layers,
@@ -66,7 +66,7 @@ class Openings(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Facades(Columns):
+class FacadeTable(Columns):
     """Flat upright walls of buildings with openings, one row each; coordinates of the tile, metres.
 
     The cells of a wall are a grid: columns of one width from ``start`` on, a ground floor and storeys of one
@@ -105,7 +105,7 @@ class WallRelief:
     wall     : (m,) int32, row of ``facades`` of each face of the tile's mesh, -1 for other faces
     """
 
-    facades: Facades
+    facades: FacadeTable
     cells: NDArray[np.int32]
     openings: Openings
     wall: NDArray[np.int32]
@@ -118,7 +118,7 @@ class WallRelief:
             return np.empty((0, *width), kind)
 
         real, count, code = np.float64, np.int32, np.uint8
-        facades = Facades(
+        facades = FacadeTable(
             none(count), none(real, 3), none(real, 2), none(real, 2), none(real, 2), none(real, 2),
             none(real), none(count, 2), none(count),
         )  # fmt: skip

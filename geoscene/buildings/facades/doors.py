@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from geoscene.buildings.facades.fit import OUT, Sheet
-from geoscene.buildings.facades.grids import Cells, Elevations, nth
+from geoscene.buildings.facades.grids import Elevations, FacadeCells, nth
 from geoscene.buildings.facades.kinds import DOOR, GATE
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
@@ -55,7 +55,7 @@ def facing_street(at: Elevations) -> Bools:
     return facing
 
 
-def _door_boxes(cells: Cells, cell: Ints, *, middle: Float, size: Float) -> Float:
+def _door_boxes(cells: FacadeCells, cell: Ints, *, middle: Float, size: Float) -> Float:
     """Openings (m, 4) of doors in cells: on a step above the ground in front, on a grid of 10 cm."""
     lift = cells.ground[cells.upright[cell]] - cells.floor[cell]
     low = np.ceil(np.maximum(lift, 0.0) * 10 - 1e-6) / 10 + 0.1

@@ -8,9 +8,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.facades.setting import Setting
+from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.styles import Styles
-from geoscene.buildings.facades.walls import Walls
+from geoscene.buildings.facades.walls import FacadeWalls
 from geoscene.geometry.mesh import Mesh
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Height, Ints
@@ -48,7 +48,7 @@ class Grids(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Cells:
+class FacadeCells:
     """All cells of the walls, row by row from below.
 
     wall, column, storey : (c,) int64; storeys count from the ground floor of the building
@@ -84,11 +84,11 @@ class Elevations:
     height  : z of the ground at x, y; None if it is 0 everywhere
     """
 
-    walls: Walls
+    walls: FacadeWalls
     grids: Grids
     styles: Styles
-    cells: Cells
-    setting: Setting
+    cells: FacadeCells
+    setting: FacadeSetting
     mesh: Mesh
     of_face: NDArray[np.int32]
     base: Float
@@ -97,8 +97,8 @@ class Elevations:
     @classmethod
     def of(
         cls,
-        walls: Walls,
-        setting: Setting,
+        walls: FacadeWalls,
+        setting: FacadeSetting,
         *,
         mesh: Mesh,
         of_face: NDArray[np.int32],
@@ -121,7 +121,7 @@ class Elevations:
         return cls(walls, grids, styles, cells, setting, mesh, number[of_face], base, height)
 
 
-def _table_rows(walls: Walls, setting: Setting, *, base: Float) -> Ints:
+def _table_rows(walls: FacadeWalls, setting: FacadeSetting, *, base: Float) -> Ints:
     """Row of the table (k,) of each wall: its building, or the part just behind it at half its height."""
     table = setting.buildings
     row = walls.feature.astype(np.int64)
@@ -140,7 +140,7 @@ def _table_rows(walls: Walls, setting: Setting, *, base: Float) -> Ints:
     return row
 
 
-def _grids(walls: Walls, setting: Setting, *, row: Ints, base: Float) -> Grids:
+def _grids(walls: FacadeWalls, setting: FacadeSetting, *, row: Ints, base: Float) -> Grids:
     styles, table = setting.styles.take(row), setting.buildings
     zero = base[walls.feature]
     bottom = walls.foot[:, 2] - zero
@@ -179,7 +179,7 @@ def _grids(walls: Walls, setting: Setting, *, row: Ints, base: Float) -> Grids:
     )
 
 
-def _cells(walls: Walls, grids: Grids, *, styles: Styles, height: Height | None) -> Cells:
+def _cells(walls: FacadeWalls, grids: Grids, *, styles: Styles, height: Height | None) -> FacadeCells:
     """The cells of grids."""
     columns, rows = grids.count.T
     wall = np.repeat(np.arange(len(walls)), columns * rows)
@@ -190,7 +190,7 @@ def _cells(walls: Walls, grids: Grids, *, styles: Styles, height: Height | None)
     before = np.cumsum(columns) - columns
     of = np.repeat(np.arange(len(walls)), columns)
     middle = grids.start[of] + grids.middle[of] + nth(columns) * grids.cell[of, 0]
-    return Cells(
+    return FacadeCells(
         wall,
         column,
         storey,
@@ -207,7 +207,7 @@ def nth(sizes: Ints) -> Ints:
     return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
 
 
-def _ground(walls: Walls, grids: Grids, *, of: Ints, middle: Float, height: Height | None) -> Float:
+def _ground(walls: FacadeWalls, grids: Grids, *, of: Ints, middle: Float, height: Height | None) -> Float:
     """Height (u,) of the highest ground in front of each column, above the building's base."""
     if height is None:
         return -grids.zero[of]

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.buildings.facades.attached import Attached, attach, without_touching
-from geoscene.buildings.facades.description import Facades, WallRelief
+from geoscene.buildings.facades.description import FacadeTable, WallRelief
 from geoscene.buildings.facades.doors import facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.fit import Sheet
 from geoscene.buildings.facades.grids import Elevations, nth
 from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_openings
-from geoscene.buildings.facades.setting import Setting
+from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.solids import are_simple
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.geometry.mesh import Mesh
@@ -49,7 +49,7 @@ class Layout:
 
 
 def wall_relief(
-    mesh: Mesh, setting: Setting, *, base: Float, height: Height | None, guess: bool = False
+    mesh: Mesh, setting: FacadeSetting, *, base: Float, height: Height | None, guess: bool = False
 ) -> Layout:
     """The relief of the walls of a mesh of buildings.
 
@@ -76,7 +76,7 @@ def wall_relief(
     index = index[kept[cells.wall]]
     walls, grids = walls.take(kept), grids.take(kept)
     sizes = grids.count.prod(axis=1)
-    facades = Facades(
+    facades = FacadeTable(
         walls.feature,
         walls.foot,
         walls.tangent,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.facades.styles import Styles, choose_styles
 from geoscene.buildings.table import Buildings
 from geoscene.geometry.frames import Frame
-from geoscene.sources.data import OsmData, Point, Tags
+from geoscene.sources.data import OsmData, TaggedNode, Tags
 from geoscene.support.columns import Columns
 from geoscene.tags import first_value, parse_length
 from geoscene.typing import Float, Ints
@@ -63,7 +63,7 @@ class Shops(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class FacadeSetting:
     """Map-wide data for the facades of any tile; no tile depends on its neighbours being built.
 
     buildings : the table
@@ -94,7 +94,7 @@ class Setting:
 
 def read_setting(
     osm: OsmData, frame: Frame, *, buildings: Buildings, streets: NDArray[np.object_]
-) -> Setting:
+) -> FacadeSetting:
     """The setting of all facades of a map.
 
     streets : (m,) centre lines of drivable roads, scene metres; pedestrian streets are added
@@ -102,7 +102,7 @@ def read_setting(
     named = set(buildings.osm_id[: buildings.count].tolist())
     tags = {area.osm_id: area.tags for area in osm.areas if area.osm_id in named}
     rows = np.flatnonzero(buildings.drawn)
-    return Setting(
+    return FacadeSetting(
         buildings,
         choose_styles(buildings, tags),
         shapely.STRtree(buildings.footprint[rows]),
@@ -120,7 +120,7 @@ def _pedestrian_streets(osm: OsmData, frame: Frame) -> NDArray[np.object_]:
     return np.fromiter(lines, object, len(lines))
 
 
-def _places(points: list[Point], frame: Frame) -> Float:
+def _places(points: list[TaggedNode], frame: Frame) -> Float:
     """Scene coordinates (n, 2) of points."""
     lon, lat = np.array([p.lon for p in points], float), np.array([p.lat for p in points], float)
     return np.column_stack(frame.from_geographic(lon, lat)).reshape(-1, 2)

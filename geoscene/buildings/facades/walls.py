@@ -21,7 +21,7 @@ _TURN = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Walls(Columns):
+class FacadeWalls(Columns):
     """Flat upright walls, sorted by feature: connected faces of one feature in one plane.
 
     feature : (k,) int32
@@ -49,7 +49,7 @@ class Walls(Columns):
         return self.foot[wall, :2] + u[:, None] * self.tangent[wall] + away * self.outwards[wall]
 
 
-def find_walls(mesh: Mesh) -> tuple[Walls, NDArray[np.int32]]:
+def find_walls(mesh: Mesh) -> tuple[FacadeWalls, NDArray[np.int32]]:
     """The walls of a mesh of buildings, and the row (m,) of the wall of each face, -1 for none."""
     normal = mesh.normals()
     corners = mesh.vertices[mesh.faces]
@@ -66,8 +66,8 @@ def find_walls(mesh: Mesh) -> tuple[Walls, NDArray[np.int32]]:
     return walls, of_face
 
 
-def _none() -> Walls:
-    return Walls(
+def _none() -> FacadeWalls:
+    return FacadeWalls(
         np.empty(0, np.int32), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2)), np.empty(0, object)
     )
 
@@ -115,7 +115,7 @@ def _connected(corners: Float, bearing: Ints) -> Ints:
 
 def _measured(
     corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: Ints, area: Float
-) -> tuple[Walls, Ints]:
+) -> tuple[FacadeWalls, Ints]:
     """The walls, sorted by feature and place, and the row (m,) of each face."""
     _, first, wall = np.unique(wall, return_index=True, return_inverse=True)
     k = len(first)
@@ -135,11 +135,11 @@ def _measured(
     row = np.empty(k, np.int64)
     row[order] = np.arange(k)
     size = np.column_stack([right - left, high - low])
-    walls = Walls(feature[first], foot, tangent, size, np.full(k, None, object)).take(order)
+    walls = FacadeWalls(feature[first], foot, tangent, size, np.full(k, None, object)).take(order)
     return replace(walls, polygon=_polygons(walls, corners, wall=row[wall], area=area)), row[wall]
 
 
-def _polygons(walls: Walls, corners: Float, *, wall: Ints, area: Float) -> NDArray[np.object_]:
+def _polygons(walls: FacadeWalls, corners: Float, *, wall: Ints, area: Float) -> NDArray[np.object_]:
     """The polygons (k,) of walls that are no rectangles, None for the others."""
     total = np.bincount(wall, weights=area, minlength=len(walls))
     odd: Bools = np.abs(total - walls.size.prod(axis=1)) > 1e-3

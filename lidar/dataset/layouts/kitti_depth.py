@@ -18,7 +18,7 @@ from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import cloud_points, scanner_clouds
-from lidar.dataset.seen_points import View, motions_of, returns_of, views_of
+from lidar.dataset.seen_points import ImageView, motions_of, returns_of, views_of
 from lidar.errors import DatasetError
 from lidar.sensors.camera.png import DEPTH_SCALE, depth_to_counts, write_png
 from lidar.sensors.rig.camera_model import intrinsic_matrix
@@ -75,14 +75,14 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     return {"images": done, "depths": depths}
 
 
-def _channels(views: Sequence[View]) -> list[str]:
+def _channels(views: Sequence[ImageView]) -> list[str]:
     """Names of cameras in this layout: ``image_02`` of image_2, and free numbers for other names."""
     own = [re.fullmatch(r"image_(\d)", view.camera.name) for view in views]
     free = iter(sorted(set(range(len(views) + 10)) - {int(found[1]) for found in own if found}))
     return [f"image_{int(found[1]) if found else next(free):02d}" for found in own]
 
 
-def _depth_file(dataset: Dataset, view: View, *, row: int) -> Path:
+def _depth_file(dataset: Dataset, view: ImageView, *, row: int) -> Path:
     return dataset.frame_file(
         dataset.paths.image(view.camera.name, int(view.images.frames[row]), kind="depth")
     )

@@ -26,7 +26,7 @@ CLASSES = {
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TrackedBox:
     """A box of a road user in an image.
 
     track, image : from 0
@@ -84,7 +84,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     return {"images": done, "tracks": len(tracks), "boxes": boxes}
 
 
-def sequence(dataset: Dataset, stream: Stream) -> list[Line]:
+def sequence(dataset: Dataset, stream: Stream) -> list[TrackedBox]:
     """The boxes in a camera's images, by track and image."""
     number = {frame: k for k, frame in enumerate(stream.frames.tolist())}
     side = [int(stream.sensor[name]) - 1 for name in ("width", "height")]
@@ -95,5 +95,5 @@ def sequence(dataset: Dataset, stream: Stream) -> list[Line]:
             top, bottom = (min(max(box[name], 0.0), side[1]) for name in ("top", "bottom"))
             kind = CLASSES[Class[box["class"].upper()]]
             place = (left, top, right, bottom)
-            lines.append(Line(box["id"], number[box["frame"]], place, kind, float(box["visibility"])))
+            lines.append(TrackedBox(box["id"], number[box["frame"]], place, kind, float(box["visibility"])))
     return sorted(lines, key=lambda line: (line.track, line.image))

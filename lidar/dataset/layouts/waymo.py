@@ -23,7 +23,13 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.layouts.waymo_parquet import DISTORTION, SHUTTER, Component, Row
-from lidar.dataset.layouts.waymo_range_images import Grid, grid_of, laser_calibration, pixels, range_images
+from lidar.dataset.layouts.waymo_range_images import (
+    RangeImageGrid,
+    grid_of,
+    laser_calibration,
+    pixels,
+    range_images,
+)
 from lidar.dataset.recorded import (
     Stream,
     cloud_points,
@@ -107,7 +113,7 @@ class _Drive:
 
     dataset: Dataset
     context: str
-    lasers: tuple[Grid, ...]
+    lasers: tuple[RangeImageGrid, ...]
     cameras: dict[int, Stream]
     trajectory: Trajectory
     near: dict[str, Ints]
@@ -161,11 +167,11 @@ def _written(drive: _Drive) -> list[str]:
     return tags + (["camera_box", "camera_to_lidar_box_association"] if any(drive.flat.values()) else [])
 
 
-def _lasers(dataset: Dataset) -> tuple[Grid, ...]:
+def _lasers(dataset: Dataset) -> tuple[RangeImageGrid, ...]:
     """Grids of the scanners that have rows of one elevation, five at most."""
     with reading_file(dataset.paths.manifest):
         devices = {device.name: device for device in scanners(rig_of(dataset.manifest["recipe"]["rig"]))}
-    found: list[Grid] = []
+    found: list[RangeImageGrid] = []
     for name in dataset.sensors("lidar"):
         stream = labelled_clouds(dataset, name)
         if stream is None:

@@ -30,7 +30,7 @@ _EMPTY = -1.0
 
 
 @dataclass(frozen=True)
-class Grid:
+class RangeImageGrid:
     """The range images of a scanner.
 
     number      : from 1, of its name
@@ -60,16 +60,16 @@ class Grid:
         return column
 
 
-def grid_of(device: Scanner, stream: Stream, *, number: int) -> Grid:
+def grid_of(device: Scanner, stream: Stream, *, number: int) -> RangeImageGrid:
     """The grid of a scanner: elevations of its rings, and firing blocks of a turn."""
     sent = firings(device.sensor, 0)
     count = np.bincount(sent.ring)
     x, y, z = sent.direction.T
     inclination = np.bincount(sent.ring, np.arctan2(z, np.hypot(x, y))) / count
-    return Grid(number, stream, inclination, _FINE * (int(sent.column.max()) + 1))
+    return RangeImageGrid(number, stream, inclination, _FINE * (int(sent.column.max()) + 1))
 
 
-def pixels(grid: Grid, table: Table) -> tuple[Ints, Ints]:
+def pixels(grid: RangeImageGrid, table: Table) -> tuple[Ints, Ints]:
     """Rows (k,) of the points of a cloud that get a pixel, and (k,) its number: image, row and column.
 
     Of points with the same pixel the first one gets it.
@@ -85,7 +85,7 @@ def pixels(grid: Grid, table: Table) -> tuple[Ints, Ints]:
 
 
 def range_images(
-    grid: Grid, trajectory: Trajectory, *, row: int, boxes: Iterable[Mapping[str, Any]] | None
+    grid: RangeImageGrid, trajectory: Trajectory, *, row: int, boxes: Iterable[Mapping[str, Any]] | None
 ) -> tuple[dict[str, Row], int]:
     """Range, pose and label images of a frame by component, and the number of points left out.
 
@@ -137,7 +137,7 @@ def _images(values: NDArray[Any], *, shape: Sequence[int], returns: int = RETURN
     return row
 
 
-def laser_calibration(grid: Grid) -> Row:
+def laser_calibration(grid: RangeImageGrid) -> Row:
     """The calibration of a scanner."""
     return {
         "laser_name": grid.number,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.geometry.mesh import Mesh
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.columns import Rays
+from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inlined
 from lidar.raycast.rays import share
@@ -88,7 +88,7 @@ class GroundRefiner:
         self.tables = tables
         self._rough = roughness()
 
-    def refine(self, rays: Rays, hits: Hits, *, threads: int) -> None:
+    def refine(self, rays: RayColumns, hits: Hits, *, threads: int) -> None:
         """Change hits on rough ground in place, as `lidar.raycast.refine.Refiner.refine` describes."""
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal
         tables, rough = self.tables, self._rough
@@ -99,7 +99,7 @@ class GroundRefiner:
 
         share(work, rays, threads=threads)
 
-    def leave(self, rays: Rays, on: NDArray[np.int32], hits: Hits) -> Float:
+    def leave(self, rays: RayColumns, on: NDArray[np.int32], hits: Hits) -> Float:
         """Follow rays that start below the plane of a face, as `lidar.raycast.refine.Refiner.leave` says."""
         at = np.zeros(len(on))
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal

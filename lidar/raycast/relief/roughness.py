@@ -59,7 +59,7 @@ _PEAK = 2.5
 _SEED = 8608
 
 
-class Kind(NamedTuple):
+class RoughnessKind(NamedTuple):
     """A kind of ground.
 
     road   : Gd(n0) in m^3 of the waves of `BAND`
@@ -75,18 +75,18 @@ class Kind(NamedTuple):
 
 _NO_STONES = (0.0, 0.0, 0.0, 0.0)
 
-KINDS: dict[str, Kind] = {
+KINDS: dict[str, RoughnessKind] = {
     # Roads by ISO 8608; grains, stones and joints are assumed.
-    "asphalt": Kind(CLASS_A, 0.0, _NO_STONES),
-    "concrete": Kind(CLASS_A, 0.0, _NO_STONES),
-    "paving": Kind(CLASS_B, 0.0, (0.4, 0.4, 0.008, 0.004)),
-    "sett": Kind(CLASS_B, 0.0, (0.16, 0.11, 0.02, 0.012)),
-    "gravel": Kind(CLASS_C, 0.004, _NO_STONES),
-    "ballast": Kind(CLASS_C, 0.008, _NO_STONES),
-    "sand": Kind(CLASS_C, 0.004, _NO_STONES),
-    "soil": Kind(CLASS_C, 0.003, _NO_STONES),
-    "grass": Kind(CLASS_C, 0.006, _NO_STONES),
-    "forest_floor": Kind(CLASS_C, 0.008, _NO_STONES),
+    "asphalt": RoughnessKind(CLASS_A, 0.0, _NO_STONES),
+    "concrete": RoughnessKind(CLASS_A, 0.0, _NO_STONES),
+    "paving": RoughnessKind(CLASS_B, 0.0, (0.4, 0.4, 0.008, 0.004)),
+    "sett": RoughnessKind(CLASS_B, 0.0, (0.16, 0.11, 0.02, 0.012)),
+    "gravel": RoughnessKind(CLASS_C, 0.004, _NO_STONES),
+    "ballast": RoughnessKind(CLASS_C, 0.008, _NO_STONES),
+    "sand": RoughnessKind(CLASS_C, 0.004, _NO_STONES),
+    "soil": RoughnessKind(CLASS_C, 0.003, _NO_STONES),
+    "grass": RoughnessKind(CLASS_C, 0.006, _NO_STONES),
+    "forest_floor": RoughnessKind(CLASS_C, 0.008, _NO_STONES),
 }
 """Kinds of ground by name; the number of a kind is its place."""
 
@@ -136,7 +136,7 @@ class Roughness(NamedTuple):
     first  : (f, `LEVELS`) start of each field's levels in ``field``
     unit   : (f, `LEVELS`) unit of ``steep``
     number : (k,) field of each kind
-    kinds  : (k, 10) factor of the field, stones as in `Kind`, greatest depth, greatest slope, one over the
+    kinds  : (k, 10) factor of the field, stones as in `RoughnessKind`, depth, greatest slope, one over the
              factor, mean height of joints, and greatest slope of the field
     """
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.buildings.facades import WallRelief
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.columns import Rays
+from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inlined
 from lidar.raycast.rays import share
@@ -37,7 +37,7 @@ _ADDED = np.arange(SILL, SILL + PARTS, dtype=np.uint8)
 _FOOT, _TANGENT, _START, _WIDTH, _HEIGHT, _GROUND, _COLUMNS, _ROWS = 0, 3, 5, 7, 8, 9, 10, 11
 
 
-class Pairs(NamedTuple):
+class WallPairs(NamedTuple):
     """The pairs of a wall and a kind of opening on it; each has a face for each of `PARTS` surfaces.
 
     wall : (p,) int64, row of the facades
@@ -50,7 +50,7 @@ class Pairs(NamedTuple):
     cell: NDArray[np.int32]
 
 
-def pairs_of(relief: WallRelief) -> Pairs:
+def pairs_of(relief: WallRelief) -> WallPairs:
     """The pairs of a tile."""
     facades, kind = relief.facades, relief.cells.astype(np.int64)
     counts = facades.grid[:, 0].astype(np.int64) * facades.grid[:, 1]
@@ -62,7 +62,7 @@ def pairs_of(relief: WallRelief) -> Pairs:
     found, pair = np.unique(wall[used] * types + kind[used], return_inverse=True)
     cell = np.full(len(kind), -1, np.int32)
     cell[used] = pair
-    return Pairs(found // types, found % types, cell)
+    return WallPairs(found // types, found % types, cell)
 
 
 class WallTables(NamedTuple):
@@ -105,7 +105,7 @@ NO_WALLS = WallTables(
 """The tables of a tile without facades."""
 
 
-def tables_of(relief: WallRelief, pairs: Pairs, *, origin: Float, bits: NDArray[np.uint32]) -> WallTables:
+def tables_of(relief: WallRelief, pairs: WallPairs, *, origin: Float, bits: NDArray[np.uint32]) -> WallTables:
     """The tables of a tile, whose additional faces follow its own.
 
     origin : (3,) scene metres, of the tile
@@ -171,7 +171,7 @@ class WallRefiner:
     def __init__(self, tables: WallTables) -> None:
         self.tables = tables
 
-    def refine(self, rays: Rays, hits: Hits, *, threads: int) -> None:
+    def refine(self, rays: RayColumns, hits: Hits, *, threads: int) -> None:
         """Change hits on walls in place, as `lidar.raycast.refine.Refiner.refine` describes."""
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal
         tables = self.tables
@@ -182,7 +182,7 @@ class WallRefiner:
 
         share(work, rays, threads=threads)
 
-    def leave(self, rays: Rays, on: NDArray[np.int32], hits: Hits) -> Float:
+    def leave(self, rays: RayColumns, on: NDArray[np.int32], hits: Hits) -> Float:
         """Follow rays that start in an opening, as `lidar.raycast.refine.Refiner.leave` describes."""
         at = np.zeros(len(on))
         _leave(self.tables, rays, on, (hits.range, hits.face, hits.instance, hits.cosine, hits.normal), at)

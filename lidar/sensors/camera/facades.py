@@ -38,7 +38,7 @@ upright, and of painted parts (sills, frames, doors, blinds); albedo of these pa
 of what is behind panes (3)."""
 
 
-class Facades(NamedTuple):
+class RenderedFacades(NamedTuple):
     """The openings of a world's walls, for compiled code.
 
     tables   : of the walls
@@ -55,13 +55,17 @@ class Facades(NamedTuple):
     glass: int
 
 
-def facades_of(world: World) -> Facades:
+def facades_of(world: World) -> RenderedFacades:
     """The facades of a world."""
     surfaces, deep = world.surfaces, world.settings.relief != "off"
-    return Facades(world.walls.tables, deep, surfaces.color, surfaces.material, materials()["glass"].code)
+    return RenderedFacades(
+        world.walls.tables, deep, surfaces.color, surfaces.material, materials()["glass"].code
+    )
 
 
-def walls_of(facades: Facades, surfaces: Surfaces, *, hits: Hits) -> tuple[Surfaces, NDArray[np.int32]]:
+def walls_of(
+    facades: RenderedFacades, surfaces: Surfaces, *, hits: Hits
+) -> tuple[Surfaces, NDArray[np.int32]]:
     """The surfaces of hits, those of parts of openings being their walls', and the wall (n,) of each hit.
 
     A wall is a row of the tables; -1 for none.

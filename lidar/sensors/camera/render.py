@@ -19,7 +19,7 @@ from lidar.raycast.device import CPU
 from lidar.raycast.hits import own_faces
 from lidar.sensors.camera import appearance, shade
 from lidar.sensors.camera.edges import edge_pixels
-from lidar.sensors.camera.facades import Facades, facades_of, flatten, walls_of
+from lidar.sensors.camera.facades import RenderedFacades, facades_of, flatten, walls_of
 from lidar.sensors.camera.light import Light, daylight
 from lidar.sensors.camera.signal_lamps import Lamps, emitted
 from lidar.sensors.physics.fresnel import mirrored
@@ -94,7 +94,7 @@ class RenderOptions:
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class CameraImage:
     """One frame of a camera, row by row from the top.
 
     rgb     : (h, w, 3) uint8, sRGB, or None if not asked for
@@ -129,14 +129,14 @@ class _Traced:
     time: Float | None
     hits: Hits
 
-    def view(self, world: World) -> View:
+    def view(self, world: World) -> TracedView:
         """These, and the surfaces that are hit."""
         found = world.lookup(self.hits)
-        return View(self.origin, self.row, self.direction, self.seen, self.time, self.hits, found)
+        return TracedView(self.origin, self.row, self.direction, self.seen, self.time, self.hits, found)
 
 
 @dataclass(frozen=True, slots=True)
-class View(_Traced):
+class TracedView(_Traced):
     """Rays in the scene and what they hit, as in `_Traced`.
 
     surfaces : surfaces at the hits
@@ -165,7 +165,7 @@ def render(
     lamps: Lamps | None = None,
     random: np.random.Generator | None = None,
     options: RenderOptions | None = None,
-) -> Frame:
+) -> CameraImage:
     """One frame of a camera.
 
     poses   : of the camera (z forward, x right, y down), one for each of `exposure_times`: a single one, one
@@ -249,7 +249,7 @@ def render(
             total = _noisy(total, exposure, normal=electrons, options=options)
         rgb = shade.developed(total, exposure).reshape(h, w, 3)
     depth = np.where(middle.range <= camera.far, middle.range, np.inf)
-    return Frame(
+    return CameraImage(
         rgb if coloured else None,
         depth.reshape(h, w),
         middle.klass.reshape(h, w),
@@ -263,7 +263,7 @@ class _Image:
 
     light   : (n, 3) float32, linear; (0, 3) without colour
     range   : (n,) float64, ray parameter of the hit
-    klass, feature : as in `Frame`
+    klass, feature : as in `CameraImage`
     """
 
     light: NDArray[np.float32]
@@ -380,7 +380,7 @@ def _traced(
 
 
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
-    """Directions of pixels whose ray parameter is the depth as defined in `Frame`."""
+    """Directions of pixels whose ray parameter is the depth as defined in `CameraImage`."""
     bent = camera.model == "fisheye" or any(camera.distortion)
     if bent and camera.width * camera.height <= _SHARED:
         return _shared_rays(camera)[pixels]
@@ -417,10 +417,10 @@ def _with_misses(hits: Hits, missed: NDArray[np.bool_]) -> Hits:
 
 def radiance(
     world: World,
-    view: View,
+    view: TracedView,
     *,
     light: Light,
-    walls: Facades,
+    walls: RenderedFacades,
     blur: float,
     angle: float,
     options: RenderOptions,
@@ -443,8 +443,13 @@ def radiance(
 
 
 def _mirrored_view(
-    world: World, view: View, *, row: NDArray[np.intp], facet: NDArray[np.float32], options: RenderOptions
-) -> View:
+    world: World,
+    view: TracedView,
+    *,
+    row: NDArray[np.intp],
+    facet: NDArray[np.float32],
+    options: RenderOptions,
+) -> TracedView:
     """What rays (k,) of a view hit after films of water with these normals (k, 3) mirror them."""
     direction, normal = view.direction[row], view.hits.normal[row]
     place = view.origin[view.row[row]] + view.hits.range[row, None] * direction
@@ -461,15 +466,15 @@ def _mirrored_view(
         start, towards, far=world.reach, time=time, normals=True, retrace=options.retrace
     )
     each = np.arange(len(row), dtype=np.int32)
-    return View(start, each, towards, np.ones(len(row), np.bool_), time, hits, world.lookup(hits))
+    return TracedView(start, each, towards, np.ones(len(row), np.bool_), time, hits, world.lookup(hits))
 
 
 def _shaded(
     world: World,
-    view: View,
+    view: TracedView,
     *,
     light: Light,
-    walls: Facades,
+    walls: RenderedFacades,
     size: tuple[float, float],
     options: RenderOptions,
     wet: bool,
@@ -550,7 +555,7 @@ def _shader(device: str) -> WarpShader:
     return shader(device)
 
 
-def _on_shapes(world: World, view: View, *, rows: NDArray[np.intp]) -> Float:
+def _on_shapes(world: World, view: TracedView, *, rows: NDArray[np.intp]) -> Float:
     """Places (k, 3) of some hits on instances, in the instances' own frames."""
     point = view.origin[view.row[rows]] + view.hits.range[rows, None] * view.direction[rows]
     time = np.zeros(len(rows)) if view.time is None else view.time[rows]
@@ -559,7 +564,7 @@ def _on_shapes(world: World, view: View, *, rows: NDArray[np.intp]) -> Float:
     return np.linalg.solve(transform[:, :, :3], offset)[..., 0].astype(np.float64)
 
 
-def _drawn(world: World, view: View, *, size: tuple[float, float]) -> NDArray[np.uint8]:
+def _drawn(world: World, view: TracedView, *, size: tuple[float, float]) -> NDArray[np.uint8]:
     """Colours (n, 3) of the surfaces of a view, with what is drawn on instances."""
     hits, found = view.hits, view.surfaces
     on = np.flatnonzero(hits.instance >= 0)

@@ -15,7 +15,7 @@ from geoscene.classes import Class, materials
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.sensors.camera import ground_texture, texture
-from lidar.sensors.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, Facades, facade
+from lidar.sensors.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, RenderedFacades, facade
 from lidar.sensors.camera.facades import PAINTED as PAINTED_PARTS
 from lidar.sensors.camera.facades import UPRIGHT as UPRIGHT_SIDES
 from lidar.sensors.camera.ground_texture import HIGHEST, LOWEST, ground
@@ -539,7 +539,7 @@ def shade(
     color: NDArray[np.uint8],
     feature: NDArray[np.int32],
     wall: NDArray[np.int32],
-    walls: Facades,
+    walls: RenderedFacades,
     lit: NDArray[np.bool_],
     light: tuple[Float, Float, Float, Float, Float],
     tables: tuple[NDArray[np.uint8], NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
@@ -554,7 +554,7 @@ def shade(
     Of wet surfaces also fill ``gloss`` (n,) with the share of what their films of water reflect, which is not
     in ``out``, and ``facet`` (n, 3) with the films' normals; both are empty in a dry world.
 
-    walls    : `facades.Facades`; ``wall`` (n,) are rows of its tables, -1 for other surfaces
+    walls    : `facades.RenderedFacades`; ``wall`` (n,) are rows of its tables, -1 for other surfaces
     light    : direction, beam, ambient, sky, horizon of `lidar.sensors.camera.light.Light`
     tables   : `material_tables` and `linear_table`
     settings : size of a pixel at distance 0 (metres) and its growth with distance (radians), extinction of

@@ -12,11 +12,11 @@ import warp as wp
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.raycast.device import Device
+from lidar.raycast.device import WarpDevice
 from lidar.raycast.device import device as device_of
 from lidar.raycast.translate import Translation
 from lidar.sensors.camera import shade
-from lidar.sensors.camera.facades import SEEN, Facades
+from lidar.sensors.camera.facades import SEEN, RenderedFacades
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,7 +25,7 @@ _KEPT = 64
 
 
 @wp.struct
-class View:
+class WarpView:
     """What `lidar.sensors.camera.shade.shade` takes of the rays and their hits."""
 
     origin: wp.array2d[wp.float64]
@@ -36,7 +36,7 @@ class View:
 
 
 @wp.struct
-class Found:
+class WarpSurfaces:
     """What it takes of the surfaces that are hit."""
 
     klass: wp.array[wp.uint8]
@@ -47,7 +47,7 @@ class Found:
 
 
 @wp.struct
-class Tables:
+class WarpWallTables:
     """What it takes of `lidar.raycast.relief.WallTables`."""
 
     frame: wp.array2d[wp.float64]
@@ -58,10 +58,10 @@ class Tables:
 
 
 @wp.struct
-class Walls:
-    """As `lidar.sensors.camera.facades.Facades`."""
+class WarpWalls:
+    """As `lidar.sensors.camera.facades.RenderedFacades`."""
 
-    tables: Tables
+    tables: WarpWallTables
     deep: wp.bool
     color: wp.array2d[wp.uint8]
     material: wp.array[wp.uint8]
@@ -69,7 +69,7 @@ class Walls:
 
 
 @wp.struct
-class Light:
+class WarpLight:
     """What it takes of `lidar.sensors.camera.light.Light`."""
 
     direction: wp.array[wp.float64]
@@ -92,7 +92,7 @@ class Materials:
 
 
 @wp.struct
-class Settings:
+class WarpSettings:
     """As `lidar.sensors.camera.shade.shade` describes them."""
 
     blur: wp.float64
@@ -127,11 +127,11 @@ _translation = Translation(f"{__name__}.translated")
 _pixel = _translation.of(
     shade.pixel,
     {
-        "view": _fields("view", View),
-        "found": _fields("found", Found),
-        "light": _fields("light", Light),
+        "view": _fields("view", WarpView),
+        "found": _fields("found", WarpSurfaces),
+        "light": _fields("light", WarpLight),
         "tables": _fields("tables", Materials),
-        "settings": _fields("settings", Settings),
+        "settings": _fields("settings", WarpSettings),
         "covers": _fields("covers", Covers),
         "scratch": _SCRATCH,
     },
@@ -141,13 +141,13 @@ Globals = _translation.struct()
 
 @wp.kernel
 def _shade(
-    view: View,
-    found: Found,
-    walls: Walls,
+    view: WarpView,
+    found: WarpSurfaces,
+    walls: WarpWalls,
     lit: wp.array[wp.bool],
-    light: Light,
+    light: WarpLight,
     tables: Materials,
-    settings: Settings,
+    settings: WarpSettings,
     covers: Covers,
     town: wp.array[wp.float64],
     out: wp.array2d[wp.float32],
@@ -166,7 +166,7 @@ class WarpShader:
     Columns of the world and the light are copied to the device once, as long as they are used.
     """
 
-    def __init__(self, device: Device) -> None:
+    def __init__(self, device: WarpDevice) -> None:
         self.device = device
         self._copies: OrderedDict[int, tuple[NDArray[Any], Any]] = OrderedDict()
         self._globals = Globals()
@@ -185,7 +185,7 @@ class WarpShader:
         color: NDArray[np.uint8],
         feature: NDArray[np.int32],
         wall: NDArray[np.int32],
-        walls: Facades,
+        walls: RenderedFacades,
         lit: NDArray[np.bool_],
         light: Sequence[Float],
         tables: Sequence[NDArray[Any]],
@@ -200,13 +200,13 @@ class WarpShader:
             upload = self.device.upload
             results = [upload(column) for column in (out, gloss, facet)]
             given = (
-                _filled(View, map(upload, (origin, row, direction, range_, normal))),
-                _filled(Found, map(upload, (klass, material, color, feature, wall))),
+                _filled(WarpView, map(upload, (origin, row, direction, range_, normal))),
+                _filled(WarpSurfaces, map(upload, (klass, material, color, feature, wall))),
                 self._walls(walls),
                 upload(lit),
-                self._kept_in(Light, light),
+                self._kept_in(WarpLight, light),
                 self._kept_in(Materials, tables),
-                _filled(Settings, settings),
+                _filled(WarpSettings, settings),
                 _filled(Covers, covers),
                 upload(shade.TOWN * light[-1]),
                 *results,
@@ -216,10 +216,10 @@ class WarpShader:
             for column, found in zip((out, gloss, facet), results, strict=True):
                 column[...] = found.numpy()
 
-    def _walls(self, walls: Facades) -> Any:
+    def _walls(self, walls: RenderedFacades) -> Any:
         t = walls.tables
-        tables = self._kept_in(Tables, (t.frame, t.first, t.cells, t.faces, t.kinds))
-        return self._kept_in(Walls, walls._replace(tables=tables))
+        tables = self._kept_in(WarpWallTables, (t.frame, t.first, t.cells, t.faces, t.kinds))
+        return self._kept_in(WarpWalls, walls._replace(tables=tables))
 
     def _kept_in(self, struct: Any, values: Iterable[Any]) -> Any:
         """A struct with these values, of which arrays are copied to the device unless they are there."""

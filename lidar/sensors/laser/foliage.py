@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.geometry.random_streams import uniform_of
 from lidar.raycast import Caster, Hits
-from lidar.sensors.laser.rays import Rays
-from lidar.world.surfaces import Faces
+from lidar.sensors.laser.rays import PulseRays
+from lidar.world.surfaces import SurfaceFaces
 
 PROJECTION = 0.5
 """Projected area per leaf area, for leaves of uniformly distributed orientation (Ross 1981)."""
@@ -30,12 +30,12 @@ class Foliage:
     """
 
     caster: Caster
-    faces: Faces
+    faces: SurfaceFaces
     far: float
     seed: int
 
     def pierce(
-        self, hits: Hits, rays: Rays, *, first: int, time: NDArray[np.float32] | None
+        self, hits: Hits, rays: PulseRays, *, first: int, time: NDArray[np.float32] | None
     ) -> NDArray[np.int64]:
         """Move hits on foliage to the leaf hit or to the surface behind, in place; return their rows.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.classes import Class, class_codes
-from geoscene.drawing.previews import DARK, Plan, around, card
+from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 
 if TYPE_CHECKING:
     from lidar.sensors.laser.cloud import Cloud
@@ -21,7 +21,7 @@ _SCANNER = (255, 90, 60)
 def cloud_png(cloud: Cloud) -> bytes:
     """A PNG picture of a cloud in the sensor frame, x to the right, with a mark where the scanner is."""
     xyz = cloud.xyz.astype(np.float64)
-    plan = Plan(around(np.vstack([xyz[:, :2], _NEAR])), DARK)
+    plan = PreviewPlan(around(np.vstack([xyz[:, :2], _NEAR])), DARK)
     plan.points(xyz, class_codes().color[cloud.klass])
     plan.line([[0.0, 0.0]], _SCANNER)
     return plan.png()

@@ -65,7 +65,7 @@ def beam_of(
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class PulseRays:
     """Rays of consecutive pulses, pulse by pulse; the first ray of each pulse is the axis of its beam.
 
     poses     : of the sensor
@@ -81,10 +81,10 @@ class Rays:
     origin: Float
     order: NDArray[np.int64]
 
-    def take(self, rows: NDArray[np.integer]) -> Rays:
+    def take(self, rows: NDArray[np.integer]) -> PulseRays:
         """Selected rays, without an ``order``."""
         none = np.empty(0, np.int64)
-        return Rays(self.poses, self.index[rows], self.direction[rows], self.origin[rows], none)
+        return PulseRays(self.poses, self.index[rows], self.direction[rows], self.origin[rows], none)
 
 
 class _Scratch(threading.local):
@@ -132,13 +132,13 @@ class MovingSensor:
         self._order = np.empty(len(firings), np.int64)
         _batches(firings.order, batch, self._order)
 
-    def rays(self, batch: int) -> Rays:
+    def rays(self, batch: int) -> PulseRays:
         """The rays of a batch, by its number; valid until this thread requests another batch."""
         part = slice(batch * self._batch, (batch + 1) * self._batch)
         fired, beam = self._firings, self._beam
         work = self._order[part]
         n = len(work) * len(beam.place)
-        out = Rays(self.poses, *_scratch.columns(n))
+        out = PulseRays(self.poses, *_scratch.columns(n))
         _fill(
             fired.time_ns[part],
             self._start_ns,

@@ -25,7 +25,7 @@ from lidar.sensors.physics.reflect import (
     sent_back,
 )
 from lidar.sensors.physics.settings import ScannerSettings
-from lidar.world.surfaces import OPEN, Faces
+from lidar.world.surfaces import OPEN, SurfaceFaces
 from lidar.world.world import World
 
 
@@ -71,7 +71,7 @@ class SurfaceOptics:
 
     def __init__(self, world: World, wavelength_nm: float, *, settings: ScannerSettings, seed: int) -> None:
         self.world, self.settings = world, settings
-        self.faces: Faces = world.faces
+        self.faces: SurfaceFaces = world.faces
         reflectance, specular = reflectance_table(wavelength_nm)
         films = soaked = np.zeros(256)
         wetness, snow = world.settings.wetness, world.settings.snow
@@ -182,7 +182,7 @@ def _columns(n: int) -> Echoes:
     return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
 
 
-def _face_row(faces: Faces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
+def _face_row(faces: SurfaceFaces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
     """Row of ``faces.packed`` of each ray's hit."""
     return hits.face[ray] + faces.start[hits.instance[ray]]
 

@@ -46,7 +46,7 @@ class Sweep:
 
 
 @dataclass(frozen=True, slots=True)
-class Detection:
+class DetectedEchoes:
     """The echoes of a sweep that the sensor reports.
 
     range  : (n,) metres as the sensor reports it
@@ -168,7 +168,7 @@ def deviates_of(sweep: Sweep) -> Deviates:
     return deviates
 
 
-def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
+def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> DetectedEchoes:
     """Detection, return mode and measured range of echoes that reach the receiver in a sweep.
 
     echoes : sorted by pulse and range: the sweep's own, or traced ones that stages have changed. Of traced
@@ -199,10 +199,10 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> Detection:
         sensor, sweep.firings, echoes=echoes, settings=settings, seed=sweep.seed, deviates=deviates
     )
     keep = (distance >= sensor.min_range) & (distance <= sensor.max_range)
-    return Detection(echoes.where(keep), distance[keep], number[keep], count[keep])
+    return DetectedEchoes(echoes.where(keep), distance[keep], number[keep], count[keep])
 
 
-def report(sweep: Sweep, detection: Detection) -> Cloud:
+def report(sweep: Sweep, detection: DetectedEchoes) -> Cloud:
     """The point cloud of what a sweep's sensor reports."""
     sensor, pulses, echoes = sweep.sensor, sweep.firings, detection.echoes
     pulse, offset, start = echoes.pulse, sensor.pattern.range_offset, int(pulses.time_ns[0])

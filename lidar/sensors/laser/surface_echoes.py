@@ -13,7 +13,7 @@ from lidar.geometry.random_streams import generator
 from lidar.raycast import Hits
 from lidar.raycast.hits import own_faces
 from lidar.sensors.laser.foliage import Foliage
-from lidar.sensors.laser.rays import MovingSensor, Rays, beam_of
+from lidar.sensors.laser.rays import MovingSensor, PulseRays, beam_of
 from lidar.sensors.laser.reflection import EchoCollector, SurfaceOptics, glossy_codes
 from lidar.sensors.physics.echoes import Echoes, by_pulse, joined, merged
 from lidar.sensors.physics.fresnel import mirrored, pane_reflection, surface_reflection
@@ -102,7 +102,7 @@ def surface_echoes(
 
 
 def _beyond(
-    rays: Rays,
+    rays: PulseRays,
     pulse: NDArray[np.int32],
     *,
     power: Float,

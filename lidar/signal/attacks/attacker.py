@@ -40,7 +40,7 @@ _NOT_IN_SCENES = [Class.UNLABELED, *(k for k in Class if Class.CAR <= k <= Class
 
 
 @dataclass(frozen=True, slots=True)
-class Device:
+class SpoofingDevice:
     """Limits of hardware that was built.
 
     points : most pulses a frame
@@ -54,11 +54,11 @@ class Device:
 
 
 DEVICES = {
-    "cao_2019": Device(60, 8.0, 180.0),
-    "sun_2020": Device(200, 10.0, 180.0),
-    "pla_2023": Device(4200, 30.0, 30.0),
-    "pra_2023": Device(1 << 31, 45.0, 180.0),
-    "any": Device(1 << 31, 360.0, 180.0),
+    "cao_2019": SpoofingDevice(60, 8.0, 180.0),
+    "sun_2020": SpoofingDevice(200, 10.0, 180.0),
+    "pla_2023": SpoofingDevice(4200, 30.0, 30.0),
+    "pra_2023": SpoofingDevice(1 << 31, 45.0, 180.0),
+    "any": SpoofingDevice(1 << 31, 360.0, 180.0),
 }
 """Devices of published attacks, and one without limits.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.camera.shade import linear_table
 from lidar.sensors.rig.camera_model import pixel_rays
 from lidar.sensors.rig.specs import CameraSpec
@@ -47,7 +47,7 @@ class CameraBlind(Stage):
     start: float = parameter(0.0, "seconds since the drive's start from which it shines", low=0)
     stop: float = parameter(1e9, "seconds since the drive's start until which it shines", low=0)
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame with the light added."""
         del rng
         if frame.rgb is None or at.camera is None or not self.start <= at.start_ns / 1e9 < self.stop:
@@ -99,7 +99,7 @@ class Patch(Stage):
         """Depth, which tells what hides a patch in the world."""
         return ("depth",) if self.on == "world" else ()
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame with the patch."""
         del rng
         if frame.rgb is None or at.camera is None or not self.start <= at.start_ns / 1e9 < self.stop:
@@ -115,7 +115,7 @@ class Patch(Stage):
         rgb[shown] = _sampled(picture, u=u[shown], v=v[shown])
         return replace(frame, rgb=rgb)
 
-    def _on_image(self, frame: Frame, *, high: float) -> tuple[Float, Float]:
+    def _on_image(self, frame: CameraImage, *, high: float) -> tuple[Float, Float]:
         """Coordinates (h, w) from 0 to 1 on the patch, from its left and its top."""
         assert frame.rgb is not None  # noqa: S101
         rows, columns = np.indices(frame.rgb.shape[:2]).astype(float)
@@ -127,7 +127,7 @@ class Patch(Stage):
         )
 
     def _in_world(
-        self, frame: Frame, *, camera: CameraSpec, at: Situation, high: float
+        self, frame: CameraImage, *, camera: CameraSpec, at: Situation, high: float
     ) -> tuple[Float, Float]:
         """As `_on_image`, of what the pixels' rays meet; NaN where they miss the plane or it is hidden."""
         middle, right, up = self._plane(at)

@@ -19,7 +19,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.signal.attacks.attacker import file_digest
 from lidar.signal.registry import Stages
 from lidar.signal.stage import Stage, parameter
-from lidar.world.actor_shapes import Shape
+from lidar.world.actor_shapes import ActorShape
 from lidar.world.actors import Actors, joined
 from lidar.world.ground import ground_height, ground_heights
 
@@ -107,7 +107,7 @@ class PlacedObject(Stage):
             scale=scale,
         )
 
-    def _shape(self) -> Shape:
+    def _shape(self) -> ActorShape:
         vertices, faces = _read_mesh(self.mesh)
         vertices = vertices * self.size
         low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -120,7 +120,7 @@ class PlacedObject(Stage):
         mesh = Mesh.of(vertices, faces, klass=int(klass), material=material)
         length, width, _ = (high - low).tolist()
         name = f"placed_object/{self.mesh}/{self.material}/{self.klass}/{self.size:g}"
-        return Shape(name, "placed_object", klass, length, width, float(high[2]), length, mesh)
+        return ActorShape(name, "placed_object", klass, length, width, float(high[2]), length, mesh)
 
     def _track(self, scene: Scene, trajectory: Trajectory) -> tuple[Ints, Float, Float]:
         """Times (k,), positions (k, 3) on the ground and yaws (k,) of the object."""

@@ -70,7 +70,7 @@ class Region(Tampering):
 
 
 @dataclass(frozen=True)
-class Target(Region):
+class TargetReturns(Region):
     """Returns to change: those in a box, or of the nearest road user."""
 
     target: str = parameter(
@@ -129,7 +129,7 @@ class Perturb(Tampering):
 
 
 @dataclass(frozen=True)
-class Delete(Target):
+class Delete(TargetReturns):
     """Returns in a box, or of the nearest road user, are deleted."""
 
     def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:
@@ -141,7 +141,7 @@ class Delete(Target):
 
 
 @dataclass(frozen=True)
-class Move(Target):
+class Move(TargetReturns):
     """Returns in a box, or of the nearest road user, are shifted together and turned about their middle."""
 
     ahead: float = parameter(0.0, "metres forward", low=-500, high=500)

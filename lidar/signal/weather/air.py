@@ -22,7 +22,7 @@ from lidar.signal.weather.backscatter import (
     scattering,
     strength,
 )
-from lidar.signal.weather.fields import Field, Rays, amounts, rays_of, strongest_response
+from lidar.signal.weather.fields import Field, WeatherBeams, amounts, rays_of, strongest_response
 from lidar.signal.weather.media import Medium
 
 _STEP = 0.25  # metres of range between samples of a field's response
@@ -90,7 +90,7 @@ def _beam_ends(pulses: Pulses, echoes: TracedEchoes) -> Float:
 
 
 def _in_field(
-    found: Found, where: tuple[Field, Rays], *, extinction: float, rng: np.random.Generator
+    found: Found, where: tuple[Field, WeatherBeams], *, extinction: float, rng: np.random.Generator
 ) -> Found:
     """The particles that are there in a medium that differs from place to place, dimmed by it."""
     pulse, place, power = found
@@ -99,7 +99,7 @@ def _in_field(
     return pulse[there], place[there], (power * np.exp(-2 * extinction * column))[there]
 
 
-def _is_even(where: tuple[Field, Rays], distance: Float) -> NDArray[np.bool_]:
+def _is_even(where: tuple[Field, WeatherBeams], distance: Float) -> NDArray[np.bool_]:
     """Pulses (n,) whose beams go through all of a medium, and no more, up to distances (n,) in metres."""
     if not np.any(where[0].share == 1):
         return np.zeros(len(distance), bool)
@@ -122,7 +122,7 @@ def _even_response(
 
 def _field_response(
     pulses: Pulses,
-    where: tuple[Field, Rays],
+    where: tuple[Field, WeatherBeams],
     *,
     end: Float,
     medium: Medium,

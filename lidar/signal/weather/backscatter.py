@@ -222,7 +222,7 @@ def even_echo(sensor: Sensor, medium: Medium, *, lens: float, noise: float) -> S
 
 
 @functools.lru_cache(maxsize=16)
-def scattering(sensor: Sensor, medium: Medium, *, lens: float) -> tuple[Particles | None, Float, Float]:
+def scattering(sensor: Sensor, medium: Medium, *, lens: float) -> tuple[AirParticles | None, Float, Float]:
     """The particles of a medium that are drawn, and the back-scatter (k,) of the rest at distances (k,)."""
     if len(medium.diameter):
         return particles(sensor, medium, lens=lens)
@@ -231,7 +231,7 @@ def scattering(sensor: Sensor, medium: Medium, *, lens: float) -> tuple[Particle
 
 
 @dataclass(frozen=True, slots=True)
-class Particles:
+class AirParticles:
     """Single particles that a pulse may meet in clear air, by classes of range and size.
 
     count     : (c,) mean number per pulse of each class
@@ -249,7 +249,7 @@ class Particles:
 
 def particles(
     sensor: Sensor, medium: Medium, *, most: float = MOST, lens: float = LENS
-) -> tuple[Particles, Float, Float]:
+) -> tuple[AirParticles, Float, Float]:
     """What a pulse may meet, and the back-scatter (k,) of all the rest at distances (k,) in metres.
 
     A particle of the back-scatter cross-section s, off the axis of a Gaussian beam, sends back the power of
@@ -272,7 +272,7 @@ def particles(
     while (counts := expected(least)).sum() > most:
         least *= 1.25
     cells = counts.ravel() > 0
-    drawn = Particles(
+    drawn = AirParticles(
         counts.ravel()[cells],
         np.broadcast_to(edges[:-1], counts.shape).ravel()[cells],
         np.broadcast_to(edges[1:], counts.shape).ravel()[cells],
@@ -309,7 +309,7 @@ def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float, lens: float) ->
 
 
 def drawn_particles(
-    some: Particles, end: Float, *, extinction: float = 0.0, rng: np.random.Generator
+    some: AirParticles, end: Float, *, extinction: float = 0.0, rng: np.random.Generator
 ) -> Found:
     """Particles that beams meet before their ends (n,), in metres, dimmed by even air (1/m); by pulse."""
     sums = np.cumsum(some.count)

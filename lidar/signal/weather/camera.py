@@ -18,14 +18,14 @@ from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
 from lidar.sensors.camera import shade
 from lidar.sensors.camera.light import Light
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.rig.camera_model import pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
-from lidar.signal.weather.fields import FARTHEST, Field, Rays, amounts, field_of
+from lidar.signal.weather.fields import FARTHEST, Field, WeatherBeams, amounts, field_of
 from lidar.signal.weather.media import Medium, medium_of
 from lidar.signal.weather.setting import WeatherSetting
-from lidar.signal.weather.streaks import Particles, streak_cover
+from lidar.signal.weather.streaks import FallingParticles, streak_cover
 from lidar.signal.weather.window_drops import drops_on, through_drops
 
 EXPOSURE_NS = 5_000_000
@@ -49,7 +49,9 @@ _STRAY = 0.086
 angle in degrees (CIE), from 1 to 90 degrees."""
 
 
-def weathered(image: Frame, setting: WeatherSetting, *, at: Situation, rng: np.random.Generator) -> Frame:
+def weathered(
+    image: CameraImage, setting: WeatherSetting, *, at: Situation, rng: np.random.Generator
+) -> CameraImage:
     """The image in a weather; depth and labels stay ground truth.
 
     Air between camera and surface dims it and adds the light that it scatters (Koschmieder, at 550 nm); drops
@@ -133,7 +135,7 @@ def _exposed(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]
     return colour
 
 
-def falling(setting: WeatherSetting, air: Medium) -> Particles | None:
+def falling(setting: WeatherSetting, air: Medium) -> FallingParticles | None:
     """Particles of a medium that are seen one by one; None for kinds without any.
 
     The fall speed of drops is that of Atlas, Srivastava and Sekhon (1973). Flakes fall at 1 m/s and swing by
@@ -143,13 +145,13 @@ def falling(setting: WeatherSetting, air: Medium) -> Particles | None:
     seen = size > _LEAST
     if setting.kind == "rain":
         fall = np.maximum(9.65 - 10.3 * np.exp(-600.0 * size), 0.1)
-        return Particles(size[seen], number[seen], fall[seen])
+        return FallingParticles(size[seen], number[seen], fall[seen])
     if setting.kind == "snow":
-        return Particles(size[seen], number[seen], np.full(int(seen.sum()), 1.0), swing=0.3)
+        return FallingParticles(size[seen], number[seen], np.full(int(seen.sum()), 1.0), swing=0.3)
     return None
 
 
-def _distance(image: Frame, camera: CameraSpec) -> NDArray[np.float32]:
+def _distance(image: CameraImage, camera: CameraSpec) -> NDArray[np.float32]:
     """Metres (h, w) along each pixel's ray to the surface seen; inf for sky."""
     depth = image.depth
     if camera.model == "pinhole":
@@ -176,7 +178,7 @@ def _path_through(
     path : (h, w) metres along each pixel's ray
     """
     direction = pose.directions(np.nan_to_num(pixel_rays(camera)))
-    rays = Rays(np.broadcast_to(pose.position, direction.shape), direction)
+    rays = WeatherBeams(np.broadcast_to(pose.position, direction.shape), direction)
     whole = path.ravel().astype(np.float64)
     far = np.minimum(whole, FARTHEST)
     _, column = amounts(field, rays, pulse=np.arange(len(direction)), distance=far)
@@ -186,7 +188,7 @@ def _path_through(
 
 def _share_at(field: Field, position: Float, *, pose: Poses) -> Float:
     """The share (n,) of a medium at places (n, 3), camera frame."""
-    rays = Rays(np.broadcast_to(pose.position, position.shape), pose.directions(position))
+    rays = WeatherBeams(np.broadcast_to(pose.position, position.shape), pose.directions(position))
     return amounts(field, rays, pulse=np.arange(len(position)), distance=np.ones(len(position)))[0]
 
 
@@ -206,7 +208,7 @@ def _velocity(at: Situation) -> Float:
 
 
 def _glare(
-    image: Frame, setting: WeatherSetting, *, air: Medium, at: Situation, pose: Poses
+    image: CameraImage, setting: WeatherSetting, *, air: Medium, at: Situation, pose: Poses
 ) -> NDArray[np.float32]:
     """Light (h, w, 3) of the sun that the window scatters over the image, as far as it is wet or dirty."""
     assert at.light is not None  # noqa: S101
@@ -223,7 +225,7 @@ def _glare(
     return glare
 
 
-def _lit(image: Frame, *, at: Situation, pose: Poses) -> bool:
+def _lit(image: CameraImage, *, at: Situation, pose: Poses) -> bool:
     """Whether the sun shines on a camera: by its rays, or where they are unknown, by the image.
 
     A sun beside a recorded image is taken to shine.

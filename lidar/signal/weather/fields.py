@@ -80,7 +80,7 @@ class Field:
 
 
 @dataclass(frozen=True, slots=True)
-class Rays:
+class WeatherBeams:
     """Beams in a scene: where they start (n, 3) and where they go (n, 3), scene metres per metre of range."""
 
     start: Float
@@ -240,7 +240,9 @@ def _add_spray(share: Float, *, corner: tuple[float, float], place: Float, veloc
     share += np.where((behind >= 0) & (age <= _SPRAY_LENGTH), plume, 0.0)
 
 
-def amounts(field: Field, rays: Rays, *, pulse: NDArray[np.integer], distance: Float) -> tuple[Float, Float]:
+def amounts(
+    field: Field, rays: WeatherBeams, *, pulse: NDArray[np.integer], distance: Float
+) -> tuple[Float, Float]:
     """The share (m,) of the medium at ranges along pulses, and its integral from the beam's start, metres."""
     here, column = np.empty(len(pulse)), np.empty(len(pulse))
     _amounts(_packed(field), (rays.start, rays.way), (pulse.astype(np.int64), distance), here, column)
@@ -291,7 +293,7 @@ def _amounts(field: Any, rays: Any, places: Any, here: Any, column: Any) -> None
 
 def strongest_response(
     field: Field,
-    rays: Rays,
+    rays: WeatherBeams,
     *,
     end: Float,
     white: Float,
@@ -352,8 +354,8 @@ def _strongest(field: Any, rays: Any, air: Any, place: Any, power: Any) -> None:
         sent[: last + taps + 1] = 0.0
 
 
-def rays_of(start: Float, direction: Float, *, time_ns: NDArray[np.int64], at: Situation) -> Rays:
+def rays_of(start: Float, direction: Float, *, time_ns: NDArray[np.int64], at: Situation) -> WeatherBeams:
     """Beams in the scene, from their starts (n, 3) and directions (n, 3) in the sensor's frame."""
     assert at.poses is not None  # noqa: S101
     poses = at.poses(time_ns)
-    return Rays(poses.place(start), poses.directions(direction))
+    return WeatherBeams(poses.place(start), poses.directions(direction))

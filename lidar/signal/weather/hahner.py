@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.signal.weather.lisa import SCATTERED, TARGET, Returns
+from lidar.signal.weather.lisa import SCATTERED, TARGET, RemainingReturns
 
 _LIGHT = 0.299792458  # metres per nanosecond
 _MOR = log(20)  # optical depth of the meteorological optical range
@@ -65,7 +65,7 @@ def fog_response(extinction: float) -> FogResponse:
 
 def hahner_fog(
     distance: Float, intensity: Float, *, extinction: float, rng: np.random.Generator | None
-) -> Returns:
+) -> RemainingReturns:
     """The returns in fog: the target's, dimmed, or the fog's where that is brighter.
 
     intensity : (n,) codes 0 to 255
@@ -82,7 +82,7 @@ def hahner_fog(
         place = place + 10 * rng.beta(2, 20, len(distance))
     replaced &= place < distance
     state = np.where(replaced, SCATTERED, TARGET).astype(np.uint8)
-    return Returns(state, np.where(replaced, place, distance), np.where(replaced, soft, hard))
+    return RemainingReturns(state, np.where(replaced, place, distance), np.where(replaced, soft, hard))
 
 
 def occupancy(rate: float, fall_speed: float) -> float:
@@ -137,7 +137,7 @@ def hahner_snow(
     fall_speed: float = 1.6,
     medium: str = "gunn-marshall",
     divergence: float = 3e-3,
-) -> Returns:
+) -> RemainingReturns:
     """The returns in snowfall: the strongest maximum of the waveform of target and flakes in the beam.
 
     intensity : (n,) codes 0 to 255
@@ -154,7 +154,7 @@ def hahner_snow(
         _snowed(beams, disks, divergence / 2, found)
         place[rows], bright[rows] = found[0], np.clip(found[1], 0, 255)
         state[rows] = found[2].astype(np.uint8)
-    return Returns(state, place, bright)
+    return RemainingReturns(state, place, bright)
 
 
 @njit(cache=True, nogil=True)

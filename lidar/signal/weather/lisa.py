@@ -39,7 +39,7 @@ class Lidar:
 
 
 @dataclass(frozen=True, slots=True)
-class Returns:
+class RemainingReturns:
     """What a model leaves of the returns of a cloud.
 
     state       : (n,) uint8, LOST, SCATTERED or TARGET
@@ -70,7 +70,7 @@ def lisa(
     extinction: float,
     rng: np.random.Generator,
     lidar: Lidar,
-) -> Returns:
+) -> RemainingReturns:
     """The returns in rain or snow (rate in mm/h) or fog, which only dims.
 
     A particle matters only if it returns more than the threshold, which it cannot beyond a distance; so of
@@ -89,7 +89,7 @@ def lisa(
         )
     hit = (best > threshold) & (~seen if lidar.last else (best > power))
     state = np.where(hit, SCATTERED, np.where(seen, TARGET, LOST)).astype(np.uint8)
-    return Returns(state, np.where(hit, place, noisy), np.where(hit, bright, measured))
+    return RemainingReturns(state, np.where(hit, place, noisy), np.where(hit, bright, measured))
 
 
 def _chosen_particles(
@@ -124,7 +124,7 @@ def _chosen_particles(
 
 def goodin(
     distance: Float, reflectance: Float, *, rate: float, rng: np.random.Generator, max_range: float = 100.0
-) -> Returns:
+) -> RemainingReturns:
     """The returns in rain by Goodin et al. 2019: extinction 0.01 R^0.6 and noise that grows with range.
 
     The extinction was fitted to lost returns; that of the air is about 25 times less.
@@ -134,7 +134,7 @@ def goodin(
     seen = dimmed / pi / distance**2 > 0.9 / (pi * max_range**2)
     sigma = 0.02 * distance * (1 - np.exp(-rate)) ** 2
     noisy = distance + sigma * rng.standard_normal(len(distance))
-    return Returns(np.where(seen, TARGET, LOST).astype(np.uint8), noisy, dimmed)
+    return RemainingReturns(np.where(seen, TARGET, LOST).astype(np.uint8), noisy, dimmed)
 
 
 def goodin_extinction(rate: float) -> float:

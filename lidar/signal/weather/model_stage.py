@@ -9,14 +9,14 @@ import numpy as np
 from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.echoes import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import parameter
 from lidar.signal.weather.camera import weathered
 from lidar.signal.weather.hahner import hahner_fog, hahner_snow
-from lidar.signal.weather.lisa import LOST, SCATTERED, Lidar, Returns, goodin, lisa
+from lidar.signal.weather.lisa import LOST, SCATTERED, Lidar, RemainingReturns, goodin, lisa
 from lidar.signal.weather.media import medium_of
 from lidar.signal.weather.setting import WeatherSetting
 
@@ -70,13 +70,13 @@ class WeatherModel(WeatherSetting):
             return _changed(cloud, found, white=1.0)
         return _changed(cloud, self._dimmed(distance, code / _WHITE, amount=amount, rng=rng), white=_WHITE)
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The image that a camera takes in this weather, by the physical model: these have no cameras."""
         return weathered(frame, self, at=at, rng=rng)
 
     def _dimmed(
         self, distance: Float, reflectance: Float, *, amount: float, rng: np.random.Generator
-    ) -> Returns:
+    ) -> RemainingReturns:
         """The returns by the models that take reflectances."""
         max_range = self.max_range or _MAX_RANGE[self.model]
         if self.model == "goodin":
@@ -92,7 +92,7 @@ class WeatherModel(WeatherSetting):
         )
 
 
-def _changed(cloud: TracedCloud, found: Returns, *, white: float) -> TracedCloud:
+def _changed(cloud: TracedCloud, found: RemainingReturns, *, white: float) -> TracedCloud:
     """A cloud with the returns of a model; ``white``: intensity code of its reflectance 1."""
     hit = found.state == SCATTERED
     xyz, old = cloud.xyz.astype(np.float64), cloud.range

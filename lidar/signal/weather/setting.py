@@ -20,7 +20,7 @@ FOREVER = 1e9
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class WeatherKind:
     """A kind of weather.
 
     unit      : of the amount
@@ -39,8 +39,8 @@ class Kind:
 
 
 KINDS = {
-    "rain": Kind("mm/h", "rain rate", 0.0, 300.0, None, ("marshall-palmer", "large-drop")),
-    "fog": Kind(
+    "rain": WeatherKind("mm/h", "rain rate", 0.0, 300.0, None, ("marshall-palmer", "large-drop")),
+    "fog": WeatherKind(
         "m",
         "visibility at 2 % contrast",
         5.0,
@@ -48,7 +48,7 @@ KINDS = {
         None,
         ("kim", "kruse", "advection", "radiation", "strong-advection", "moderate-advection", "chu-hogg"),
     ),
-    "snow": Kind(
+    "snow": WeatherKind(
         "mm/h",
         "snowfall rate as water",
         0.0,
@@ -56,9 +56,9 @@ KINDS = {
         None,
         ("stallabrass", "gunn-marshall", "sekhon-srivastava", "itu-dry", "itu-wet"),
     ),
-    "dust": Kind("m", "visibility within the dust", 2.0, 1e5, 20.0, ("plumes", "even")),
-    "spray": Kind("mm", "depth of the water on the road", 0.0, 10.0, 1.0, ("plumes",)),
-    "clear": Kind("", "nothing", 0.0, 0.0, 0.0, ("air",)),
+    "dust": WeatherKind("m", "visibility within the dust", 2.0, 1e5, 20.0, ("plumes", "even")),
+    "spray": WeatherKind("mm", "depth of the water on the road", 0.0, 10.0, 1.0, ("plumes",)),
+    "clear": WeatherKind("", "nothing", 0.0, 0.0, 0.0, ("air",)),
 }
 """Kinds of weather; ``clear`` carries the sun, the cover glass and wet ground without anything in the air."""
 
@@ -185,7 +185,7 @@ class WeatherSetting(Stage):
         return {"name": name, **asdict(self)}
 
 
-def _faults(setting: WeatherSetting, kind: Kind) -> list[str]:
+def _faults(setting: WeatherSetting, kind: WeatherKind) -> list[str]:
     """What is wrong with a setting whose values are each of their type."""
     faults = []
     amounts = {"amount": setting.amount}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
@@ -56,7 +56,7 @@ class Weather(WeatherSetting):
             column = float(amounts(field, way, pulse=np.zeros(1, int), distance=np.array([distance]))[1][0])
         return math.exp(-medium.extinction * column)
 
-    def image(self, frame: Frame, *, at: Situation, rng: np.random.Generator) -> Frame:
+    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The image that the camera takes."""
         return weathered(frame, self, at=at, rng=rng)
 

@@ -25,7 +25,7 @@ _STEPS = 200  # of distance and of its distribution
 
 
 @dataclass(frozen=True, slots=True)
-class Particles:
+class FallingParticles:
     """Falling drops or flakes, one row for each class of diameter.
 
     diameter : (k,) metres
@@ -42,7 +42,7 @@ class Particles:
 
 def streak_cover(
     camera: CameraSpec,
-    particles: Particles,
+    particles: FallingParticles,
     *,
     exposure: float,
     down: Float,

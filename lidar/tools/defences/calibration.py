@@ -12,7 +12,7 @@ import numpy as np
 from geoscene.support.untrusted import read_toml
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.tools.defences.scores import FALSE_ALARMS, Samples, threshold_at
+from lidar.tools.defences.scores import FALSE_ALARMS, SuspicionCounts, threshold_at
 from lidar.tools.detection import RULES, Detector
 
 _BUILT_IN = {
@@ -125,7 +125,7 @@ class Calibration:
         return float(tail.suspicion[at[0]]) if len(at) else 1.0
 
 
-def tail_of(samples: Samples) -> Tail:
+def tail_of(samples: SuspicionCounts) -> Tail:
     """The tail of genuine samples; shares that too few samples support are left out."""
     count = int(samples.genuine.sum())
     shares = [share for share in TAILS if share * count >= _FEWEST]

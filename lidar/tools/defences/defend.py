@@ -26,10 +26,10 @@ from lidar.sensors.camera.png import write_png
 from lidar.tools.defences.calibration import Calibration, Joint, calibration_text, tail_of
 from lidar.tools.defences.fusion import FUSED, fused, fused_threshold, joint_of
 from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.reading import Scans, read_scans
+from lidar.tools.defences.reading import RecordedScans, read_scans
 from lidar.tools.defences.registry import NamedDefence
 from lidar.tools.defences.run import Judged, able, judged_frames
-from lidar.tools.defences.scores import FALSE_ALARMS, LEVELS, Samples, Score, score
+from lidar.tools.defences.scores import FALSE_ALARMS, LEVELS, Score, SuspicionCounts, score
 from lidar.tools.defences.truth import FrameTruth, attack_truth
 from lidar.tools.defences.verdict import Verdict
 from lidar.tools.detection import RULES, Detector
@@ -44,7 +44,7 @@ _Pairs = list[tuple[Float, NDArray[np.bool_]]]
 
 
 @dataclass
-class Tally:
+class DefenceTally:
     """Suspicions and truth of all frames, by defence and level, and the seconds of each frame."""
 
     pairs: dict[tuple[str, str], _Pairs] = field(default_factory=lambda: defaultdict(list))
@@ -64,9 +64,9 @@ class Tally:
         for name, seconds in judged.seconds.items():
             self.seconds[name].append(seconds)
 
-    def samples(self) -> dict[tuple[str, str], Samples]:
+    def samples(self) -> dict[tuple[str, str], SuspicionCounts]:
         """Samples by defence and level."""
-        return {key: Samples.of(pairs) for key, pairs in self.pairs.items()}
+        return {key: SuspicionCounts.of(pairs) for key, pairs in self.pairs.items()}
 
     def joint(self, calibration: Calibration, *, rng: np.random.Generator) -> dict[str, Joint]:
         """Suspicions of the same samples by all defences, by level."""
@@ -168,7 +168,7 @@ def _defended(
         thresholds |= {
             (FUSED, level): fused_threshold(calibration, names, level=level, rule=rule) for level in LEVELS
         }
-    tally, tables = Tally(), _Tables()
+    tally, tables = DefenceTally(), _Tables()
     for place, scans, judged in job.judged(progress):
         if rule:
             judged.verdicts[FUSED] = fused(dict(judged.verdicts), calibration, rule=rule)
@@ -229,7 +229,11 @@ def calibrate(
 
     Raises DatasetError if a frame was attacked.
     """
-    job, tally, names = _job(datasets, defences, scene=scene, seed=seed, detector=detector), Tally(), []
+    job, tally, names = (
+        _job(datasets, defences, scene=scene, seed=seed, detector=detector),
+        DefenceTally(),
+        [],
+    )
     for _, scans, judged in job.judged(progress):
         frame = judged.frame
         truth = _truth_of(scans, frame)
@@ -247,15 +251,15 @@ def calibrate(
 
 
 @dataclass(frozen=True)
-class Job:
+class DefenceJob:
     """Frames to judge: scanners of datasets with the folder of their files, and the defences they allow."""
 
-    scans: tuple[tuple[Path, Scans], ...]
+    scans: tuple[tuple[Path, RecordedScans], ...]
     defences: tuple[NamedDefence, ...]
     scene: Scene | None
     seed: int
 
-    def judged(self, progress: Progress) -> Iterator[tuple[Path, Scans, Judged]]:
+    def judged(self, progress: Progress) -> Iterator[tuple[Path, RecordedScans, Judged]]:
         """The frames in order."""
         for place, scans in self.scans:
             scene = self.scene_of(scans.dataset)
@@ -276,13 +280,15 @@ def _job(
     scene: Scene | None,
     seed: int,
     detector: Detector,
-) -> Job:
+) -> DefenceJob:
     """The frames of all scanners of datasets; raises InputError as `able` does."""
     scans = []
     for k, dataset in enumerate(datasets):
         name = dataset.path.name if len(datasets) == 1 else f"{k}_{dataset.path.name}"
         scans += [(Path(name) / each.sensor.name, each) for each in read_scans(dataset, detector=detector)]
-    job = Job(tuple(scans), tuple(able([each for _, each in scans], defences, scene=scene)), scene, seed)
+    job = DefenceJob(
+        tuple(scans), tuple(able([each for _, each in scans], defences, scene=scene)), scene, seed
+    )
     for _, each in scans:
         if (seen := job.scene_of(each.dataset)) is not None and seen.frame != each.dataset.frame:
             raise InputError(
@@ -292,7 +298,7 @@ def _job(
     return job
 
 
-def _truth_of(scans: Scans, frame: Observation) -> FrameTruth:
+def _truth_of(scans: RecordedScans, frame: Observation) -> FrameTruth:
     """What attacks did to a frame."""
     seconds = frame.start_ns * 1e-9
     name, count = scans.sensor.name, len(frame)

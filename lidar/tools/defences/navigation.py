@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from geoscene.typing import Float
 from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
-from lidar.tools.defences.observation import Navigation as Measured
+from lidar.tools.defences.observation import NavigationMeasurements as Measured
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict
 from lidar.world.world import World
@@ -43,7 +43,7 @@ class Correction:
 
 
 @dataclass(frozen=True)
-class Navigation(Defence):
+class NavigationDefence(Defence):
     """Fixes, gyroscope and recorded poses that contradict the motion that the scanner sees (chi-squared)."""
 
     history: ClassVar[int] = _LAG

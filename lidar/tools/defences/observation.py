@@ -55,7 +55,7 @@ def pixels_of(file: Path) -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True, slots=True)
-class Navigation:
+class NavigationMeasurements:
     """Measurements of the vehicle's receiver and inertial unit over the whole drive.
 
     gnss      : columns ``time_ns``, ``lon``, ``lat``, ``h``, ``quality``, ``hdop``
@@ -101,7 +101,7 @@ class Observation:
     range: Float
     intensity: Float
     pictures: tuple[Picture, ...] = ()
-    navigation: Navigation | None = None
+    navigation: NavigationMeasurements | None = None
     detector: Detector = RULES
 
     def __len__(self) -> int:

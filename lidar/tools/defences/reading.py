@@ -18,7 +18,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Scanner, cameras, scanners
 from lidar.sensors.rig.scanner import Sensor
 from lidar.sensors.rig.specs import CameraSpec, rig_of
-from lidar.tools.defences.observation import Navigation, Observation, Picture
+from lidar.tools.defences.observation import NavigationMeasurements, Observation, Picture
 from lidar.tools.detection import RULES, Detector
 
 SEEN = ("x", "y", "z", "intensity", "time_ns", "ring", "column", "range", "echo", "echoes")
@@ -29,7 +29,7 @@ _INERTIAL = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 
 
 @dataclass(frozen=True)
-class Scans:
+class RecordedScans:
     """The frames of a scanner.
 
     pictures   : images of the cameras, by camera
@@ -42,7 +42,7 @@ class Scans:
     clouds: Stream
     trajectory: Trajectory
     pictures: tuple[tuple[CameraSpec, Stream], ...]
-    navigation: Navigation | None
+    navigation: NavigationMeasurements | None
     detector: Detector = RULES
 
     @property
@@ -85,7 +85,7 @@ class Scans:
         )
 
 
-def read_scans(dataset: Dataset, *, detector: Detector = RULES) -> list[Scans]:
+def read_scans(dataset: Dataset, *, detector: Detector = RULES) -> list[RecordedScans]:
     """The frames of each scanner of a dataset, with the boxes of a detector.
 
     Raises InputError if the rig's files have changed since the drive, and DatasetError if clouds are not in
@@ -97,7 +97,7 @@ def read_scans(dataset: Dataset, *, detector: Detector = RULES) -> list[Scans]:
     pictures = _pictures(dataset, {camera.name: camera.spec for camera in cameras(rig)})
     navigation = _navigation(dataset)
     found = [
-        Scans(
+        RecordedScans(
             dataset,
             scanner.sensor,
             _clouds(dataset, scanner),
@@ -138,7 +138,7 @@ def _pictures_during(camera: CameraSpec, images: Stream, *, window_ns: tuple[int
     return [Picture(camera, int(images.time_ns[k]), images.files[k]) for k in np.flatnonzero(near)]
 
 
-def _navigation(dataset: Dataset) -> Navigation | None:
+def _navigation(dataset: Dataset) -> NavigationMeasurements | None:
     receivers, units = dataset.sensors("gnss"), dataset.sensors("imu")
     if not receivers or not units:
         return None
@@ -149,7 +149,7 @@ def _navigation(dataset: Dataset) -> Navigation | None:
     place = np.column_stack([x, y])
     place[~np.isfinite(gnss["lon"])] = np.nan
     mount = np.array(receivers[receiver]["vehicle_from_sensor"], float)
-    return Navigation(gnss, imu, mount[:3, 3], place)
+    return NavigationMeasurements(gnss, imu, mount[:3, 3], place)
 
 
 def _columns(dataset: Dataset, name: str, *, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:

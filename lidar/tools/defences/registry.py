@@ -20,11 +20,11 @@ _DEFENCES = {
     "azimuth": "azimuth.Azimuth",
     "overlay": "overlay.Overlay",
     "map": "map.Map",
-    "navigation": "navigation.Navigation",
+    "navigation": "navigation.NavigationDefence",
     "physics": "physics.Physics",
-    "statistical": "statistical.Statistical",
+    "statistical": "statistical.StatisticalDefence",
     "timing": "timing.Timing",
-    "watermark": "watermark.Watermark",
+    "watermark": "watermark.WatermarkDefence",
 }
 """Module within this folder and class, by name."""
 

@@ -15,7 +15,7 @@ from geoscene.support.storage import url_of
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
 from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.reading import Scans
+from lidar.tools.defences.reading import RecordedScans
 from lidar.tools.defences.registry import NamedDefence
 from lidar.tools.defences.verdict import Verdict
 from lidar.world.world import World
@@ -38,7 +38,7 @@ class Judged:
 
 
 def able(
-    scans: Sequence[Scans], defences: Sequence[NamedDefence], *, scene: Scene | None = None
+    scans: Sequence[RecordedScans], defences: Sequence[NamedDefence], *, scene: Scene | None = None
 ) -> list[NamedDefence]:
     """The defences that the data of all scanners allow, and ``scene`` or those that they were driven in.
 
@@ -58,7 +58,7 @@ def able(
     return found
 
 
-def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
+def _lacks(scans: RecordedScans, *, needs: frozenset[str]) -> str:
     """What a defence needs and the data of a scanner lack; empty if nothing."""
     path = scans.dataset.path
     if "cameras" in needs and not scans.pictures:
@@ -75,7 +75,7 @@ def _lacks(scans: Scans, *, needs: frozenset[str]) -> str:
 
 
 def judged_frames(
-    scans: Scans,
+    scans: RecordedScans,
     defences: Sequence[NamedDefence],
     *,
     scene: Scene | None = None,

@@ -23,7 +23,7 @@ _BOOTSTRAPS = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class SuspicionCounts:
     """Counts of suspicions by frame and bin, from 0 to 1.
 
     genuine  : (frames, bins + 1)
@@ -34,7 +34,7 @@ class Samples:
     attacked: NDArray[np.int64]
 
     @classmethod
-    def of(cls, frames: Sequence[tuple[Float, NDArray[np.bool_]]]) -> Samples:
+    def of(cls, frames: Sequence[tuple[Float, NDArray[np.bool_]]]) -> SuspicionCounts:
         """Samples of frames; each gives its suspicions and which of them are of attacked ones."""
         genuine = np.zeros((len(frames), BINS + 1), np.int64)
         attacked = np.zeros_like(genuine)
@@ -78,7 +78,7 @@ class Score:
         return document
 
 
-def threshold_at(samples: Samples, rate: float) -> float:
+def threshold_at(samples: SuspicionCounts, rate: float) -> float:
     """The least suspicion above which at most a share ``rate`` of genuine ones is; 1 if there is none."""
     genuine = samples.genuine.sum(axis=0)
     above = genuine.sum() - np.cumsum(genuine)
@@ -86,7 +86,7 @@ def threshold_at(samples: Samples, rate: float) -> float:
     return float(allowed[0] / BINS)
 
 
-def score(samples: Samples, *, threshold: float, rng: np.random.Generator) -> Score:
+def score(samples: SuspicionCounts, *, threshold: float, rng: np.random.Generator) -> Score:
     """The score of samples at a threshold.
 
     Intervals are those of frames drawn with replacement (percentile bootstrap), as returns and objects of a

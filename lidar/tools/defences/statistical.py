@@ -20,7 +20,7 @@ _NEAREST, _FARTHEST = 1.0, 200.0  # metres, of the bins of range
 
 
 @dataclass(frozen=True)
-class Statistical(Defence):
+class StatisticalDefence(Defence):
     """Returns farther from their neighbours than others at their range are (Charron et al. 2018)."""
 
     neighbours: int = parameter(6, "nearest returns of which the mean distance counts", low=1, high=50)

@@ -15,13 +15,13 @@ from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict
 from lidar.tools.integrity.keys import read_secret
 from lidar.tools.integrity.tampering import NOISE, FrameVerdict, frame_verdict
-from lidar.tools.integrity.watermark import STEP, Cells
-from lidar.tools.integrity.watermark import Watermark as Mark
+from lidar.tools.integrity.watermark import STEP, WatermarkCells
+from lidar.tools.integrity.watermark import WatermarkKey as Mark
 from lidar.world.world import World
 
 
 @dataclass(frozen=True)
-class Watermark(Defence):
+class WatermarkDefence(Defence):
     """Returns without the watermark that was embedded with a key (Changalvala and Malik 2019)."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"watermark"})
@@ -50,7 +50,7 @@ class Watermark(Defence):
         """Judge the returns of the last frame; the frame by its block with most wrong bits for its size."""
         del scene, rng
         frame = frames[-1]
-        cells = Cells(frame.sensor.name, frame.number, frame.ring, frame.column, frame.echo)
+        cells = WatermarkCells(frame.sensor.name, frame.number, frame.ring, frame.column, frame.echo)
         mark = Mark(read_secret(Path(self.key)), self.step)
         found = frame_verdict(mark, frame.xyz, cells=cells, noise=self.noise, false_alarms=self.false_alarms)
         returns = np.where(found.forged, np.maximum(found.suspicion, 0.5), np.minimum(found.suspicion, 0.5))

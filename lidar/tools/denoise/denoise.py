@@ -35,7 +35,7 @@ from lidar.sensors.rig.specs import rig_of
 from lidar.signal.run import Altered, cloud_truth, unaltered, write_truth
 from lidar.simulation.boxes import merge_box_files
 from lidar.tools.denoise.filters import Bools, Filter
-from lidar.tools.denoise.scores import Tally
+from lidar.tools.denoise.scores import FilterTally
 from lidar.tools.rerecord import recorded_cloud, recording_again, richest_format, write_altered
 
 _BYTES = {"kitti": 16, "nuscenes": 20}
@@ -51,7 +51,7 @@ class Denoised:
 
     path: Path
     out: Path | None
-    scores: dict[str, dict[str, Tally]]
+    scores: dict[str, dict[str, FilterTally]]
 
     def to_json(self) -> dict[str, Any]:
         """All scores."""
@@ -110,7 +110,7 @@ def denoise(
 
 def _scores(
     source: Path, methods: Mapping[str, Filter], *, out: Path | None, progress: Progress
-) -> dict[str, dict[str, Tally]]:
+) -> dict[str, dict[str, FilterTally]]:
     """Scores by filter and scanner; with ``out`` the clouds are written."""
     frames: Iterator[_Frame]
     if Paths(source).manifest.exists():
@@ -121,13 +121,13 @@ def _scores(
         if not clouds:
             raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
         job, count, frames = None, len(clouds), _foreign_frames(clouds, source, out=out)
-    scores: dict[str, dict[str, Tally]] = {text: {} for text in methods}
+    scores: dict[str, dict[str, FilterTally]] = {text: {} for text in methods}
     for done, frame in enumerate(frames):
         progress("frames", done, total=count)
         for text, method in methods.items():
             kept = method.kept(frame.xyz, frame.intensity)
             for name in (frame.scanner, "all"):
-                tally = scores[text].get(name, Tally())
+                tally = scores[text].get(name, FilterTally())
                 scores[text][name] = tally.with_frame(kept, frame.weather)
             frame.write(kept)
     progress("frames", count, total=count)

@@ -38,7 +38,7 @@ class Filter(Stage):
 
 
 @dataclass(frozen=True)
-class Statistical(Filter):
+class StatisticalFilter(Filter):
     """Mean distance to neighbours below the cloud's mean plus a deviation (Rusu and Cousins 2011)."""
 
     neighbours: int = parameter(50, "nearest returns", low=1, high=500)
@@ -121,7 +121,7 @@ class Ddior(Filter):
 
 
 METHODS: dict[str, type[Filter]] = {
-    "statistical": Statistical,
+    "statistical": StatisticalFilter,
     "dror": Dror,
     "dsor": Dsor,
     "lior": Lior,

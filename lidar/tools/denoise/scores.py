@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, slots=True)
-class Tally:
+class FilterTally:
     """Returns of frames by what they are and whether a filter removes them.
 
     frames, returns, removed : numbers
@@ -25,14 +25,14 @@ class Tally:
     weather: int = 0
     weather_removed: int = 0
 
-    def with_frame(self, kept: NDArray[np.bool_], weather: NDArray[np.bool_] | None) -> Tally:
+    def with_frame(self, kept: NDArray[np.bool_], weather: NDArray[np.bool_] | None) -> FilterTally:
         """With one more frame; its truth (n,) may be unknown, for then that of all is."""
         frames, returns = self.frames + 1, self.returns + len(kept)
         removed = self.removed + int(np.count_nonzero(~kept))
         if weather is None or self.weather < 0:
-            return Tally(frames, returns, removed, -1)
+            return FilterTally(frames, returns, removed, -1)
         both = self.weather_removed + int(np.count_nonzero(~kept & weather))
-        return Tally(frames, returns, removed, self.weather + int(np.count_nonzero(weather)), both)
+        return FilterTally(frames, returns, removed, self.weather + int(np.count_nonzero(weather)), both)
 
     @property
     def precision(self) -> float:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from geoscene.typing import Bools, Float, Ints
 from lidar.tools.detection.boxes import Rectangle, fitted
-from lidar.tools.detection.detector import Points
+from lidar.tools.detection.detector import CloudPoints
 from lidar.tools.detection.ground import height_above_ground
 
 
@@ -56,7 +56,7 @@ WALL = 1.9
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class ClusterShape:
     """Measures of a cluster, in metres.
 
     seen   : its rectangle, of the middles of its cells
@@ -90,7 +90,7 @@ class Shape:
 
 
 @dataclass(frozen=True, slots=True)
-class Cluster:
+class PointCluster:
     """Points that may be of one object.
 
     rows   : (m,) of the points of its `Scan`
@@ -100,7 +100,7 @@ class Cluster:
 
     rows: Ints
     middle: NDArray[np.floating]
-    shape: Shape
+    shape: ClusterShape
     floor: float
 
 
@@ -116,10 +116,10 @@ class Scan:
     xyz: Float
     height: Float
     row: Ints
-    clusters: tuple[Cluster, ...]
+    clusters: tuple[PointCluster, ...]
 
 
-def clustered(cloud: Points, *, settings: DetectorSettings) -> Scan:
+def clustered(cloud: CloudPoints, *, settings: DetectorSettings) -> Scan:
     """The clusters of a cloud of one turn of a scanner that stands upright on a vehicle.
 
     Points above the ground, up to 2.5 m, are clustered seen from above; clusters that are too long are
@@ -148,16 +148,18 @@ def clustered(cloud: Points, *, settings: DetectorSettings) -> Scan:
         if len(mine) >= settings.fewest:
             shape = _shape(height[rows], mine, tall=tall, settings=settings)
             floor = float((xyz[rows, 2] - height[rows]).mean())
-            found.append(Cluster(rows, mine, shape, floor))
+            found.append(PointCluster(rows, mine, shape, floor))
     return Scan(xyz, height, row, tuple(found))
 
 
-def _shape(height: Float, middle: NDArray[np.floating], *, tall: _Tall, settings: DetectorSettings) -> Shape:
+def _shape(
+    height: Float, middle: NDArray[np.floating], *, tall: _Tall, settings: DetectorSettings
+) -> ClusterShape:
     seen = fitted(middle)
     distance = float(np.hypot(*seen.centre))
     around = tall.near(middle, radius=0.25)
     following = around[around < settings.band[1] + 0.5 + _SPACING * distance]
-    return Shape(
+    return ClusterShape(
         seen,
         len(middle),
         (seen.size[0] + settings.cell, seen.size[1] + settings.cell),

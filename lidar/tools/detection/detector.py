@@ -21,7 +21,7 @@ KINDS = {
 """What detectors call a class of road users."""
 
 
-class Points(Protocol):
+class CloudPoints(Protocol):
     """A cloud, of which only the coordinates are used."""
 
     @property
@@ -47,7 +47,7 @@ class Detector(Protocol):
         """The name "rules", or the start of the digest of a model."""
         ...
 
-    def detect(self, cloud: Points) -> Detections:
+    def detect(self, cloud: CloudPoints) -> Detections:
         """Road users in a cloud."""
         ...
 
@@ -94,7 +94,7 @@ def inside(xyz: NDArray[np.floating], centre: Float, *, size: Float, yaw: float)
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DetectedObject:
     """One object: its rectangle, lowest and highest z, score and kind."""
 
     rectangle: Rectangle
@@ -103,9 +103,9 @@ class Found:
     kind: str
 
 
-def apart(found: list[Found]) -> list[Found]:
+def apart(found: list[DetectedObject]) -> list[DetectedObject]:
     """The objects, best first, without those whose middle is in a better one: parts of it."""
-    kept: list[Found] = []
+    kept: list[DetectedObject] = []
     for one in sorted(found, key=lambda one: -one.score):
         middle = np.append(one.rectangle.centre, 0.0)[None]
         flat = [
@@ -117,7 +117,7 @@ def apart(found: list[Found]) -> list[Found]:
     return kept
 
 
-def table(found: list[Found], xyz: Float) -> Detections:
+def table(found: list[DetectedObject], xyz: Float) -> Detections:
     """Boxes of objects, with the number of points (n, 3) in each."""
     boxes = [one.rectangle for one in found]
     z = np.array([one.z for one in found], float).reshape(-1, 2)

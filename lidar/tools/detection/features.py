@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
-from lidar.tools.detection.clusters import Cluster, Scan
+from lidar.tools.detection.clusters import PointCluster, Scan
 
 _BANDS = (0.3, 0.7, 1.1, 1.5, 2.0, 2.5)
 """Metres above the ground between which the share of the points is counted."""
@@ -34,7 +34,7 @@ FEATURES = (
 )
 """Names of the columns of `features`:
 
-distance, edge, across, top, bottom, roof, above, standing : as in `lidar.tools.detection.clusters.Shape`
+distance, edge, across, top, bottom, roof, above, standing : as in `ClusterShape`
 points, cells : natural logarithms of their numbers
 rows          : number of elevations of its points, of steps of 4 mrad
 length, width : metres, of its rectangle
@@ -59,7 +59,7 @@ def features(scan: Scan) -> NDArray[np.float32]:
     return found
 
 
-def _measures(one: Cluster, scan: Scan, *, tree: cKDTree) -> list[float]:
+def _measures(one: PointCluster, scan: Scan, *, tree: cKDTree) -> list[float]:
     shape, xyz, height = one.shape, scan.xyz[one.rows], scan.height[one.rows]
     flat = xyz[:, :2] - shape.seen.centre
     sight = shape.seen.centre / max(shape.distance, 1e-9)

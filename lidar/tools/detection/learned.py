@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import FormatError
 from lidar.tools.detection.boxes import Rectangle, completed
-from lidar.tools.detection.clusters import PLAIN, Cluster, DetectorSettings, clustered
-from lidar.tools.detection.detector import Detections, Found, Points, apart, table
+from lidar.tools.detection.clusters import PLAIN, DetectorSettings, PointCluster, clustered
+from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detections, apart, table
 from lidar.tools.detection.features import FEATURES, features
 from lidar.tools.detection.forest import Forest, read_forest, write_forest
 
@@ -48,7 +48,7 @@ class Learned:
     training: Mapping[str, Any] = field(default_factory=dict)
     settings: DetectorSettings = PLAIN
 
-    def detect(self, cloud: Points) -> Detections:
+    def detect(self, cloud: CloudPoints) -> Detections:
         """Road users in a cloud of one turn of a scanner that stands upright on a vehicle."""
         scan = clustered(cloud, settings=self.settings)
         scores = self.scores(features(scan))
@@ -101,13 +101,13 @@ def read_model(path: Path, *, name: str = "") -> Learned:
     return Learned(forest, threshold, name or str(path), f"model {digest[:16]}", training)
 
 
-def _found(one: Cluster, kind: str, *, score: float, settings: DetectorSettings) -> Found:
+def _found(one: PointCluster, kind: str, *, score: float, settings: DetectorSettings) -> DetectedObject:
     """The object of a kind that a cluster is."""
     shape, seen = one.shape, one.shape.seen
     if kind == "vehicle":
         high = shape.above > _HANGING and shape.roof < _HIGHEST
         box = completed(seen, length=settings.length, width=settings.width)
-        return Found(box, (one.floor, one.floor + (shape.roof if high else shape.top)), score, kind)
+        return DetectedObject(box, (one.floor, one.floor + (shape.roof if high else shape.top)), score, kind)
     size = tuple(np.maximum(seen.size, _SMALLEST[kind]).tolist())
     box = Rectangle(seen.centre, (size[0], size[1]), seen.yaw, seen.edge)
-    return Found(box, (one.floor, one.floor + shape.top), score, kind)
+    return DetectedObject(box, (one.floor, one.floor + shape.top), score, kind)

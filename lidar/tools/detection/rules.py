@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar.tools.detection.boxes import Rectangle, completed
-from lidar.tools.detection.clusters import PLAIN, WALL, DetectorSettings, Shape, clustered, ramp
-from lidar.tools.detection.detector import Detections, Found, Points, apart, table
+from lidar.tools.detection.clusters import PLAIN, WALL, ClusterShape, DetectorSettings, clustered, ramp
+from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detections, apart, table
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class Rules:
     name: str = "rules"
     identity: str = "rules"
 
-    def detect(self, cloud: Points) -> Detections:
+    def detect(self, cloud: CloudPoints) -> Detections:
         """Road users in a cloud."""
         return detect(cloud, settings=self.settings)
 
@@ -25,7 +25,7 @@ class Rules:
 RULES = Rules()
 
 
-def detect(cloud: Points, *, settings: DetectorSettings = PLAIN) -> Detections:
+def detect(cloud: CloudPoints, *, settings: DetectorSettings = PLAIN) -> Detections:
     """Road users in a cloud of one turn of a scanner that stands upright on a vehicle.
 
     Each cluster gets a rectangle; its size, its height, the share of points above it and the number of cells
@@ -36,7 +36,7 @@ def detect(cloud: Points, *, settings: DetectorSettings = PLAIN) -> Detections:
     return table(apart([one for one in found if one.score >= settings.certain]), scan.xyz)
 
 
-def _judged(shape: Shape, *, floor: float, settings: DetectorSettings) -> Found:
+def _judged(shape: ClusterShape, *, floor: float, settings: DetectorSettings) -> DetectedObject:
     """What a cluster most likely is, with the score of the rules.
 
     floor : z of the ground below it
@@ -46,22 +46,22 @@ def _judged(shape: Shape, *, floor: float, settings: DetectorSettings) -> Found:
     cycle = Rectangle(seen.centre, (max(length, 1.7), max(width, 0.6)), seen.yaw, seen.edge)
     vehicle = completed(seen, length=settings.length, width=settings.width)
     choices = [
-        Found(person, (floor, floor + shape.top), _as_person(shape), "person"),
-        Found(cycle, (floor, floor + shape.top), _as_cycle(shape), "cycle"),
-        Found(vehicle, (floor, floor + shape.top), _as_car(shape), "vehicle"),
-        Found(vehicle, (floor, floor + shape.roof), _as_truck(shape), "vehicle"),
+        DetectedObject(person, (floor, floor + shape.top), _as_person(shape), "person"),
+        DetectedObject(cycle, (floor, floor + shape.top), _as_cycle(shape), "cycle"),
+        DetectedObject(vehicle, (floor, floor + shape.top), _as_car(shape), "vehicle"),
+        DetectedObject(vehicle, (floor, floor + shape.roof), _as_truck(shape), "vehicle"),
     ]
     return max(choices, key=lambda choice: choice.score)
 
 
-def _as_person(shape: Shape) -> float:
+def _as_person(shape: ClusterShape) -> float:
     """0 to 1: narrow, of a person's height, and nothing above, as over a pole or a trunk."""
     side = ramp(-shape.sides[0], -1.3, -1.0) * ramp(shape.sides[0], 0.1, 0.4)
     few = ramp(shape.cells, 1, 6)
     return few * shape.standing * side * ramp(shape.top, 1.1, 1.45) * ramp(-shape.above, -0.15, -0.01)
 
 
-def _as_cycle(shape: Shape) -> float:
+def _as_cycle(shape: ClusterShape) -> float:
     """0 to 1: as a person, but longer along the line of sight; one seen from the side is as wide as a car."""
     side = (
         ramp(-shape.sides[0], -2.5, -2.1) * ramp(shape.sides[0], 1.1, 1.4) * ramp(-shape.sides[1], -1.0, -0.8)
@@ -70,7 +70,7 @@ def _as_cycle(shape: Shape) -> float:
     return ramp(shape.cells, 1, 8) * shape.standing * side * upright * ramp(shape.across, 0.4, 0.7)
 
 
-def _as_car(shape: Shape) -> float:
+def _as_car(shape: ClusterShape) -> float:
     """0 to 1: of a car's or van's length, width and height, with points along two edges and nothing above."""
     length, width = shape.sides
     size = ramp(-length, -6.4, -5.4) * ramp(length, 0.9, 1.5) * ramp(-width, -2.6, -2.1)
@@ -78,7 +78,7 @@ def _as_car(shape: Shape) -> float:
     return _many(shape) * size * high * ramp(-shape.above, -0.05, 0.0) * _edge(shape)
 
 
-def _as_truck(shape: Shape) -> float:
+def _as_truck(shape: ClusterShape) -> float:
     """0 to 0.6: of a truck's or bus's size, and in no line that is longer; so are some walls."""
     length, width = shape.sides
     size = ramp(length, 1.8, 2.4) * ramp(-width, -3.4, -2.8)
@@ -86,15 +86,15 @@ def _as_truck(shape: Shape) -> float:
     return 0.6 * _many(shape) * size * high * _alone(shape) * _edge(shape) * ramp(width, -1.0, 1.2)
 
 
-def _many(shape: Shape) -> float:
+def _many(shape: ClusterShape) -> float:
     """0 to 1 by the number of cells and, as a single beam tells little, by the heights that they span."""
     return shape.standing * ramp(shape.cells, 2, 12) * (0.5 + 0.5 * ramp(shape.top - shape.bottom, 0.1, 0.5))
 
 
-def _alone(shape: Shape) -> float:
+def _alone(shape: ClusterShape) -> float:
     """0 to 1: no longer than a bus, and in no line of walls that is."""
     return ramp(-max(shape.line, shape.sides[0]), -14.0, -12.0)
 
 
-def _edge(shape: Shape) -> float:
+def _edge(shape: ClusterShape) -> float:
     return ramp(-shape.seen.edge, -0.7, -0.4)

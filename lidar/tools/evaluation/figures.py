@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from geoscene.drawing.canvas import Canvas
 from geoscene.drawing.charts import COLORS, Axes
-from geoscene.drawing.panels import Band, Panel, Raster, Series, figure
+from geoscene.drawing.panels import Panel, Raster, Series, ShadedBand, figure
 from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from geoscene.typing import Float
@@ -133,7 +133,7 @@ def drift(compared: Compared) -> Canvas:
                 [line, dots],
                 x_log=False,
                 y_log=False,
-                bands=[Band("95 %", known)] if len(known) > 1 else [],
+                bands=[ShadedBand("95 %", known)] if len(known) > 1 else [],
                 x_ends=(0.0, 1.05 * values[-1][0]),
             )
         )

@@ -16,7 +16,7 @@ GAPS_S = {"interpolated": 1.0, "nearest": 0.01}
 
 
 @dataclass(frozen=True, slots=True)
-class Pairs:
+class PosePairs:
     """Poses of an estimate and of the truth at the same times, row by row.
 
     left_out : poses of the estimate without a counterpart
@@ -31,7 +31,7 @@ class Pairs:
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class TrajectoryAlignment:
     """What moves an estimate onto the truth: ``scale * rotation @ point + shift``.
 
     rotation : (3, 3)
@@ -48,7 +48,7 @@ class Alignment:
         return path.moved(self.rotation, self.shift, scale=self.scale)
 
 
-def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = None) -> Pairs:
+def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = None) -> PosePairs:
     """Pair the poses of two paths by time; those of files without times by their number.
 
     how   : ``interpolated`` takes the truth between its poses at each time of the estimate; ``nearest`` takes
@@ -63,7 +63,7 @@ def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = 
                 f"the estimate has {len(estimate)} poses, the truth {len(truth)}, and neither has times: give"
                 " files of equal length, or times"
             )
-        return Pairs(estimate, truth, 0)
+        return PosePairs(estimate, truth, 0)
     if estimate.timed != truth.timed:
         raise InputError("one trajectory has times and the other none: give both as TUM, or a dataset")
     gap_ns = round(1e9 * (GAPS_S[how] if gap_s is None else gap_s))
@@ -77,25 +77,25 @@ def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = 
     return pairs
 
 
-def _interpolated(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> Pairs:
+def _interpolated(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> PosePairs:
     knots, at = truth.time_ns, estimate.time_ns
     after = np.clip(np.searchsorted(knots, at), 1, len(knots) - 1)
     inside = (at >= knots[0]) & (at <= knots[-1]) & (knots[after] - knots[after - 1] <= gap_ns)
     kept = estimate.where(inside)
-    return Pairs(kept, truth.at(kept.time_ns), int((~inside).sum()))
+    return PosePairs(kept, truth.at(kept.time_ns), int((~inside).sum()))
 
 
-def _nearest(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> Pairs:
+def _nearest(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> PosePairs:
     fewer, more = (estimate, truth) if len(estimate) <= len(truth) else (truth, estimate)
     row: Ints = nearest(more.time_ns, fewer.time_ns)
     close = np.abs(more.time_ns[row] - fewer.time_ns) <= gap_ns
     first, second = fewer.where(close), more.take(row[close])
     if fewer is estimate:
-        return Pairs(first, second, int((~close).sum()))
-    return Pairs(second, first, len(estimate) - len(second))
+        return PosePairs(first, second, int((~close).sum()))
+    return PosePairs(second, first, len(estimate) - len(second))
 
 
-def alignment(pairs: Pairs, kind: str) -> Alignment:
+def alignment(pairs: PosePairs, kind: str) -> TrajectoryAlignment:
     """The motion that brings an estimate onto the truth.
 
     none         : as it is
@@ -107,17 +107,17 @@ def alignment(pairs: Pairs, kind: str) -> Alignment:
     """
     estimate, truth = pairs.estimate, pairs.truth
     if kind == "none":
-        return Alignment(kind, np.eye(3), np.zeros(3))
+        return TrajectoryAlignment(kind, np.eye(3), np.zeros(3))
     if kind == "origin":
         turn = truth.rotation[0] @ estimate.rotation[0].T
-        return Alignment(kind, turn, truth.position[0] - turn @ estimate.position[0])
+        return TrajectoryAlignment(kind, turn, truth.position[0] - turn @ estimate.position[0])
     here, there = estimate.position.mean(axis=0), truth.position.mean(axis=0)
     x, y = estimate.position - here, truth.position - there
     if kind == "yaw-position":
         yaw = np.arctan2((x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).sum(), (x[:, :2] * y[:, :2]).sum())
         c, s = np.cos(yaw), np.sin(yaw)
         turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return Alignment(kind, turn, there - turn @ here)
+        return TrajectoryAlignment(kind, turn, there - turn @ here)
     u, d, v = np.linalg.svd(y.T @ x / len(x))
     if d[1] <= 1e-9 * max(d[0], 1e-12):
         raise InputError(
@@ -127,4 +127,4 @@ def alignment(pairs: Pairs, kind: str) -> Alignment:
     flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v))])
     turn = u @ flip @ v
     scale = float(np.trace(np.diag(d) @ flip) / (x**2).sum(axis=1).mean()) if kind == "sim3" else 1.0
-    return Alignment(kind, turn, there - scale * turn @ here, scale)
+    return TrajectoryAlignment(kind, turn, there - scale * turn @ here, scale)

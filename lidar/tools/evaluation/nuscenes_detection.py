@@ -86,7 +86,7 @@ class Boxes(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class KeyFrames:
     """Key frames.
 
     token : of each sample
@@ -132,7 +132,7 @@ class NuScenesScore:
     nds_present: float
 
 
-def samples_of(dataset: Dataset) -> Samples:
+def samples_of(dataset: Dataset) -> KeyFrames:
     """The key frames of a dataset as `lidar.dataset.layouts.nuscenes` has them."""
     top = streams_of(dataset)["LIDAR_TOP"]
     rows, name = key_rows(top.time_ns), dataset.path.resolve().name
@@ -140,10 +140,10 @@ def samples_of(dataset: Dataset) -> Samples:
     scale, zero = table_frame(trajectory)
     time_ns, frames = top.time_ns[rows], top.frames[rows]
     tokens = [token_of(name, "sample", frame) for frame in frames.tolist()]
-    return Samples(tokens, time_ns, frames, trajectory.at(time_ns).position / scale - zero)
+    return KeyFrames(tokens, time_ns, frames, trajectory.at(time_ns).position / scale - zero)
 
 
-def true_boxes(dataset: Dataset, samples: Samples) -> Boxes:
+def true_boxes(dataset: Dataset, samples: KeyFrames) -> Boxes:
     """Road users of the key frames with returns, of classes of the benchmark.
 
     Velocities are those between annotations before and after, as the development kit takes them.
@@ -210,7 +210,7 @@ def _detected(category: str) -> str:
     return "construction_vehicle" if words[:2] == ["vehicle", "construction"] else ""
 
 
-def read_results(path: Path, samples: Samples) -> Boxes:
+def read_results(path: Path, samples: KeyFrames) -> Boxes:
     """The detections of a file of results in nuScenes' layout, those of unknown samples left out.
 
     Raises FormatError for another file, InputError if it has none of the samples.

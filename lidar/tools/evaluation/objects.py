@@ -14,7 +14,7 @@ from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.layouts.kitti import OBJECTS
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
 from lidar.dataset.layouts.kitti_objects import object_lines
-from lidar.dataset.layouts.mot import Line, sequence
+from lidar.dataset.layouts.mot import TrackedBox, sequence
 from lidar.dataset.recorded import color_images
 from lidar.errors import DatasetError, InputError
 from lidar.tools.evaluation.detect import RESULTS
@@ -29,7 +29,7 @@ from lidar.tools.evaluation.nuscenes_detection import (
 from lidar.tools.evaluation.tracking import (
     CLASSES,
     LIMITS,
-    Tracks,
+    ObjectTracks,
     TrackScore,
     read_tracks,
     score_tracks,
@@ -148,11 +148,11 @@ def _detections(folder: Path, drive: KittiDrive, *, against: Path) -> ObjectScor
     return ObjectScores(str(folder), str(against), "kitti detections", len(frames), evaluate_kitti(frames))
 
 
-def _kitti_tracks(path: Path, found: Mapping[int, Tracks], *, drive: KittiDrive) -> ObjectScores:
+def _kitti_tracks(path: Path, found: Mapping[int, ObjectTracks], *, drive: KittiDrive) -> ObjectScores:
     true = {}
     for row, lines in enumerate(true_lines(drive)):
         labels = labels_of(list(lines.values()), name=drive.dataset.path)
-        true[row] = Tracks(np.array(list(lines), np.int64), labels)
+        true[row] = ObjectTracks(np.array(list(lines), np.int64), labels)
     _check_frames(path, found, count=len(drive))
     scores = []
     for kind in CLASSES:
@@ -162,7 +162,9 @@ def _kitti_tracks(path: Path, found: Mapping[int, Tracks], *, drive: KittiDrive)
     return ObjectScores(str(path), str(drive.dataset.path), "kitti tracks", len(drive), scores)
 
 
-def _mot_tracks(path: Path, found: Mapping[int, Tracks], *, dataset: Dataset, sensor: str) -> ObjectScores:
+def _mot_tracks(
+    path: Path, found: Mapping[int, ObjectTracks], *, dataset: Dataset, sensor: str
+) -> ObjectScores:
     cameras = dataset.sensors("camera")
     if sensor and sensor not in cameras:
         raise InputError(f"`sensor` {sensor}: no camera of {dataset.path}; there are {', '.join(cameras)}")
@@ -170,11 +172,11 @@ def _mot_tracks(path: Path, found: Mapping[int, Tracks], *, dataset: Dataset, se
     stream = color_images(dataset, sensor or known[0]) if known else None
     if stream is None or stream.name not in known:
         raise DatasetError(f"{dataset.path}: has no images with boxes of road users; drive with `traffic`")
-    rows: dict[int, list[Line]] = {}
+    rows: dict[int, list[TrackedBox]] = {}
     for line in sequence(dataset, stream):
         rows.setdefault(line.image, []).append(line)
     true = {
-        image: Tracks(
+        image: ObjectTracks(
             np.array([line.track for line in lines], np.int64),
             labels_of(
                 ["object 0 0 0 {} {} {} {} 1 1 1 0 0 0 0".format(*one.box) for one in lines], name=path
@@ -189,7 +191,7 @@ def _mot_tracks(path: Path, found: Mapping[int, Tracks], *, dataset: Dataset, se
     return ObjectScores(str(path), str(dataset.path), f"mot tracks of {stream.name}", count, scores)
 
 
-def _check_frames(path: Path, found: Mapping[int, Tracks], *, count: int) -> None:
+def _check_frames(path: Path, found: Mapping[int, ObjectTracks], *, count: int) -> None:
     if found and not 0 <= min(found) <= max(found) < count:
         beyond = max(found) if max(found) >= count else min(found)
         raise InputError(f"{path}: has frame {beyond} (from 0), but the drive has {count} frames")

@@ -9,7 +9,7 @@ import numpy as np
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.attitude import quat_from_matrix
-from lidar.tools.evaluation.matching import Pairs
+from lidar.tools.evaluation.matching import PosePairs
 
 KITTI_LENGTHS = tuple(range(100, 900, 100))
 """Metres of the segments of KITTI's odometry benchmark."""
@@ -63,14 +63,14 @@ def angles(rotation: Float) -> Float:
     return np.asarray(2 * np.arctan2(np.linalg.norm(quat[:, :3], axis=1), np.abs(quat[:, 3])), float)
 
 
-def absolute(pairs: Pairs) -> tuple[Float, Float]:
+def absolute(pairs: PosePairs) -> tuple[Float, Float]:
     """Distances (n,) in metres and angles (n,) in radians between the poses of each pair."""
     off = pairs.estimate.position - pairs.truth.position
     turn = pairs.truth.rotation.swapaxes(1, 2) @ pairs.estimate.rotation
     return np.linalg.norm(off, axis=1), angles(turn)
 
 
-def by_axis(pairs: Pairs) -> tuple[Float, Float]:
+def by_axis(pairs: PosePairs) -> tuple[Float, Float]:
     """Errors (n, 3) forward, left and up, metres, and roll, pitch and yaw (n, 3), radians, in true axes."""
     back = pairs.truth.rotation.swapaxes(1, 2)
     off = np.einsum("nij,nj->ni", back, pairs.estimate.position - pairs.truth.position)
@@ -81,13 +81,13 @@ def by_axis(pairs: Pairs) -> tuple[Float, Float]:
     return off, np.column_stack([roll, pitch, yaw])
 
 
-def over_frames(pairs: Pairs, count: int) -> Relative:
+def over_frames(pairs: PosePairs, count: int) -> Relative:
     """Relative errors of all pairs of poses that are a number of poses apart (Sturm et al. 2012)."""
     first = np.arange(max(len(pairs) - count, 0))
     return _relative(pairs, first=first, last=first + count)
 
 
-def over_metres(pairs: Pairs, length: float) -> Relative:
+def over_metres(pairs: PosePairs, length: float) -> Relative:
     """Relative errors from each pose to that whose true way from it is nearest to a length.
 
     Pairs whose way differs by more than a tenth of the length are left out.
@@ -104,7 +104,7 @@ def over_metres(pairs: Pairs, length: float) -> Relative:
     return _relative(pairs, first=first[good], last=last[good])
 
 
-def _relative(pairs: Pairs, *, first: Ints, last: Ints) -> Relative:
+def _relative(pairs: PosePairs, *, first: Ints, last: Ints) -> Relative:
     """Errors of the motion between rows of pairs."""
     true = _motion(pairs.truth.position, pairs.truth.rotation, first=first, last=last)
     found = _motion(pairs.estimate.position, pairs.estimate.rotation, first=first, last=last)
@@ -124,7 +124,7 @@ def lengths_for(way: float) -> tuple[int, ...]:
     return kitti if len(kitti) > 1 else tuple(length for length in SHORT_LENGTHS if length < way)
 
 
-def segments(pairs: Pairs, lengths: tuple[int, ...]) -> Segments:
+def segments(pairs: PosePairs, lengths: tuple[int, ...]) -> Segments:
     """Errors of segments of the true way, as KITTI's development kit computes them (Geiger et al. 2012).
 
     A segment ends at the first pose whose way is longer than its length; errors are per metre of it. Speeds

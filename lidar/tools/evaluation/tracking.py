@@ -25,7 +25,7 @@ _COUNTS = DIFFICULTIES[-1]
 
 
 @dataclass(frozen=True, slots=True)
-class Tracks:
+class ObjectTracks:
     """Objects of a frame and the numbers (n,) of their tracks."""
 
     track: Ints
@@ -62,7 +62,7 @@ class TrackScore:
     idf1: float
 
 
-def read_tracks(path: Path) -> tuple[dict[int, Tracks], str]:
+def read_tracks(path: Path) -> tuple[dict[int, ObjectTracks], str]:
     """The tracks of each frame of a file of KITTI's tracking benchmark or of MOT, and which it is.
 
     Raises FormatError for another file.
@@ -89,20 +89,25 @@ def read_tracks(path: Path) -> tuple[dict[int, Tracks], str]:
     except (ValueError, IndexError) as error:
         raise FormatError(f"{path}: no tracks of KITTI or MOT ({error})") from None
     found = {
-        frame: Tracks(np.array([t for t, _ in own]), labels_of([text for _, text in own], name=path))
+        frame: ObjectTracks(np.array([t for t, _ in own]), labels_of([text for _, text in own], name=path))
         for frame, own in rows.items()
     }
     return found, "kitti" if kitti else "mot"
 
 
 def steps_of(
-    true: Mapping[int, Tracks], found: Mapping[int, Tracks], *, frames: Sequence[int], kind: str, measure: str
+    true: Mapping[int, ObjectTracks],
+    found: Mapping[int, ObjectTracks],
+    *,
+    frames: Sequence[int],
+    kind: str,
+    measure: str,
 ) -> list[Step]:
     """Frames of a class; ``object`` stands for all classes.
 
     Objects that are low, hidden or of a class alike do not count, and found ones on them are left out.
     """
-    nothing = Tracks(np.empty(0, np.int64), labels_of([], name=""))
+    nothing = ObjectTracks(np.empty(0, np.int64), labels_of([], name=""))
     steps = []
     for frame in frames:
         here, there = found.get(frame, nothing), true.get(frame, nothing)

@@ -14,7 +14,7 @@ from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import EvaluateOptions, MapOptions
 from lidar.tools.evaluation.intervals import Statistics, Value, statistics
-from lidar.tools.evaluation.matching import Alignment, Pairs, alignment, matched
+from lidar.tools.evaluation.matching import PosePairs, TrajectoryAlignment, alignment, matched
 from lidar.tools.evaluation.pose_errors import (
     KITTI_LENGTHS,
     KITTI_STEP,
@@ -28,7 +28,7 @@ from lidar.tools.evaluation.pose_errors import (
 from lidar.tools.evaluation.trajectories import Path3D, file_of, read_path, read_truth, sensor_mount
 
 if TYPE_CHECKING:
-    from lidar.tools.maps.compare import Distances
+    from lidar.tools.maps.compare import SurfaceDistances
 
 _VOXEL = 0.1
 """Metres: side of the cubes of which a map keeps a point each when its error is measured."""
@@ -84,13 +84,13 @@ class TrajectoryErrors:
     way_m: float
     way_estimate_m: float
     duration_s: float | None
-    alignment: Alignment
+    alignment: TrajectoryAlignment
     translation: Statistics
     rotation: Statistics
     relative: list[RelativeError]
     segments: list[SegmentErrors]
     kitti: bool
-    map: list[Distances]
+    map: list[SurfaceDistances]
 
     def to_json(self) -> dict[str, Any]:
         """As ``evaluation.json``."""
@@ -111,7 +111,7 @@ class Compared:
     """
 
     errors: TrajectoryErrors
-    pairs: Pairs
+    pairs: PosePairs
     segments: Segments
     dataset: Dataset | None
 
@@ -144,7 +144,7 @@ def evaluate_trajectory(
         found = found.mounted(mount)
     pairs = matched(found, truth, how=options.associate, gap_s=options.max_gap)
     motion = alignment(pairs, options.align)
-    aligned = Pairs(motion.of(pairs.estimate), pairs.truth, pairs.left_out)
+    aligned = PosePairs(motion.of(pairs.estimate), pairs.truth, pairs.left_out)
     way = pairs.truth.distance()
     parts = segments(aligned, lengths_for(float(way[-1])))
     moved, turned = absolute(aligned)
@@ -173,17 +173,17 @@ def evaluate_trajectory(
     return Compared(errors, aligned, parts, dataset)
 
 
-def _pairs_apart(pairs: Pairs, delta: str) -> Any:
+def _pairs_apart(pairs: PosePairs, delta: str) -> Any:
     if delta.endswith("f"):
         return over_frames(pairs, int(delta[:-1]))
     return over_metres(pairs, float(delta[:-1]))
 
 
-def _fits(pairs: Pairs, delta: str) -> bool:
+def _fits(pairs: PosePairs, delta: str) -> bool:
     return len(_pairs_apart(pairs, delta)) > 0
 
 
-def _relative(pairs: Pairs, delta: str) -> RelativeError:
+def _relative(pairs: PosePairs, delta: str) -> RelativeError:
     found = _pairs_apart(pairs, delta)
     least = int(np.median(found.last - found.first))
     return RelativeError(
@@ -210,7 +210,7 @@ def _segment_errors(parts: Segments, way: float) -> list[SegmentErrors]:
 
 def _map_errors(
     dataset: Dataset, vehicle: Path3D, *, out: Path | None, progress: Progress
-) -> list[Distances]:
+) -> list[SurfaceDistances]:
     """Distances of the map that a trajectory of the vehicle gives to the surfaces of the dataset's scene."""
     from lidar.tools.maps.aggregate import aggregate  # noqa: PLC0415
 

@@ -26,7 +26,7 @@ from lidar.sensors.physics.echoes import Origin
 from lidar.tools.maps.colors import distinct, ramp
 from lidar.tools.maps.picture import (
     BACKGROUND,
-    View,
+    PictureView,
     cloud_picture,
     depth_picture,
     range_rings,
@@ -44,7 +44,7 @@ _GROUND = (10, 11, 15, 170)
 _LINE = 16
 """Pixels between the lines of a legend."""
 
-_VIEWS = {"chase": View(90.0, 20.0, 62.0), "top": View(90.0, 90.0, 2.0)}
+_VIEWS = {"chase": PictureView(90.0, 20.0, 62.0), "top": PictureView(90.0, 90.0, 2.0)}
 """In the vehicle frame: x, forward, is up in the picture."""
 
 _SAMPLES = 3

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.tools.integrity.watermark import Cells, Watermark
+from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey
 
 LEAST = 0.1
 """Metres from the sensor below which returns bear no mark."""
@@ -22,11 +22,11 @@ _EDGE = 2e-6
 """Radians from a cell's edge that marked returns keep; single precision moves directions by 1e-7."""
 
 
-def cells_by_direction(xyz: NDArray[np.floating], *, sensor: str, frame: int) -> Cells:
+def cells_by_direction(xyz: NDArray[np.floating], *, sensor: str, frame: int) -> WatermarkCells:
     """Cells of returns (n, 3), sensor frame: step of the elevation as ring, of the azimuth as column."""
     turn, rise, _ = _polar(xyz)
     ring, column = (rise // _RISE).astype(np.uint16), (turn // _TURN).astype(np.int64)
-    return Cells(sensor, frame, ring, column, np.zeros(len(xyz), np.uint8), ranges=True)
+    return WatermarkCells(sensor, frame, ring, column, np.zeros(len(xyz), np.uint8), ranges=True)
 
 
 def is_marked(xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -36,7 +36,7 @@ def is_marked(xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def with_mark(
-    watermark: Watermark, xyz: NDArray[np.float32], *, sensor: str, frame: int
+    watermark: WatermarkKey, xyz: NDArray[np.float32], *, sensor: str, frame: int
 ) -> NDArray[np.float32]:
     """Coordinates (n, 3) with the watermark in their ranges, in single precision."""
     out, rows = xyz.copy(), np.flatnonzero(is_marked(xyz))

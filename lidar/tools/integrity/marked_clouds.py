@@ -25,7 +25,7 @@ from lidar.sensors.rig.specs import rig_of
 from lidar.simulation.record_clouds import sent_pulses
 from lidar.simulation.recording import Recording
 from lidar.tools.integrity.directions import cells_by_direction, is_marked
-from lidar.tools.integrity.watermark import Cells
+from lidar.tools.integrity.watermark import WatermarkCells
 from lidar.tools.rerecord import recording_again
 from lidar.tools.sign import cells_of, cloud_place, marked_formats
 
@@ -52,12 +52,12 @@ class MarkedCloud:
     sensor: str
     frame: int
     xyz: NDArray[np.floating]
-    cells: Cells
+    cells: WatermarkCells
     step: float
 
 
 @dataclass(frozen=True)
-class CloudFile:
+class MarkedCloudFile:
     """A file of a cloud that may bear a watermark; `read` reads it."""
 
     data: Signable
@@ -96,14 +96,14 @@ class CloudFile:
         return MarkedCloud(self.place, self.sensor, self.frame, xyz, cells, coarseness(world))
 
 
-def cloud_files(data: Signable) -> Iterator[CloudFile]:
+def cloud_files(data: Signable) -> Iterator[MarkedCloudFile]:
     """The files of clouds that may bear a watermark, in order.
 
     Raises InputError for a dataset without a format that keeps one.
     """
     if data.dataset is None:
         for path, form in foreign_clouds(data.path):
-            yield CloudFile(data, path, form, *cloud_place(data.path, path))
+            yield MarkedCloudFile(data, path, form, *cloud_place(data.path, path))
         return
     dataset, formats = data.dataset, tuple(data.dataset.manifest["recipe"].get("formats", ()))
     forms = readable_formats(tuple(name for name in formats if name in FORMATS))
@@ -118,7 +118,7 @@ def cloud_files(data: Signable) -> Iterator[CloudFile]:
         for frame in range(len(dataset.sample_times(name))):
             for form in forms:
                 path = form.path(dataset.paths.sensor(name), frame)
-                yield CloudFile(data, path, form, name, frame, geometry)
+                yield MarkedCloudFile(data, path, form, name, frame, geometry)
 
 
 def readable_formats(formats: tuple[str, ...]) -> list[Format]:
@@ -153,7 +153,7 @@ class _Geometry:
     def _scanners(self) -> dict[str, Scanner]:
         return {one.name: one for one in scanners(rig_of(self._dataset.manifest["recipe"]["rig"]))}
 
-    def in_sensor(self, world: Float, table: Table, *, name: str, frame: int) -> tuple[Float, Cells]:
+    def in_sensor(self, world: Float, table: Table, *, name: str, frame: int) -> tuple[Float, WatermarkCells]:
         """Points (n, 3) of the export CRS in the sensor frame, each at its pulse's time, and their pulses."""
         recording, scanner = self._recording, self._scanners[name]
         sent = sent_pulses(recording, scanner, frame=frame)
@@ -162,7 +162,7 @@ class _Geometry:
         mount = scanner.spec.mount
         poses = recording.trajectory.at(sent.time_ns[row]).mounted(mount.translation, mount.rotation)
         echo = table.get("echo", np.ones(len(ring), np.uint8))
-        cells = Cells(name, frame, ring, sent.column[row], echo)
+        cells = WatermarkCells(name, frame, ring, sent.column[row], echo)
         return poses.seen(recording.geo.scene_points(world)), cells
 
 

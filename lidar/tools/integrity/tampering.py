@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float, Ints
 from lidar.tools.integrity.blocks import SECTORS, BlockTest, block_of, block_test
 from lidar.tools.integrity.linkage import joined, linked_clusters
-from lidar.tools.integrity.watermark import CHAINED, Cells, Decoded, Watermark, earlier
+from lidar.tools.integrity.watermark import CHAINED, Decoded, WatermarkCells, WatermarkKey, earlier
 
 NOISE = 0.001
 """Default standard deviation in metres of noise since the watermark was embedded, such as of rounding."""
@@ -83,10 +83,10 @@ class FrameVerdict:
 
 
 def frame_verdict(
-    watermark: Watermark,
+    watermark: WatermarkKey,
     xyz: NDArray[np.floating],
     *,
-    cells: Cells,
+    cells: WatermarkCells,
     noise: float = NOISE,
     false_alarms: float = 0.01,
 ) -> FrameVerdict:
@@ -115,7 +115,7 @@ def frame_verdict(
     return FrameVerdict(bits, wrong, test, forged, places, suspicion)
 
 
-def _evidence(watermark: Watermark, decoded: Decoded, *, noise: float) -> Float:
+def _evidence(watermark: WatermarkKey, decoded: Decoded, *, noise: float) -> Float:
     """Logarithm (n,) of how much likelier the coordinates of a return are if it is forged than if genuine."""
     half, sigma = watermark.step / 2, max(noise, _FINEST)
     wraps = np.arange(-2, 3)[:, None, None] * half
@@ -152,10 +152,10 @@ def _with_neighbours(blocks: Ints) -> Ints:
 
 
 def _gaps(
-    watermark: Watermark,
+    watermark: WatermarkKey,
     xyz: NDArray[np.floating],
     *,
-    cells: Cells,
+    cells: WatermarkCells,
     near: NDArray[np.bool_],
     noisy: bool,
 ) -> tuple[Place, ...]:

@@ -35,7 +35,7 @@ _MOST_COLUMNS = 1 << 22
 
 
 @dataclass(frozen=True)
-class Cells:
+class WatermarkCells:
     """Which pulses the returns of a frame belong to.
 
     sensor, frame : name and number
@@ -50,7 +50,7 @@ class Cells:
     echo: NDArray[np.integer]
     ranges: bool = False
 
-    def where(self, keep: NDArray[np.bool_]) -> Cells:
+    def where(self, keep: NDArray[np.bool_]) -> WatermarkCells:
         """The returns of a mask (n,)."""
         return replace(self, ring=self.ring[keep], column=self.column[keep], echo=self.echo[keep])
 
@@ -72,7 +72,7 @@ class Decoded:
 
 
 @dataclass(frozen=True)
-class Watermark:
+class WatermarkKey:
     """A key and the distance in metres of lattice points of the same bit.
 
     Raises InputError for a step that is not positive.
@@ -86,14 +86,14 @@ class Watermark:
         if not 1e-4 <= self.step <= 1:
             raise InputError(f"`step` {self.step:g}: give 0.0001 to 1 metre")
 
-    def embedded(self, xyz: NDArray[np.floating], cells: Cells) -> Float:
+    def embedded(self, xyz: NDArray[np.floating], cells: WatermarkCells) -> Float:
         """Coordinates (n, 3), or ranges (n, 1), with the watermark, each at most half its step off."""
         dither, half, bits = self._expected(cells)
         index = bits + 2 * np.rint(((xyz - dither) / half - bits) / 2)
         marked: Float = dither + half * index
         return marked
 
-    def decoded(self, xyz: NDArray[np.floating], cells: Cells) -> Decoded:
+    def decoded(self, xyz: NDArray[np.floating], cells: WatermarkCells) -> Decoded:
         """Bits and lattice distances of coordinates (n, 3) in the sensor frame, or of their ranges."""
         dither, half, bits = self._expected(cells)
         given = np.linalg.norm(xyz.astype(np.float64), axis=1)[:, None] if cells.ranges else xyz
@@ -110,7 +110,7 @@ class Watermark:
             np.mean([bit_error_rate(s, sigma, within=within) for s in self.step * (1 + SPREAD * middles)])
         )
 
-    def _expected(self, cells: Cells) -> tuple[Float, Float, NDArray[np.uint8]]:
+    def _expected(self, cells: WatermarkCells) -> tuple[Float, Float, NDArray[np.uint8]]:
         """Dither, half the step (n, 3) in metres and bits (n, 3) of returns; (n, 1) of ranges."""
         order = cells.order()
         values = self._cells(cells)[order]
@@ -127,7 +127,7 @@ class Watermark:
             ((bits[row, None] >> np.arange(count)) & 1).astype(np.uint8),
         )
 
-    def _cells(self, cells: Cells) -> NDArray[np.void]:
+    def _cells(self, cells: WatermarkCells) -> NDArray[np.void]:
         """The pseudo-random function (n,) of each return."""
         frame_key = hmac.digest(self.key, f"watermark/{cells.sensor}/{cells.frame}".encode(), "sha256")
         out = np.zeros(len(cells.ring), _CELL)

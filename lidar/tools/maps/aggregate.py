@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.classes import class_codes
-from geoscene.drawing.previews import DARK, Plan, around, card
+from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.scene import open_scene
 from geoscene.support.files import atomic_folder, exclusive
 from geoscene.support.progress import Progress, silent
@@ -23,13 +23,13 @@ from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.options import MapOptions
 from lidar.tools.maps.colors import distinct, ramp
-from lidar.tools.maps.compare import Comparison, Distances
+from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances
 from lidar.tools.maps.image_colors import ImageColors
 from lidar.tools.maps.outliers import Outliers
 from lidar.tools.maps.poses import PoseErrors, measured_trajectory, pose_errors, write_poses
 from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.selection import Selection
-from lidar.tools.maps.source import COLUMNS, Source
+from lidar.tools.maps.source import COLUMNS, MapClouds
 from lidar.tools.maps.tiles import INDEX, NAMES, open_tiles
 from lidar.tools.maps.voxels import thinned
 
@@ -60,7 +60,7 @@ class MapSummary:
     missing: dict[str, int]
     path: Path
     beside: list[Path]
-    distances: list[Distances]
+    distances: list[SurfaceDistances]
     poses: PoseErrors | None
 
     def _repr_png_(self) -> bytes | None:
@@ -69,7 +69,7 @@ class MapSummary:
             return None
         table = read_table(self.path)
         xyz = np.column_stack([table[axis] for axis in "xyz"])
-        plan = Plan(around(xyz[:, :2]), DARK)
+        plan = PreviewPlan(around(xyz[:, :2]), DARK)
         plan.points(xyz, np.column_stack([table[name] for name in ("red", "green", "blue")]).astype(np.uint8))
         return plan.png()
 
@@ -114,7 +114,7 @@ def aggregate(
     trajectory = measured_trajectory(dataset, options.poses, refine=options.refine, progress=progress)
     selection = Selection(dataset, options, trajectory=trajectory)
     colors = ImageColors(dataset) if options.color == "image" else None
-    source = Source(dataset, names, selection=selection, trajectory=trajectory, colors=colors)
+    source = MapClouds(dataset, names, selection=selection, trajectory=trajectory, colors=colors)
     read = _Read()
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
@@ -124,7 +124,7 @@ def aggregate(
         stream = outliers.without(stream, out=out, offset=source.geo.offset)
     comparison = None
     if options.compare is not None:
-        comparison = Comparison(open_scene(options.compare), dataset.frame, crs=dataset.crs)
+        comparison = SurfaceComparison(open_scene(options.compare), dataset.frame, crs=dataset.crs)
         stream = comparison.measured(stream)
     rasters = Rasters(options.raster, options.resolution)
     if options.raster:
@@ -186,7 +186,7 @@ class _Read:
         self.frames: set[int] = set()
         self.left_out = Counter[str]()
 
-    def wanted(self, source: Source, selection: Selection, *, progress: Progress) -> Iterator[Table]:
+    def wanted(self, source: MapClouds, selection: Selection, *, progress: Progress) -> Iterator[Table]:
         """The tables of a source without the returns that a selection leaves out."""
         for k, (frame, name, row, table) in enumerate(source.tables()):
             self.points += rows(table)
@@ -215,7 +215,7 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
 
 @contextmanager
 def _opened(
-    out: Path, source: Source, *, options: MapOptions
+    out: Path, source: MapClouds, *, options: MapOptions
 ) -> Iterator[tuple[Path, Callable[[Table], None]]]:
     """Yield the path whose folder and name files beside a map have, and a function that appends tables.
 

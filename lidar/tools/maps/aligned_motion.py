@@ -7,7 +7,7 @@ import numpy as np
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.recorded import Stream, cloud_points
-from lidar.tools.maps.measured_poses import Motion
+from lidar.tools.maps.measured_poses import RelativeMotion
 from lidar.tools.odometry.deskewing import still
 from lidar.tools.odometry.local_map import LocalMap
 
@@ -16,7 +16,7 @@ _DRIFT = (0.0006, 0.006)
 """Radians and metres per root of a second: standard deviation of aligned motion, of each component."""
 
 
-def aligned_motion(clouds: Stream, motion: Motion, *, progress: Progress) -> Motion:
+def aligned_motion(clouds: Stream, motion: RelativeMotion, *, progress: Progress) -> RelativeMotion:
     """Motion of the vehicle from the start of each frame to that of the next, by alignment.
 
     motion : measured, from the start of each frame to that of the next, and to the end of the last one
@@ -41,7 +41,7 @@ def aligned_motion(clouds: Stream, motion: Motion, *, progress: Progress) -> Mot
             sigma[k - 1] = np.repeat(_DRIFT, 3) * np.sqrt(duration_ns[k - 1] * 1e-9)
         pose = start if found is None else found.pose
         local.add(sweep, pose)
-    return Motion(motion.time_ns, step, sigma)
+    return RelativeMotion(motion.time_ns, step, sigma)
 
 
 def _still_points(clouds: Stream, row: int, *, motion: Float, duration_ns: int) -> Float:

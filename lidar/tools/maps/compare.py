@@ -35,7 +35,7 @@ _ROAD_USERS = (Class.CAR, Class.MOTORCYCLIST)
 
 
 @dataclass(frozen=True, slots=True)
-class Distances:
+class SurfaceDistances:
     """Distances of the points of one class, in metres; median and 95 % to 0.1 mm.
 
     name   : of the class, ``all`` or ``all but road users``
@@ -52,7 +52,7 @@ class Distances:
     beyond: int
 
 
-class Comparison:
+class SurfaceComparison:
     """Distances of a map's points to a scene's surfaces, gathered table by table in constant memory.
 
     Raises InputError for a scene whose heights have another reference.
@@ -98,7 +98,7 @@ class Comparison:
             xyz, away = (np.concatenate(parts)[::2] for parts in zip(*self._shown, strict=True))
             self._shown, self._stride = [(xyz, away)], 2 * self._stride
 
-    def rows(self) -> list[Distances]:
+    def rows(self) -> list[SurfaceDistances]:
         """Distances of all points, of all but road users, and of each class."""
         low, high = _ROAD_USERS
         still = [code for code in self._bins if not low <= code <= high]
@@ -108,10 +108,10 @@ class Comparison:
         groups |= {Class(code).name.lower(): [code] for code in sorted(self._bins)}
         return [self._row(name, codes) for name, codes in groups.items()]
 
-    def _row(self, name: str, codes: list[int]) -> Distances:
+    def _row(self, name: str, codes: list[int]) -> SurfaceDistances:
         if not codes:
             nothing = (float("nan"),) * 5
-            return Distances(name, 0, *nothing, beyond=0)
+            return SurfaceDistances(name, 0, *nothing, beyond=0)
         bins = np.sum([self._bins[code] for code in codes], axis=0)
         sums = np.array([self._sums[code] for code in codes])
         count, cumulative = int(bins.sum()), np.cumsum(bins)
@@ -121,7 +121,7 @@ class Comparison:
         )
         mean, square = sums[:, :2].sum(axis=0) / count
         largest = float(sums[:, 2].max())
-        return Distances(
+        return SurfaceDistances(
             name, count, float(mean), median, p95, float(square) ** 0.5, largest, int(sums[:, 3].sum())
         )
 
@@ -130,7 +130,7 @@ class Comparison:
         table, picture = out.with_suffix(".compare.csv"), out.with_suffix(".compare.png")
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(f.name for f in fields(Distances))
+        writer.writerow(f.name for f in fields(SurfaceDistances))
         for row in self.rows():
             writer.writerow(f"{v:.6g}" if isinstance(v, float) else v for v in asdict(row).values())
         write_atomically(table, text.getvalue().encode())

@@ -32,7 +32,7 @@ _FARTHEST = 1e6  # metres, of positions in a file
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class MeasuredPositions:
     """Positions and courses of a vehicle, in true metres: scene coordinates over ``scale`` horizontally.
 
     time_ns  : (n,) int64, since the drive's start
@@ -54,7 +54,7 @@ class Measured:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class RelativeMotion:
     """Motion of a vehicle from each time to the next.
 
     time_ns : (n + 1,) int64, rising, since the drive's start
@@ -74,7 +74,7 @@ class Motion:
         return np.array(poses)
 
 
-def fixes_of(dataset: Dataset, receiver: str) -> Measured:
+def fixes_of(dataset: Dataset, receiver: str) -> MeasuredPositions:
     """The fixes of a receiver of a dataset.
 
     Raises InputError without two fixes while the vehicle moves, and DatasetError for files that are damaged.
@@ -93,7 +93,7 @@ def fixes_of(dataset: Dataset, receiver: str) -> Measured:
     )
     sigma = np.fmax(typical[fixes.state[on]], _LEAST_SIGMA) * np.fmax(fixes.dop[on][:, [0, 0, 1]], 1.0)
     x, y = dataset.frame.from_geographic(lon, lat)
-    return Measured(
+    return MeasuredPositions(
         time_ns,
         np.column_stack([x / scale, y / scale, height]),
         sigma,
@@ -126,12 +126,12 @@ def trajectory_in(dataset: Dataset, path: Path) -> Trajectory:
     return trajectory_of(poses, time_ns, frame=dataset.frame, scale=scale)
 
 
-def fixes_along(trajectory: Trajectory) -> Measured:
+def fixes_along(trajectory: Trajectory) -> MeasuredPositions:
     """The poses of a trajectory as if they were fixes."""
     scale = float(trajectory.scale[0])
     turn = Rotation.from_quat(trajectory.quat_xyzw)
     ahead = turn.apply([1.0, 0.0, 0.0])
-    return Measured(
+    return MeasuredPositions(
         trajectory.time_ns,
         trajectory.position / [scale, scale, 1.0],
         np.full((len(ahead), 3), _FILE_SIGMA),
@@ -142,7 +142,7 @@ def fixes_along(trajectory: Trajectory) -> Measured:
     )
 
 
-def motion_along(trajectory: Trajectory, time_ns: Ints) -> Motion:
+def motion_along(trajectory: Trajectory, time_ns: Ints) -> RelativeMotion:
     """Motion of a vehicle by its trajectory."""
     poses = trajectory.at(time_ns)
     turn = Rotation.from_matrix(poses.rotation)
@@ -150,10 +150,12 @@ def motion_along(trajectory: Trajectory, time_ns: Ints) -> Motion:
     step[:, :3, :3] = (turn[:-1].inv() * turn[1:]).as_matrix()
     step[:, :3, 3] = turn[:-1].inv().apply(np.diff(poses.position, axis=0) / poses.scale[:1])
     along = np.full(len(step), _SPEEDS[0])
-    return Motion(time_ns, step, _sigma(np.diff(time_ns) * 1e-9, along=along, gyro=True))
+    return RelativeMotion(time_ns, step, _sigma(np.diff(time_ns) * 1e-9, along=along, gyro=True))
 
 
-def measured_motion(dataset: Dataset, fixes: Measured, *, unit: str, time_ns: Ints) -> Motion:
+def measured_motion(
+    dataset: Dataset, fixes: MeasuredPositions, *, unit: str, time_ns: Ints
+) -> RelativeMotion:
     """Motion of the vehicle by the speeds of a receiver, and the turns of an inertial unit or of courses.
 
     unit : name of an inertial unit; empty without one
@@ -178,7 +180,7 @@ def measured_motion(dataset: Dataset, fixes: Measured, *, unit: str, time_ns: In
     step[:, :3, 3] = half[:, :, 0] * (speed * seconds)[:, None]
     row = np.clip(np.searchsorted(fixes.time_ns, time_ns[:-1]), 1, len(fixes.time_ns) - 1)
     known = (fixes.time_ns[row] - fixes.time_ns[row - 1]) < _GAP_NS
-    return Motion(time_ns, step, _sigma(seconds, along=np.where(known, *_SPEEDS), gyro=bool(unit)))
+    return RelativeMotion(time_ns, step, _sigma(seconds, along=np.where(known, *_SPEEDS), gyro=bool(unit)))
 
 
 def _turned(dataset: Dataset, unit: str) -> tuple[Ints, Float]:
@@ -202,7 +204,7 @@ def _sigma(seconds: Float, *, along: Float, gyro: bool) -> Float:
     return np.column_stack([rates, along, np.tile(_ACROSS, (len(seconds), 1))]) * seconds[:, None]
 
 
-def poses_by_fixes(fixes: Measured, time_ns: NDArray[np.int64]) -> Float:
+def poses_by_fixes(fixes: MeasuredPositions, time_ns: NDArray[np.int64]) -> Float:
     """Poses (n, 4, 4) at times by the fixes alone: level, heading along the course, linear in between."""
     poses = np.tile(np.eye(4), (len(time_ns), 1, 1))
     yaw = np.interp(time_ns, fixes.time_ns, fixes.yaw)
@@ -216,7 +218,7 @@ def poses_by_fixes(fixes: Measured, time_ns: NDArray[np.int64]) -> Float:
 def trajectory_of(poses: Float, time_ns: Ints, *, frame: Frame, scale: float) -> Trajectory:
     """The trajectory in the scene of poses (n, 4, 4) in true metres, at rising times (n,).
 
-    scale : see `Measured`
+    scale : see `MeasuredPositions`
     """
     place = poses[:, :3, 3]
     position = np.ascontiguousarray(place * [scale, scale, 1.0])

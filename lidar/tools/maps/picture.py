@@ -35,7 +35,7 @@ BACKGROUND = (16, 18, 24)
 
 
 @dataclass(frozen=True)
-class View:
+class PictureView:
     """Viewing direction of a picture; the distance follows from the bounds that it shows.
 
     azimuth_deg   : horizontal viewing direction, clockwise from the y axis (north)
@@ -48,14 +48,18 @@ class View:
     fov_deg: float = 32.0
 
 
-VIEWS = {"top": View(0.0, 90.0, 2.0), "oblique": View(25.0, 33.0), "low": View(25.0, 16.0, 45.0)}
+VIEWS = {
+    "top": PictureView(0.0, 90.0, 2.0),
+    "oblique": PictureView(25.0, 33.0),
+    "low": PictureView(25.0, 16.0, 45.0),
+}
 """Views by name; ``top`` is a map with north up."""
 
 
 def scene_picture(
     world: World,
     *,
-    view: str | View = "oblique",
+    view: str | PictureView = "oblique",
     size: tuple[int, int] = (1600, 1000),
     bounds: tuple[float, float, float, float] | None = None,
     sun: ArrayLike = AFTERNOON,
@@ -63,7 +67,7 @@ def scene_picture(
 ) -> Pixels:
     """A rendered picture (h, w, 3) of a scene.
 
-    view   : name in `VIEWS`, or a `View`
+    view   : name in `VIEWS`, or a `PictureView`
     size   : width and height in pixels
     bounds : (xmin, ymin, xmax, ymax) to show, scene metres; the whole world by default
     sun    : (3,) direction towards the sun
@@ -81,8 +85,8 @@ def scene_picture(
     return picture
 
 
-def _view(view: str | View) -> View:
-    if isinstance(view, View):
+def _view(view: str | PictureView) -> PictureView:
+    if isinstance(view, PictureView):
         return view
     if view not in VIEWS:
         raise InputError(f"view {view!r} is not known: {', '.join(VIEWS)}")
@@ -101,7 +105,7 @@ def _heights(world: World, area: tuple[float, float, float, float]) -> tuple[flo
     return float(z.min()), float(np.percentile(z, 98))
 
 
-def _eye(corners: Float, view: View, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
+def _eye(corners: Float, view: PictureView, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
     """The nearest camera that sees all corners (n, 3)."""
     width, height = size
     a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
@@ -126,7 +130,7 @@ def cloud_picture(
     points: ArrayLike,
     colors: ArrayLike,
     *,
-    view: str | View = "oblique",
+    view: str | PictureView = "oblique",
     size: tuple[int, int] = (1600, 1000),
     bounds: ArrayLike | None = None,
     point: float = 0.12,
@@ -282,7 +286,7 @@ def sweep_picture(
     *,
     vehicle: Vehicle | None = None,
     half_width: float = 60.0,
-    view: str | View = "oblique",
+    view: str | PictureView = "oblique",
     size: tuple[int, int] = (1600, 1000),
     point: float = 0.15,
 ) -> Pixels:

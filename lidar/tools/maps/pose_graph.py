@@ -10,7 +10,7 @@ from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
 from geoscene.typing import Float, Ints
-from lidar.tools.maps.measured_poses import Measured, Motion
+from lidar.tools.maps.measured_poses import MeasuredPositions, RelativeMotion
 
 _KNOT_NS = 1_000_000_000  # between the poses that are adjusted
 _TILT = (0.3, 0.1)  # rad, of pitch and roll against level: roads keep their slope for longer than a second
@@ -26,7 +26,7 @@ _DIFFERENCE = 1e-6  # radians and metres, over which derivatives are taken
 _SMALL = 1e-7  # radians and metres: the last step
 
 
-def fitted(motion: Motion, fixes: Measured) -> Float:
+def fitted(motion: RelativeMotion, fixes: MeasuredPositions) -> Float:
     """Poses (n + 1, 4, 4) at the times of a motion, true metres, that fit it and some fixes best.
 
     The pose graph has a pose for each second (6 unknowns), edges of the motion between successive ones, the
@@ -63,7 +63,7 @@ class PoseGraph:
     sigma    : (n - 1, 6) one standard deviation of rotation and translation from each to the next
     """
 
-    def __init__(self, relative: Float, time_ns: Ints, *, sigma: Float, fixes: Measured) -> None:
+    def __init__(self, relative: Float, time_ns: Ints, *, sigma: Float, fixes: MeasuredPositions) -> None:
         self._relative, self._edge_sigma = relative, sigma
         step = np.linalg.inv(relative[:-1]) @ relative[1:]
         self._turn, self._shift = step[:, :3, :3], step[:, :3, 3]

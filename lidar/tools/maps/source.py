@@ -36,7 +36,7 @@ def _readable(frames: tuple[str, ...]) -> list[Format]:
     return sorted(found, key=lambda form: form.frame != "world")
 
 
-class Source:
+class MapClouds:
     """The point clouds of some scanners in the export CRS, in order of frames.
 
     names      : of the scanners

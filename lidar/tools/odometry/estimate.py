@@ -30,7 +30,7 @@ OWN_FILES = frozenset({TRAJECTORY, "trajectory.kitti", "poses.csv", REPORT})
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MotionEstimate:
     """Poses of a vehicle.
 
     time_ns : (n,) int64, rising, since the drive's start
@@ -103,7 +103,7 @@ def _adjoint(pose: Float) -> Float:
     return out
 
 
-def begun_at(estimate: Estimate, place: tuple[float, ...], *, frame: Frame) -> Estimate:
+def begun_at(estimate: MotionEstimate, place: tuple[float, ...], *, frame: Frame) -> MotionEstimate:
     """An estimate whose first pose is a given one.
 
     place : x, y, z in scene metres, and roll, pitch and yaw in radians as alpha, beta and gamma of poses.csv
@@ -123,7 +123,7 @@ def begun_at(estimate: Estimate, place: tuple[float, ...], *, frame: Frame) -> E
     return replace(estimate, poses=moved, sigma=sigma, in_scene=True, scale=scale)
 
 
-def write_estimate(folder: Path, estimate: Estimate, *, dataset: Dataset) -> None:
+def write_estimate(folder: Path, estimate: MotionEstimate, *, dataset: Dataset) -> None:
     """Write an estimate into a folder: TUM, KITTI, poses.csv, and what was done as JSON."""
     poses, quat = estimate.poses, quat_from_matrix(estimate.poses[:, :3, :3])
     position = np.ascontiguousarray(poses[:, :3, 3])
@@ -135,7 +135,7 @@ def write_estimate(folder: Path, estimate: Estimate, *, dataset: Dataset) -> Non
     write_json(folder / REPORT, estimate.report)
 
 
-def _columns(estimate: Estimate, *, dataset: Dataset) -> dict[str, Any]:
+def _columns(estimate: MotionEstimate, *, dataset: Dataset) -> dict[str, Any]:
     """Columns of ``poses.csv``, with standard deviations and what the method counted."""
     position, quat = estimate.poses[:, :3, 3], quat_from_matrix(estimate.poses[:, :3, :3])
     if estimate.in_scene:

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from geoscene.typing import Bools, Float
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.odometry.features import Features, matches
+from lidar.tools.odometry.features import ImageFeatures, matches
 from lidar.tools.odometry.view_geometry import moved_back, tangents, triangulated
 
 _NEIGHBOURS = 8
@@ -40,7 +40,7 @@ def unhidden(pixel: Float, distance: Float) -> Bools:
 
 
 def laser_distances(
-    features: Features, camera: CameraSpec, *, points: Float, motion: Float, radius: float
+    features: ImageFeatures, camera: CameraSpec, *, points: Float, motion: Float, radius: float
 ) -> tuple[Float, Float]:
     """Distances (n,) of features by laser points, and their standard deviations over them; NaN if unknown.
 
@@ -90,7 +90,7 @@ def laser_distances(
     return np.where(known, 1.0 / level, np.nan), np.where(known, fuzz, np.nan)
 
 
-def stereo_distances(first: Features, second: Features, *, pose: Float) -> tuple[Float, Float]:
+def stereo_distances(first: ImageFeatures, second: ImageFeatures, *, pose: Float) -> tuple[Float, Float]:
     """Distances (n,) of features by those of a second camera, and their deviations over them; NaN if unknown.
 
     pose : (4, 4) of the second camera in the first one's frame

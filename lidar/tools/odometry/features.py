@@ -25,7 +25,7 @@ _SCALE = 1.2  # between the levels of the pyramid of images
 
 
 @dataclass(frozen=True)
-class Features:
+class ImageFeatures:
     """Features of an image.
 
     pixel      : (n, 2)
@@ -65,7 +65,7 @@ def camera_of(name: str, sensor: dict[str, Any]) -> CameraSpec:
     )
 
 
-def read_features(path: Path, camera: CameraSpec, *, settings: OdometrySettings) -> Features:
+def read_features(path: Path, camera: CameraSpec, *, settings: OdometrySettings) -> ImageFeatures:
     """The ORB features of a colour image, spread over it; rows of a rolling shutter have their own times.
 
     The strongest features of a street are on few things, often on road users. So the image is divided into
@@ -92,7 +92,7 @@ def read_features(path: Path, camera: CameraSpec, *, settings: OdometrySettings)
     seconds = (camera.row_ns * pixel[:, 1] + camera.exposure_ns / 2) * 1e-9
     if descriptor is None:
         descriptor = np.empty((0, 32), np.uint8)
-    return Features(pixel[seen], bearing[seen], sigma[seen], seconds[seen], descriptor[seen])
+    return ImageFeatures(pixel[seen], bearing[seen], sigma[seen], seconds[seen], descriptor[seen])
 
 
 def _spread(place: Float, strength: Float, *, count: int) -> Ints:

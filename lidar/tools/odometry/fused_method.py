@@ -15,7 +15,7 @@ from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.rig.imu_grades import PRESETS, Noise
 from lidar.sensors.rig.specs import ImuSpec, rig_of
-from lidar.tools.odometry.estimate import Estimate
+from lidar.tools.odometry.estimate import MotionEstimate
 from lidar.tools.odometry.fusion import Fixed, fixes_of, fused, unit_of
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.scans import scans_of
@@ -34,7 +34,7 @@ def fused_odometry(
     grade: str,
     settings: OdometrySettings,
     progress: Progress,
-) -> Estimate:
+) -> MotionEstimate:
     """Poses of the vehicle in the scene by its receiver, inertial unit and odometry, as far as there are any.
 
     relative : method of odometry, ``none``, or empty for small_gicp or else stereo, if the data are there
@@ -82,7 +82,7 @@ def fused_odometry(
         "frames": len(time_ns),
     }
     quality_of = dict(odometry.quality) if odometry else {}
-    return Estimate(
+    return MotionEstimate(
         time_ns, found.poses, found.sigma, None, quality_of, report, in_scene=True, scale=fixes.scale
     )
 
@@ -100,7 +100,7 @@ def _relative(
     names: tuple[str, ...],
     settings: OdometrySettings,
     progress: Progress,
-) -> Estimate | None:
+) -> MotionEstimate | None:
     """The estimate of a method of odometry; of the first that the data allow, or None, for an empty one."""
     if method == "none":
         return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from geoscene.errors import need
 from geoscene.typing import Float, Ints
-from lidar.tools.odometry.features import Features
+from lidar.tools.odometry.features import ImageFeatures
 
 _FIRM = 1e-4  # radians and metres: of the pose that a window or a graph hangs on
 _SCALE_FIRM = 1e-3  # share of the way between the first two poses of a window without distances
@@ -36,7 +36,7 @@ class Keyframe:
 
     row: int
     pose: Float
-    features: Features
+    features: ImageFeatures
     distance: Float
     fuzz: Float
     measured: np.ndarray[Any, np.dtype[np.bool_]]

@@ -18,9 +18,9 @@ from geoscene.errors import need
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.estimate import Estimate, propagated
+from lidar.tools.odometry.estimate import MotionEstimate, propagated
 from lidar.tools.odometry.local_map import LocalMap
-from lidar.tools.odometry.scans import Scans
+from lidar.tools.odometry.scans import SweepSequence
 from lidar.tools.odometry.settings import OdometrySettings
 
 _LEAST = 50  # points of a sweep, below which the vehicle moves on as before
@@ -52,10 +52,14 @@ class _Method(Protocol):
     first : (4, 4) motion of the vehicle in the first sweep
     """
 
-    def __call__(self, scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration: ...
+    def __call__(
+        self, scans: SweepSequence, settings: OdometrySettings, *, first: Float
+    ) -> _Registration: ...
 
 
-def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, progress: Progress) -> Estimate:
+def lidar_odometry(
+    scans: SweepSequence, method: str, *, settings: OdometrySettings, progress: Progress
+) -> MotionEstimate:
     """Poses of the vehicle at the ends of sweeps, relative to the first.
 
     method : of `LIDAR_METHODS`
@@ -86,7 +90,7 @@ def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, pro
         sigma = propagated(covered, np.array(covariance))
         step_sigma = np.sqrt(np.einsum("nii->ni", np.array(covariance)))
     points_of = np.array(counts, np.int64)
-    return Estimate(
+    return MotionEstimate(
         scans.time_ns,
         covered,
         sigma,
@@ -96,7 +100,7 @@ def lidar_odometry(scans: Scans, method: str, *, settings: OdometrySettings, pro
     )
 
 
-def _report(scans: Scans, method: str, *, counts: Ints) -> dict[str, object]:
+def _report(scans: SweepSequence, method: str, *, counts: Ints) -> dict[str, object]:
     return {
         "method": method,
         "package": f"{method} {metadata.version(method)}",
@@ -108,7 +112,7 @@ def _report(scans: Scans, method: str, *, counts: Ints) -> dict[str, object]:
     }
 
 
-def first_motion(scans: Scans) -> Float:
+def first_motion(scans: SweepSequence) -> Float:
     """Motion (4, 4) of the vehicle in the first sweep.
 
     The second sweep is aligned to the first with the motion by which both are de-skewed; what is found
@@ -142,7 +146,7 @@ def first_motion(scans: Scans) -> Float:
     return best
 
 
-def _still_sweep(scans: Scans, row: int, *, motion: Float) -> Float:
+def _still_sweep(scans: SweepSequence, row: int, *, motion: Float) -> Float:
     """Points (n, 3) of a sweep in the vehicle's frame at the time of its pose.
 
     motion : (4, 4) of the vehicle in a sweep
@@ -151,7 +155,7 @@ def _still_sweep(scans: Scans, row: int, *, motion: Float) -> Float:
     return still(points, share, motion=motion) if scans.period_ns else points
 
 
-def _kiss_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+def _kiss_icp(scans: SweepSequence, settings: OdometrySettings, *, first: Float) -> _Registration:
     """Point to point with an adaptive threshold (Vizzo et al. 2023).
 
     The threshold begins at what is open once the first motion is known. The package's own, 2 m, holds as
@@ -174,7 +178,7 @@ def _kiss_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Reg
     return register
 
 
-def _genz_icp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+def _genz_icp(scans: SweepSequence, settings: OdometrySettings, *, first: Float) -> _Registration:
     """Point to point and point to plane, weighted by what surfaces are planar (Lee et al. 2025).
 
     Its motion model is within it and begins at rest. So the first sweep goes before itself, as seen from
@@ -241,7 +245,7 @@ def _one_core() -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _small_gicp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _Registration:
+def _small_gicp(scans: SweepSequence, settings: OdometrySettings, *, first: Float) -> _Registration:
     """Point to plane to a map of planes, with the motion before as a prior (`local_map`)."""
     del first  # each sweep has its expected motion
     side = settings.voxel or 0.25
@@ -259,12 +263,12 @@ def _small_gicp(scans: Scans, settings: OdometrySettings, *, first: Float) -> _R
     return register
 
 
-def _usual(scans: Scans, settings: OdometrySettings) -> Float:
+def _usual(scans: SweepSequence, settings: OdometrySettings) -> Float:
     """Standard deviations (6,) of the motion from a sweep to the next about that of the sweep before."""
     return np.repeat([settings.turn_acceleration, settings.acceleration], 3) * _seconds(scans) ** 2
 
 
-def _seconds(scans: Scans) -> float:
+def _seconds(scans: SweepSequence) -> float:
     return 1.0 / float(scans.streams[0].sensor["rate_hz"])
 
 

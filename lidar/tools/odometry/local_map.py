@@ -22,7 +22,7 @@ _NOISE = 0.2  # metres: standard deviation of a point from the planes, which are
 _REACH = (1.0, 0.3)  # metres between a point and the map: first, and then, without what moves
 
 
-class Alignment(NamedTuple):
+class ScanAlignment(NamedTuple):
     """The most likely pose (4, 4) of a sweep.
 
     information : (6, 6) of small rotations and translations along the sweep's own axes
@@ -87,7 +87,7 @@ class LocalMap:
         flat = (spread[:, 0] < _THICK**2) & (spread[:, 1] > _WIDE * spread[:, 2])
         return points[flat] if np.count_nonzero(flat) >= _LEAST else points
 
-    def aligned(self, sweep: Any, start: Float, *, sigma: Float) -> Alignment | None:
+    def aligned(self, sweep: Any, start: Float, *, sigma: Float) -> ScanAlignment | None:
         """The most likely pose of a sweep from an expected one and its alignment; None if few points match.
 
         sigma : (6,) standard deviations of the expected pose's rotation and translation
@@ -121,4 +121,4 @@ class LocalMap:
         shift = np.linalg.solve(information, given @ wanted)
         step = np.eye(4)
         step[:3, :3], step[:3, 3] = Rotation.from_rotvec(shift[:3]).as_matrix(), shift[3:]
-        return Alignment(aligned @ step, information, found.num_inliers / sweep.size())
+        return ScanAlignment(aligned @ step, information, found.num_inliers / sweep.size())

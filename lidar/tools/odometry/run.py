@@ -15,7 +15,7 @@ from geoscene.support.progress import Progress, silent
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.options import OdometryOptions
-from lidar.tools.odometry.estimate import OWN_FILES, Estimate, begun_at, write_estimate
+from lidar.tools.odometry.estimate import OWN_FILES, MotionEstimate, begun_at, write_estimate
 from lidar.tools.odometry.fused_method import fused_odometry
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.scans import scans_of
@@ -33,7 +33,7 @@ class OdometrySummary:
     seconds  : that it took
     """
 
-    estimate: Estimate
+    estimate: MotionEstimate
     length_m: float
     seconds: float
 
@@ -86,14 +86,14 @@ def estimate_motion(
 
 def _by_lidar(
     dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> Estimate:
+) -> MotionEstimate:
     scans = scans_of(dataset, options.sensors, least=settings.min_range, most=settings.max_range or None)
     return lidar_odometry(scans, options.method, settings=settings, progress=progress)
 
 
 def _by_camera(
     dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> Estimate:
+) -> MotionEstimate:
     return visual_odometry(
         dataset, options.method, names=options.sensors, settings=settings, progress=progress
     )
@@ -101,7 +101,7 @@ def _by_camera(
 
 def _by_fusion(
     dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> Estimate:
+) -> MotionEstimate:
     return fused_odometry(
         dataset,
         options.relative,
@@ -112,7 +112,7 @@ def _by_fusion(
     )
 
 
-_METHODS: dict[str, Callable[..., Estimate]] = {
+_METHODS: dict[str, Callable[..., MotionEstimate]] = {
     "fused": _by_fusion,
     **dict.fromkeys(LIDAR_METHODS, _by_lidar),
     **dict.fromkeys(VISUAL_METHODS, _by_camera),

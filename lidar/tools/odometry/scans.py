@@ -17,7 +17,7 @@ _FARTHEST = 100.0
 
 
 @dataclass(frozen=True)
-class Scans:
+class SweepSequence:
     """Sweeps of one scanner, or of several that are merged.
 
     A sweep has the pose of its end, so that the motion between two poses is that within the later sweep.
@@ -77,7 +77,7 @@ class Scans:
 
 def scans_of(
     dataset: Dataset, names: tuple[str, ...] = (), *, least: float = 3.0, most: float | None = None
-) -> Scans:
+) -> SweepSequence:
     """The sweeps of scanners of a dataset; by default of the one whose first frame has the most points.
 
     names : of the scanners that are merged; frames are those of the first
@@ -115,7 +115,7 @@ def scans_of(
         (least, min(float(stream.sensor.get("max_range", _FARTHEST)), most or _FARTHEST)) for stream in found
     ]
     period_ns = round(1e9 / float(found[0].sensor["rate_hz"])) if timed else 0
-    return Scans(tuple(found), np.array(limits), period_ns)
+    return SweepSequence(tuple(found), np.array(limits), period_ns)
 
 
 def _clouds(dataset: Dataset, name: str) -> Stream | None:

@@ -13,14 +13,14 @@ from lidar.dataset.recorded import Stream, color_images
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.estimate import Estimate, propagated
+from lidar.tools.odometry.estimate import MotionEstimate, propagated
 from lidar.tools.odometry.feature_depths import laser_distances, stereo_distances
-from lidar.tools.odometry.features import Features, camera_of, read_features
+from lidar.tools.odometry.features import ImageFeatures, camera_of, read_features
 from lidar.tools.odometry.keyframes import Keyframe, close_loops
-from lidar.tools.odometry.scans import Scans, scans_of
+from lidar.tools.odometry.scans import SweepSequence, scans_of
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import scaled_motion
-from lidar.tools.odometry.visual_tracking import ENOUGH, Distances, Tracked, tracked
+from lidar.tools.odometry.visual_tracking import ENOUGH, FeatureDepths, Tracked, tracked
 
 VISUAL_METHODS = ("orb", "orb+depth", "stereo")
 """Methods by their names."""
@@ -34,7 +34,7 @@ _NEAR_ROAD = 3.0  # metres to the side of the camera, within which the road is
 
 def visual_odometry(
     dataset: Dataset, method: str, *, names: tuple[str, ...], settings: OdometrySettings, progress: Progress
-) -> Estimate:
+) -> MotionEstimate:
     """Poses of the vehicle at the starts of a camera's frames, relative to the first.
 
     method : of `VISUAL_METHODS`
@@ -46,7 +46,7 @@ def visual_odometry(
     """
     images, other, scanners = _sensors(dataset, method, names=names)
     camera = camera_of(images.name, images.sensor)
-    measure: Distances | None = None
+    measure: FeatureDepths | None = None
     sensors = [images.name, *([other.name] if other else [])]
     if method == "orb+depth":
         scans = scans_of(dataset, scanners, least=settings.min_range, most=settings.max_range or None)
@@ -85,7 +85,7 @@ def visual_odometry(
     if measure is not None:
         sigma, step_sigma = propagated(vehicle, covariance), np.sqrt(np.einsum("nii->ni", covariance))
     quality = {"matches": found.matched, "inliers": found.inliers}
-    return Estimate(images.time_ns, vehicle, sigma, step_sigma, quality, report)
+    return MotionEstimate(images.time_ns, vehicle, sigma, step_sigma, quality, report)
 
 
 def _sensors(
@@ -118,12 +118,14 @@ def _sensors(
     )
 
 
-def _by_laser(scans: Scans, images: Stream, *, camera: CameraSpec, settings: OdometrySettings) -> Distances:
+def _by_laser(
+    scans: SweepSequence, images: Stream, *, camera: CameraSpec, settings: OdometrySettings
+) -> FeatureDepths:
     """Distances by the sweep during which, or nearest to which, an image is taken."""
     into = np.linalg.inv(images.mount.matrix)
     period_ns = 1e9 / float(scans.streams[0].sensor["rate_hz"])
 
-    def measured(row: int, features: Features, *, motion: Float) -> tuple[Float, Float]:
+    def measured(row: int, features: ImageFeatures, *, motion: Float) -> tuple[Float, Float]:
         at = int(images.time_ns[row])
         middle = scans.time_ns - scans.period_ns / 2
         sweep = int(np.argmin(np.abs(middle - at)))
@@ -137,14 +139,14 @@ def _by_laser(scans: Scans, images: Stream, *, camera: CameraSpec, settings: Odo
     return measured
 
 
-def _by_stereo(images: Stream, other: Stream, *, settings: OdometrySettings) -> Distances:
+def _by_stereo(images: Stream, other: Stream, *, settings: OdometrySettings) -> FeatureDepths:
     """Distances by a second camera."""
     pose = np.linalg.inv(images.mount.matrix) @ other.mount.matrix
     second = camera_of(other.name, other.sensor)
     if np.linalg.norm(pose[:3, 3]) < 1e-3:
         raise InputError(f"`sensor` {other.name}: is where {images.name} is; stereo needs two places")
 
-    def measured(row: int, features: Features, *, motion: Float) -> tuple[Float, Float]:
+    def measured(row: int, features: ImageFeatures, *, motion: Float) -> tuple[Float, Float]:
         del motion  # rows of both cameras that see a point are exposed at about the same time
         there = read_features(other.files[row], second, settings=settings)
         return stereo_distances(features, there, pose=pose)

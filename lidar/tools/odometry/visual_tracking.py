@@ -19,7 +19,7 @@ from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.recorded import Stream
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.features import Features, matches, read_features
+from lidar.tools.odometry.features import ImageFeatures, matches, read_features
 from lidar.tools.odometry.keyframes import Keyframe, refine_window
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import Sighted, pose_of, scaled_motion, triangulated, two_view_pose
@@ -40,10 +40,10 @@ _SPEEDS = np.arange(0.0, 41.0, 4.0)  # m/s ahead, from which the first motion is
 _ROUNDS = 2  # of distances and pose from each
 
 
-class Distances(Protocol):
+class FeatureDepths(Protocol):
     """Measures distances of features."""
 
-    def __call__(self, row: int, features: Features, *, motion: Float) -> tuple[Float, Float]:
+    def __call__(self, row: int, features: ImageFeatures, *, motion: Float) -> tuple[Float, Float]:
         """Distances (n,) of a frame's features and their deviations over them; NaN where unknown.
 
         motion : (4, 4) of the camera in a second
@@ -67,7 +67,7 @@ class Tracked:
     loops: list[tuple[int, int, Float, Float]]
 
 
-def _at_start(features: Features, distance: Float, *, motion: Float) -> tuple[Features, Float]:
+def _at_start(features: ImageFeatures, distance: Float, *, motion: Float) -> tuple[ImageFeatures, Float]:
     """Features and distances as at the frame's start, of rows exposed later by a motion (4, 4) in a second.
 
     Where the distance is unknown, the turn alone is undone.
@@ -86,7 +86,7 @@ def tracked(
     images: Stream,
     camera: CameraSpec,
     *,
-    measure: Distances | None,
+    measure: FeatureDepths | None,
     settings: OdometrySettings,
     progress: Progress,
 ) -> Tracked:
@@ -169,7 +169,7 @@ def tracked(
 
 
 def _first_rate(
-    images: Stream, camera: CameraSpec, *, measure: Distances, settings: OdometrySettings
+    images: Stream, camera: CameraSpec, *, measure: FeatureDepths, settings: OdometrySettings
 ) -> Float:
     """Motion (4, 4) of the camera in a second, at the first image.
 
@@ -199,7 +199,7 @@ def _first_rate(
     return best if most >= ENOUGH else np.eye(4)
 
 
-def _matches(last: Keyframe, features: Features, *, expected: Float | None) -> tuple[Ints, Ints]:
+def _matches(last: Keyframe, features: ImageFeatures, *, expected: Float | None) -> tuple[Ints, Ints]:
     """Rows of the same features in a keyframe and a frame, near to where they are expected.
 
     Windows of a facade look alike: without an expectation, features may be matched to those of the next one.
@@ -223,11 +223,11 @@ def _matches(last: Keyframe, features: Features, *, expected: Float | None) -> t
 
 def _keyframe(
     row: int,
-    features: Features,
+    features: ImageFeatures,
     *,
     pose: Float,
     rate: Float,
-    measure: Distances | None,
+    measure: FeatureDepths | None,
     tracks: int,
 ) -> Keyframe:
     """A keyframe with the distances that are measured."""
@@ -258,7 +258,7 @@ def _linked(frame: Keyframe, last: Keyframe, *, rows: Ints, mine: Ints, sigma: f
     frame.fuzz[mine[carried]] = last.fuzz[rows[carried]]
 
 
-def _begun(last: Keyframe, features: Features, *, rows: Ints, mine: Ints) -> tuple[Float, Bools] | None:
+def _begun(last: Keyframe, features: ImageFeatures, *, rows: Ints, mine: Ints) -> tuple[Float, Bools] | None:
     """The pose of the second view of a map without distances, a unit away; None for equal views."""
     here, there = last.features.bearing[rows], features.bearing[mine]
     if len(rows) < ENOUGH:
@@ -275,7 +275,7 @@ def _begun(last: Keyframe, features: Features, *, rows: Ints, mine: Ints) -> tup
 
 def _pose_in(
     last: Keyframe,
-    features: Features,
+    features: ImageFeatures,
     *,
     rows: Ints,
     mine: Ints,
@@ -338,7 +338,7 @@ def _loops(
     return []
 
 
-def _turned(features: Features, motion: Float) -> Float:
+def _turned(features: ImageFeatures, motion: Float) -> Float:
     """Bearings (n, 3) at the frame's start: rows exposed later are turned back.
 
     motion : (4, 4) of the camera in a second

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.drawing.charts import COLORS, Axes
-from geoscene.drawing.panels import Band, Panel, Series, figure
+from geoscene.drawing.panels import Panel, Series, ShadedBand, figure
 from geoscene.geometry.frames import Frame
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
@@ -49,7 +49,7 @@ def gnss(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn
                 [Series(f"error {direction}", thinned(seconds, error[:, k]), color=COLORS[k])],
                 x_log=False,
                 y_log=False,
-                bands=[Band("± 1 sigma, as stated", band)],
+                bands=[ShadedBand("± 1 sigma, as stated", band)],
                 x_ends=ends,
             )
         )

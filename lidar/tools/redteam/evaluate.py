@@ -14,7 +14,7 @@ import numpy as np
 from lidar.geometry.random_streams import generator
 from lidar.tools.defences.calibration import Calibration, tail_of
 from lidar.tools.defences.fusion import FUSED, fused
-from lidar.tools.defences.scores import Samples, Score, score, threshold_at
+from lidar.tools.defences.scores import Score, SuspicionCounts, score, threshold_at
 from lidar.tools.defences.verdict import Verdict
 from lidar.tools.redteam.measure import FEWEST, is_attacked
 from lidar.tools.redteam.plan import GOALS, Attack, Measure, Run
@@ -76,7 +76,7 @@ class Success:
 
 
 @dataclass(frozen=True, slots=True)
-class Detection:
+class AttackDetection:
     """How well a defence notices an attack in a setting.
 
     level    : ``frames`` or ``objects``
@@ -104,7 +104,7 @@ class Detection:
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
+class DetectorAccuracy:
     """How well the detector finds road users without attack, from ``near`` to ``far`` metres away."""
 
     setting: dict[str, str]
@@ -118,7 +118,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True, slots=True)
-class Cost:
+class DefenceCost:
     """Median seconds of a defence for a frame."""
 
     setting: dict[str, str]
@@ -132,9 +132,9 @@ class Matrix:
     """The results."""
 
     success: list[Success]
-    detection: list[Detection]
-    accuracy: list[Accuracy]
-    cost: list[Cost]
+    detection: list[AttackDetection]
+    accuracy: list[DetectorAccuracy]
+    cost: list[DefenceCost]
 
     @property
     def of_all_scenes(self) -> Matrix:
@@ -274,7 +274,7 @@ def _defences(drives: Iterable[Figures]) -> list[str]:
 
 def _samples(
     plain: Iterable[Figures], attacked: Iterable[Figures], *, defence: str, level: str, block: float
-) -> Samples:
+) -> SuspicionCounts:
     """Suspicions of a defence by independent blocks, of drives without attack and of attacked ones."""
     blocks: dict[tuple[str, str, int], list[tuple[float, bool]]] = defaultdict(list)
     for one, truth in [*((one, False) for one in plain), *((one, True) for one in attacked)]:
@@ -283,7 +283,7 @@ def _samples(
                 blocks[one.block(frame, seconds=block)] += _suspicions(
                     frame, defence, level=level, forged=truth
                 )
-    return Samples.of(
+    return SuspicionCounts.of(
         [
             (np.array([s for s, _ in pairs]), np.array([truth for _, truth in pairs], bool))
             for pairs in blocks.values()
@@ -362,7 +362,7 @@ def _detections(
     measure: Measure,
     known: dict[str, Any],
     thresholds: Mapping[tuple[str, str], float],
-) -> Iterator[Detection]:
+) -> Iterator[AttackDetection]:
     frames = [
         (one.block(frame, seconds=measure.block), frame)
         for one in attacked
@@ -383,7 +383,7 @@ def _detections(
             latencies = [_latency(one, defence, threshold=thresholds[defence, "frames"]) for one in attacked]
             tried = [late for late in latencies if late is not None]
             heard = [late for late in tried if math.isfinite(late)]
-            yield Detection(
+            yield AttackDetection(
                 attack.name,
                 defence,
                 level,
@@ -420,7 +420,7 @@ def _latency(one: Figures, defence: str, *, threshold: float) -> float | None:
 
 def accuracies(
     frames: Sequence[tuple[Any, Mapping[str, Any]]], *, measure: Measure, known: dict[str, Any]
-) -> Iterator[Accuracy]:
+) -> Iterator[DetectorAccuracy]:
     """How well a detector finds road users in frames without attack, each with its block.
 
     known : fields of the rows that are not measured
@@ -444,7 +444,7 @@ def accuracies(
                     for user in frame["users"]
                     if user["kind"] == kind and near <= user["distance"] < far and user["points"] >= FEWEST
                 ]
-            yield Accuracy(
+            yield DetectorAccuracy(
                 kind=kind,
                 near=near,
                 far=far,
@@ -459,13 +459,13 @@ def _rate_of(trials: Sequence[tuple[Any, bool]]) -> Rate:
     return rate(sum(hit for _, hit in trials), len(trials), blocks=len({block for block, _ in trials}))
 
 
-def _costs(drives: Sequence[Figures], *, setting: dict[str, str]) -> Iterator[Cost]:
+def _costs(drives: Sequence[Figures], *, setting: dict[str, str]) -> Iterator[DefenceCost]:
     seconds: dict[str, list[float]] = defaultdict(list)
     for frame in (frame for one in drives for frame in one.frames):
         for name, spent in frame["cost"].items():
             seconds[name].append(spent)
     for name, spent in seconds.items():
-        yield Cost(setting, name, float(np.median(spent)), len(spent))
+        yield DefenceCost(setting, name, float(np.median(spent)), len(spent))
 
 
 def document_of(rows: Iterable[Any]) -> list[dict[str, Any]]:
@@ -473,7 +473,7 @@ def document_of(rows: Iterable[Any]) -> list[dict[str, Any]]:
     documents = []
     for row in rows:
         document = asdict(row)
-        if isinstance(row, Detection):
+        if isinstance(row, AttackDetection):
             document["score"] = row.score.to_json()
         documents.append(_without_nan(document))
     return documents

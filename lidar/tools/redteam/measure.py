@@ -22,7 +22,7 @@ from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.errors import InputError, LidarError
 from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.reading import Scans, read_scans
+from lidar.tools.defences.reading import RecordedScans, read_scans
 from lidar.tools.defences.registry import NamedDefence
 from lidar.tools.defences.run import able, judged_frames
 from lidar.tools.defences.truth import frame_truth
@@ -49,7 +49,7 @@ _COLUMNS = ("id", "instance", "kind", "x", "y", "vx", "vy", "length", "width", "
 
 
 @dataclass(frozen=True)
-class Case:
+class AttackCase:
     """A drive to measure.
 
     path     : its folder
@@ -68,7 +68,7 @@ class Case:
     detector: str = RULES.name
 
 
-def measured(case: Case) -> dict[str, Any]:
+def measured(case: AttackCase) -> dict[str, Any]:
     """The figures of a drive; from the file if it has them of the same drive, twin and defences.
 
     ``frames`` has a row for each frame of each scanner; in a drive with an attack, those that it leaves as
@@ -90,7 +90,7 @@ def measured(case: Case) -> dict[str, Any]:
     return dict(document)
 
 
-def kept(case: Case) -> dict[str, Any] | None:
+def kept(case: AttackCase) -> dict[str, Any] | None:
     """The figures in the file of a drive; None if they are not of the same drive, twin and defences."""
     with suppress(OSError, ValueError, LookupError, TypeError):
         document = json.loads(case.out.read_text("utf-8"))
@@ -99,14 +99,14 @@ def kept(case: Case) -> dict[str, Any] | None:
     return None
 
 
-def _key(case: Case) -> str:
+def _key(case: AttackCase) -> str:
     drives = [Paths(path).journal for path in (case.path, case.twin) if path is not None]
     identity = read_detector(case.detector).identity
     made_of = [__version__, case.score, identity, [digest_of(path) for path in drives]]
     return json.dumps([*made_of, [named.to_json() for named in case.defences]])
 
 
-def _document(case: Case, dataset: Dataset, *, scene: Scene | None) -> dict[str, Any]:
+def _document(case: AttackCase, dataset: Dataset, *, scene: Scene | None) -> dict[str, Any]:
     detector = read_detector(case.detector)
     twin = [] if case.twin is None else read_scans(open_dataset(case.twin), detector=detector)
     twins = {scans.sensor.name: scans for scans in twin}
@@ -119,7 +119,7 @@ def _document(case: Case, dataset: Dataset, *, scene: Scene | None) -> dict[str,
     return {"absent": sorted(absent), "frames": frames}
 
 
-def _able(scans: Scans, defences: Sequence[NamedDefence]) -> tuple[list[NamedDefence], list[str]]:
+def _able(scans: RecordedScans, defences: Sequence[NamedDefence]) -> tuple[list[NamedDefence], list[str]]:
     """Defences whose needs the data have, and the names of the others."""
     found, lacking = [], []
     for named in defences:
@@ -131,10 +131,10 @@ def _able(scans: Scans, defences: Sequence[NamedDefence]) -> tuple[list[NamedDef
 
 
 def _frames(
-    scans: Scans,
+    scans: RecordedScans,
     defences: Sequence[NamedDefence],
     *,
-    twin: Scans | None,
+    twin: RecordedScans | None,
     scene: Scene | None,
     score: float,
 ) -> Iterator[dict[str, Any]]:
@@ -176,7 +176,7 @@ def is_attacked(frame: Mapping[str, Any]) -> bool:
     return any(frame.get(name, 0) > 0 for name in ("added", "lost", "images", "fix_error"))
 
 
-def _change(scans: Scans, twin: Scans, *, row: int) -> dict[str, Any]:
+def _change(scans: RecordedScans, twin: RecordedScans, *, row: int) -> dict[str, Any]:
     """What an attack did to the returns, the images and the fixes of a frame, against its twin without it."""
     frame, other, name = scans.frame(row), twin.frame(row), scans.sensor.name
     placed = _placed(_users(scans.dataset, name, frame=frame.number))
@@ -210,7 +210,9 @@ def _objects(frame: Observation, *, forged: Bools, matched: Ints) -> dict[str, A
     }
 
 
-def _hidden(scans: Scans, twin: Scans, *, row: int, found: set[int], score: float) -> dict[str, int]:
+def _hidden(
+    scans: RecordedScans, twin: RecordedScans, *, row: int, found: set[int], score: float
+) -> dict[str, int]:
     """How many road users an attack hides.
 
     found : numbers of the road users that the detector finds in spite of it

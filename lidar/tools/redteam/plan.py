@@ -94,7 +94,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class RedteamPlan:
     """A matrix of attacks, defences and conditions."""
 
     runs: tuple[Run, ...]
@@ -103,7 +103,7 @@ class Plan:
     measure: Measure
 
 
-def read_plan(path: Path) -> Plan:
+def read_plan(path: Path) -> RedteamPlan:
     """The matrix that a file describes.
 
     Tables ``drive``, ``grid`` and ``map`` are those of a sweep; each drive is made without attack and with
@@ -130,7 +130,7 @@ def read_plan(path: Path) -> Plan:
             raise InputError(f"{path}: attack is an option of the tables [[attack]], not of drives")
     options = {"attack": ["", *(attack.option for attack in attacks)]}
     drives = drives_of(tables | {"grid": [{**grid, **options} for grid in grids]}, path)
-    return Plan(tuple(_runs(drives, attacks)), attacks, defences, measure)
+    return RedteamPlan(tuple(_runs(drives, attacks)), attacks, defences, measure)
 
 
 def _attacks(path: Path, tables: Any) -> tuple[Attack, ...]:

@@ -21,10 +21,10 @@ from geoscene.drawing.charts import (
 from geoscene.drawing.figures import share
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_atomically, write_json
-from lidar.tools.redteam.evaluate import Accuracy, Detection, Matrix, Success, document_of
+from lidar.tools.redteam.evaluate import AttackDetection, DetectorAccuracy, Matrix, Success, document_of
 from lidar.tools.redteam.measure import FEWEST
-from lidar.tools.redteam.plan import Attack, Plan
-from lidar.tools.redteam.published import ATTACKS, DEFENCES, Band
+from lidar.tools.redteam.plan import Attack, RedteamPlan
+from lidar.tools.redteam.published import ATTACKS, DEFENCES, PublishedResult
 from lidar.tools.redteam.statistics import Rate, rate
 
 REPORT = "redteam.json"
@@ -41,7 +41,7 @@ def write_report(
     matrix: Matrix,
     folder: Path,
     *,
-    plan: Plan,
+    plan: RedteamPlan,
     failed: Mapping[str, str],
     absent: Sequence[str],
     source: str,
@@ -101,7 +101,7 @@ def words_of(setting: Mapping[str, str]) -> str:
     return ", ".join(f"{name} {_value(name, text)}" for name, text in setting.items()) or "one setting"
 
 
-def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequence[str]) -> str:
+def _body(matrix: Matrix, plan: RedteamPlan, *, failed: Mapping[str, str], absent: Sequence[str]) -> str:
     pooled = matrix.of_all_scenes
     settings = list({str(row.setting): row.setting for row in pooled.success}.values())
     measure = plan.measure
@@ -144,7 +144,7 @@ def _body(matrix: Matrix, plan: Plan, *, failed: Mapping[str, str], absent: Sequ
     return "".join(parts)
 
 
-def _band(attack: str, attacks: Sequence[Attack]) -> Band | None:
+def _band(attack: str, attacks: Sequence[Attack]) -> PublishedResult | None:
     return next((ATTACKS[one.published] for one in attacks if one.name == attack and one.published), None)
 
 
@@ -246,7 +246,7 @@ def _success_picture(rows: Sequence[Success], attacks: Sequence[Attack]) -> byte
     return spans(marks, title="Success with 95 % intervals")
 
 
-def detection_rows(rows: Sequence[Detection]) -> tuple[list[str], list[list[Rate]], list[str]]:
+def detection_rows(rows: Sequence[AttackDetection]) -> tuple[list[str], list[list[Rate]], list[str]]:
     """Defences, shares with an alarm by attack and defence, and the attacks; the first is no attack."""
     defences = list(dict.fromkeys(row.defence for row in rows))
     attacks = list(dict.fromkeys(row.attack for row in rows))
@@ -256,13 +256,13 @@ def detection_rows(rows: Sequence[Detection]) -> tuple[list[str], list[list[Rate
     return defences, [plain, *lines], ["without attack", *attacks]
 
 
-def _detection_matrix(rows: Sequence[Detection]) -> str:
+def _detection_matrix(rows: Sequence[AttackDetection]) -> str:
     defences, lines, names = detection_rows(rows)
     texts = [[name, *(one.to_text() for one in line)] for name, line in zip(names, lines, strict=True)]
     return html_matrix(["attack", *defences], texts, shades=[[one.share for one in line] for line in lines])
 
 
-def _residual_matrix(rows: Sequence[Detection]) -> str:
+def _residual_matrix(rows: Sequence[AttackDetection]) -> str:
     """What is left of the success of attacks: the less, the darker."""
     defences, _, (_, *attacks) = detection_rows(rows)
     by_pair = {(row.attack, row.defence): row.residual for row in rows}
@@ -273,7 +273,7 @@ def _residual_matrix(rows: Sequence[Detection]) -> str:
     )
 
 
-def _area_matrix(rows: Sequence[Detection]) -> str:
+def _area_matrix(rows: Sequence[AttackDetection]) -> str:
     defences = list(dict.fromkeys(row.defence for row in rows))
     attacks = list(dict.fromkeys(row.attack for row in rows))
     by_pair = {(row.attack, row.defence): row.score.auc for row in rows}
@@ -291,7 +291,7 @@ def _area(area: tuple[float, float, float]) -> str:
     return f"{value:.2f}" if math.isnan(low) else f"{value:.2f} ({low:.2f} to {high:.2f})"
 
 
-def _curves(rows: Sequence[Detection], *, allowed: float) -> str:
+def _curves(rows: Sequence[AttackDetection], *, allowed: float) -> str:
     """A picture of the ROC of frames for each attack, with the areas and the allowed false alarms."""
     pictures = []
     for attack in dict.fromkeys(row.attack for row in rows):
@@ -321,7 +321,7 @@ def _cost_table(matrix: Matrix) -> str:
     )
 
 
-def accuracy_rows(rows: Iterable[Accuracy]) -> list[list[str]]:
+def accuracy_rows(rows: Iterable[DetectorAccuracy]) -> list[list[str]]:
     """Texts of the detector's table, with a head; lines without road users and detections are left out."""
     found = [["kind", "setting", "distance", "road users", "recall", "precision", "false per frame"]]
     found += [
@@ -335,6 +335,6 @@ def accuracy_rows(rows: Iterable[Accuracy]) -> list[list[str]]:
     return found
 
 
-def _accuracy_table(rows: Iterable[Accuracy]) -> str:
+def _accuracy_table(rows: Iterable[DetectorAccuracy]) -> str:
     head, *lines = accuracy_rows(rows)
     return html_table(head, lines)

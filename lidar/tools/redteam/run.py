@@ -15,8 +15,8 @@ from lidar.errors import InputError, LidarError
 from lidar.tools.detection import RULES
 from lidar.tools.detection.registry import read_detector
 from lidar.tools.redteam.evaluate import Figures, Matrix, evaluated
-from lidar.tools.redteam.measure import Case, measured
-from lidar.tools.redteam.plan import Plan, Run, read_plan
+from lidar.tools.redteam.measure import AttackCase, measured
+from lidar.tools.redteam.plan import RedteamPlan, Run, read_plan
 from lidar.tools.redteam.report import write_report
 from lidar.tools.sweep.run import recorded
 
@@ -87,7 +87,7 @@ def _is_matrix(folder: Path) -> bool:
 
 
 def _results(
-    plan: Plan, folder: Path, *, failed: dict[str, str], workers: int, progress: Progress
+    plan: RedteamPlan, folder: Path, *, failed: dict[str, str], workers: int, progress: Progress
 ) -> Iterator[tuple[Run, Figures | str]]:
     """Figures of the drives by each detector, in the order of the plan, or why there are none."""
     ready = [run for run in plan.runs if run.drive.name not in failed]
@@ -112,14 +112,14 @@ class _Task:
     """A drive to measure, and its number."""
 
     row: int
-    case: Case
+    case: AttackCase
 
 
-def _case(run: Run, detector: str, *, plan: Plan, folder: Path) -> Case:
+def _case(run: Run, detector: str, *, plan: RedteamPlan, folder: Path) -> AttackCase:
     drives = folder.absolute() / "drives"
     identity = read_detector(detector).identity
     own = "" if identity == RULES.identity else f".{identity.rpartition(' ')[2]}"
-    return Case(
+    return AttackCase(
         drives / run.drive.name,
         drives / run.twin if run.attack is not None else None,
         folder.absolute() / "figures" / f"{run.drive.name}{own}.json",

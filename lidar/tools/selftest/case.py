@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class ExtremeCase:
     """A row of the table of extremes.
 
     group   : rays, places, footprints, time, statistics or scale

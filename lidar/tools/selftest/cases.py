@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from lidar.tools.selftest import footprints, places, rays, regions, scale, statistics, times
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 
-CASES: tuple[Case, ...] = (
+CASES: tuple[ExtremeCase, ...] = (
     *rays.CASES,
     *places.CASES,
     *footprints.CASES,

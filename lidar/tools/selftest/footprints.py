@@ -14,14 +14,14 @@ from shapely import affinity
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
-from geoscene.geometry.watertight import Verdict, validate_mesh
+from geoscene.geometry.watertight import MeshVerdict, validate_mesh
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 from geoscene.typing import Float
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 
 _FRAME = Frame.at(8.7, 49.4)
 
@@ -33,7 +33,7 @@ def house(number: int, shape: Any, **tags: str) -> Area:
     return Area(f"way/{number}", {"building": "yes", **named}, lonlat, np.empty(0, np.int64))
 
 
-def built(areas: Sequence[Area]) -> tuple[Mesh, Verdict, int]:
+def built(areas: Sequence[Area]) -> tuple[Mesh, MeshVerdict, int]:
     """Mesh and verdict of a map's buildings, and the number of areas of which nothing tells what became.
 
     Raises no error for any footprint.
@@ -229,7 +229,7 @@ def accuracy_of_corners(count: int) -> float:
 _FAULTS = "no body passes with a fault; what cannot be built is in problems.csv"
 
 CASES = (
-    Case(
+    ExtremeCase(
         "footprints",
         "volume of footprints of 3 to 100,000 corners",
         1e-3,
@@ -240,7 +240,7 @@ CASES = (
         100_000,
         "grid of 0.1 mm; corners within 2 mm of a straight wall are left out",
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "volume of footprints of 1 to 1e6 m²",
         1e-3,
@@ -251,7 +251,7 @@ CASES = (
         61,
         "grid of 0.1 mm; corners within 2 mm of a straight wall are left out",
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "corners off their place",
         1e-4,
@@ -262,7 +262,7 @@ CASES = (
         1000,
         "grid of 0.1 mm",
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "1e-4 to 1 m², neither solid nor reported",
         0,
@@ -273,7 +273,7 @@ CASES = (
         1000,
         "below 0.5 m² they are dropped and reported as too small",
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "heights of 0 to 1e4 m, neither solid nor reported",
         0,
@@ -284,7 +284,7 @@ CASES = (
         1000,
         _FAULTS,
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "spikes, bow ties, touching and nested rings, neither solid nor reported",
         0,
@@ -295,7 +295,7 @@ CASES = (
         10_000,
         _FAULTS,
     ),
-    Case(
+    ExtremeCase(
         "footprints",
         "terraced houses within ±5 cm, neither solid nor reported",
         0,
@@ -306,9 +306,11 @@ CASES = (
         1000,
         _FAULTS,
     ),
-    Case("footprints", "nested parts of one building", 0, "faults", nested_parts, "parts", 50, 1000, _FAULTS),
-    Case("footprints", "roads along a parallel", 0, "faults", road_along_parallel, "maps", 1, 9, ""),
-    Case(
+    ExtremeCase(
+        "footprints", "nested parts of one building", 0, "faults", nested_parts, "parts", 50, 1000, _FAULTS
+    ),
+    ExtremeCase("footprints", "roads along a parallel", 0, "faults", road_along_parallel, "maps", 1, 9, ""),
+    ExtremeCase(
         "footprints",
         "maps of one node or a way without length",
         0,

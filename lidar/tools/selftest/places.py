@@ -15,7 +15,7 @@ from geoscene.scene.validate import check_scene
 from geoscene.sources import read_osm
 from geoscene.typing import Float
 from lidar.raycast import Caster
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.meshes import directions, sheet
 from lidar.world.world import World
 
@@ -260,7 +260,7 @@ def small_scenes(count: int) -> float:
 
 
 CASES = (
-    Case(
+    ExtremeCase(
         "places",
         "round trip, local frame to degrees, 100 km wide, 17 places",
         1e-6,
@@ -271,7 +271,7 @@ CASES = (
         1_700_000,
         "PROJ's series and iterations",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "round trip, UTM or UPS to degrees, 100 km wide, 17 places",
         1e-6,
@@ -282,7 +282,7 @@ CASES = (
         1_700_000,
         "PROJ's series and iterations",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "round trip, local frame to UTM or UPS, 10 km wide, 17 places",
         1e-6,
@@ -293,7 +293,7 @@ CASES = (
         1_700_000,
         "PROJ's series and iterations",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "1 km in UTM or UPS by its point scale",
         0.1,
@@ -304,7 +304,7 @@ CASES = (
         1_700_000,
         "the scale of the line's middle stands for the line",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "1 km in UTM or UPS, taken as true",
         6100.0,
@@ -315,7 +315,7 @@ CASES = (
         1_700_000,
         "scale is 0.9996 amid a UTM zone, 0.994 at a pole; told by `geoscene build`, corrected in drives",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "1 km in a local frame, scene of 10 km",
         1.0,
@@ -326,7 +326,7 @@ CASES = (
         1_700_000,
         "scale is 1 at the centre and grows as x² / 2R²",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "1 km in a local frame, scene of 100 km",
         40.0,
@@ -337,7 +337,7 @@ CASES = (
         1_700_000,
         "scale is 1 at the centre and grows as x² / 2R²",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "1 km in a local frame, ground at -430 and 5,000 m",
         800.0,
@@ -348,7 +348,7 @@ CASES = (
         1_700_000,
         "lengths are those on the ellipsoid: z / R, 785 mm per km at 5,000 m; told by builds and drives",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "UTM and UPS zones at their edges, wrong",
         0,
@@ -359,7 +359,7 @@ CASES = (
         len(_ZONES),
         "exceptions of Norway and Svalbard included",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "range to ground at -430, 0 and 5,000 m",
         1e-10,
@@ -370,7 +370,7 @@ CASES = (
         3 * 10**6,
         "float64 plane of the face",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "scenes built at 17 places, local and UTM or UPS, not whole",
         0,
@@ -381,7 +381,7 @@ CASES = (
         2 * len(PLACES),
         "",
     ),
-    Case(
+    ExtremeCase(
         "places",
         "scenes on elevation models at -430 and 5,000 m, not whole or error of lengths not told",
         0,
@@ -392,6 +392,6 @@ CASES = (
         4,
         "",
     ),
-    Case("places", "scenes of 10 m, not whole", 0, "scenes", small_scenes, "scenes", 1, 5, ""),
+    ExtremeCase("places", "scenes of 10 m, not whole", 0, "scenes", small_scenes, "scenes", 1, 5, ""),
 )
 """Extremes of places."""

@@ -7,7 +7,7 @@ import numpy as np
 from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.raycast import Caster
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.meshes import ball, batches, cuboid, directions, prism_of_slivers, sheet
 
 _FAR = np.array([0.001, 0.01, 0.1, 1.0, 10.0, 100.0])
@@ -185,7 +185,7 @@ def unusable(count: int) -> float:
 
 
 CASES = (
-    Case(
+    ExtremeCase(
         "rays",
         "range of 1 mm to 100 m, incidence to 60°",
         1e-9,
@@ -196,7 +196,7 @@ CASES = (
         10**7,
         "float64 plane of the face",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "range of 1 to 100 km, incidence to 60°",
         1e-12,
@@ -207,7 +207,7 @@ CASES = (
         10**7,
         "float64 plane of the face",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "range at incidence of 89.9° to 89.999°",
         1e-11,
@@ -218,7 +218,7 @@ CASES = (
         10**7,
         "rounding of the ray's direction, divided by the cosine",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "leaks through slivers of 1e-5 × 100 m",
         0,
@@ -229,7 +229,7 @@ CASES = (
         10**7,
         "triangles below 4 mm are covered by patches",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "faces of 1 mm on a ground of 100 km, missed",
         0,
@@ -240,7 +240,7 @@ CASES = (
         10**7,
         "0.06 mm margin of the float32 surfaces",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "leaks out of a solid at edges and vertices, origin 0 to 10 km away",
         0,
@@ -251,7 +251,7 @@ CASES = (
         10**7,
         "margin of 0.06 mm, 0.24 mm per km from the origin",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "leaks into a solid at edges and vertices, origin 0 to 10 km away",
         0,
@@ -262,7 +262,7 @@ CASES = (
         10**7,
         "margin of 0.06 mm, 0.24 mm per km from the origin",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "starts on a face that hit it again",
         0,
@@ -273,7 +273,7 @@ CASES = (
         10**7,
         "starts within 1e-9 m of the plane",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "identical faces in one place, missed or displaced",
         0,
@@ -284,7 +284,7 @@ CASES = (
         10**7,
         "either face is reported",
     ),
-    Case(
+    ExtremeCase(
         "rays",
         "NaN, infinite and zero rays that are cast",
         0,

@@ -14,7 +14,7 @@ from geoscene.pipeline.build import build
 from geoscene.scene import Scene
 from geoscene.sources import read_osm
 from geoscene.typing import Float, Ints
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 
 _PLACE = (10.0, 47.0)
 _POST = 1 / 1200
@@ -101,9 +101,11 @@ def _open_edges(scene: Scene) -> int:
 _TIME = "triangles where the terrain needs them"
 
 CASES = (
-    Case("scale", "empty scene, level elevation model", 60, "CPU s", empty_level, "km wide", 5, 100, _TIME),
-    Case("scale", "empty scene in mountains", 60, "CPU s", empty_rough, "km wide", 5, 100, _TIME),
-    Case(
+    ExtremeCase(
+        "scale", "empty scene, level elevation model", 60, "CPU s", empty_level, "km wide", 5, 100, _TIME
+    ),
+    ExtremeCase("scale", "empty scene in mountains", 60, "CPU s", empty_rough, "km wide", 5, 100, _TIME),
+    ExtremeCase(
         "scale", "gaps in the ground of an empty scene in mountains", 0, "edges", gaps, "km wide", 5, 100, ""
     ),
 )

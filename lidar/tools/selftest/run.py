@@ -14,7 +14,7 @@ import numpy as np
 from geoscene.support.progress import Progress, silent
 from lidar.errors import BackendError, InputError
 from lidar.raycast.library import library
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.cases import CASES, GROUPS
 
 
@@ -28,7 +28,7 @@ class Outcome:
     seconds  : wall time
     """
 
-    case: Case
+    case: ExtremeCase
     count: int
     measured: float
     error: str
@@ -55,7 +55,7 @@ def outcomes(
         progress("cases", k + 1, total=len(chosen))
 
 
-def outcome(case: Case, count: int) -> Outcome:
+def outcome(case: ExtremeCase, count: int) -> Outcome:
     """What is measured in a case in ``count`` samples."""
     start = time.perf_counter()
     try:

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 
 from geoscene.typing import Float, Ints
-from lidar.raycast import Caster, Instances
-from lidar.tools.selftest.case import Case
+from lidar.raycast import Caster, MeshInstances
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.footprints import built, house
 from lidar.tools.selftest.meshes import cuboid
 
@@ -67,7 +67,7 @@ def many_road_users(count: int) -> float:
         0,
     ] - side * 5.0 * np.array([1, 1, 0])
     moves[:, 0, :, 3], moves[:, 1, :, 3] = place, place + rng.uniform(-2, 2, (count, 3)) * [1, 1, 0]
-    caster = Caster(instances=[Instances((shape,), np.zeros(count, np.int32), moves)], origin=np.zeros(3))
+    caster = Caster(instances=[MeshInstances((shape,), np.zeros(count, np.int32), moves)], origin=np.zeros(3))
     who, time = rng.integers(0, count, 10 * count), rng.random(10 * count).astype(np.float32)
     share = time[:, None].astype(float)
     aim = (1 - share) * moves[who, 0, :, 3] + share * moves[who, 1, :, 3] + [0, 0, 1.5]
@@ -77,7 +77,7 @@ def many_road_users(count: int) -> float:
 
 
 CASES = (
-    Case(
+    ExtremeCase(
         "scale",
         "range among 1e7 triangles, at their vertices",
         1e-9,
@@ -88,7 +88,7 @@ CASES = (
         10**7,
         "float64 plane of the face",
     ),
-    Case(
+    ExtremeCase(
         "scale",
         "buildings of a town, no solids of the right volume",
         0,
@@ -99,7 +99,7 @@ CASES = (
         100_000,
         "",
     ),
-    Case(
+    ExtremeCase(
         "scale",
         "road users, moving, that a ray misses",
         0,

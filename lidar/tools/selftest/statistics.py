@@ -19,7 +19,7 @@ from lidar.sensors.physics.range_error import signal_sigma, stretch_sigma
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.sensors.rig.specs import ImuSpec
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 from lidar.tools.selftest.meshes import BATCH, batches
 
 SIGMAS = 5.0
@@ -237,8 +237,8 @@ def gnss_processes(count: int) -> float:
 _LIMIT = "5 standard errors: one statistic exceeds them by chance once in 1.7 million"
 
 
-def _row(name: str, measure: Callable[[int], float], *, full: int = 10**8) -> Case:
-    return Case("statistics", name, SIGMAS, "σ", measure, "samples", 100_000, full, _LIMIT)
+def _row(name: str, measure: Callable[[int], float], *, full: int = 10**8) -> ExtremeCase:
+    return ExtremeCase("statistics", name, SIGMAS, "σ", measure, "samples", 100_000, full, _LIMIT)
 
 
 CASES = (
@@ -251,7 +251,7 @@ CASES = (
     _row("largest of the correlations between 100 frames", between_many_frames),
     _row("correlation between seeds", between_seeds),
     _row("correlation between successive numbers", between_numbers),
-    Case(
+    ExtremeCase(
         "statistics",
         "deviates that depend on the order of frames, as of workers",
         0,

@@ -12,7 +12,7 @@ from lidar.geometry.time_scales import GPS_EPOCH, LEAPS, gps_seconds, leap_secon
 from lidar.sensors.navigation.gnss import epochs
 from lidar.sensors.rig.patterns.beams import frame_window_ns
 from lidar.sensors.rig.specs import GnssSpec
-from lidar.tools.selftest.case import Case
+from lidar.tools.selftest.case import ExtremeCase
 
 _DAY = 86_400
 _RATES = (
@@ -75,7 +75,7 @@ def lost_leap_seconds(count: int) -> float:
 _FLOOR = "times are whole nanoseconds"
 
 CASES = (
-    Case(
+    ExtremeCase(
         "time",
         "starts of the frames of 24 h",
         1,
@@ -86,8 +86,10 @@ CASES = (
         130_000,
         _FLOOR,
     ),
-    Case("time", "epochs of a receiver in 24 h", 1, "ns", epoch_times, "epochs", 1300, 130_000, _FLOOR),
-    Case(
+    ExtremeCase(
+        "time", "epochs of a receiver in 24 h", 1, "ns", epoch_times, "epochs", 1300, 130_000, _FLOOR
+    ),
+    ExtremeCase(
         "time",
         "GPS time from 1980 to 2100",
         0.5,
@@ -98,7 +100,7 @@ CASES = (
         100_000,
         "doubles of LAS, less 1e9 s",
     ),
-    Case(
+    ExtremeCase(
         "time",
         "leap seconds that GPS time does not count",
         0,

@@ -18,7 +18,7 @@ from geoscene.pipeline.build import build
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
 from geoscene.sources import read_osm, with_elevation
-from geoscene.support.cluster import Cluster
+from geoscene.support.cluster import DaskCluster
 from geoscene.support.console import DEFAULTS, guard_numbers
 from geoscene.support.files import digest_of, sources_digest, write_json
 from geoscene.support.progress import Progress, silent
@@ -50,7 +50,12 @@ class MapScene:
         return [path for path in named if path.is_file()]
 
     def built(
-        self, folder: Path, *, workers: int = 1, cluster: Cluster | None = None, progress: Progress = silent
+        self,
+        folder: Path,
+        *,
+        workers: int = 1,
+        cluster: DaskCluster | None = None,
+        progress: Progress = silent,
     ) -> Path:
         """The scene in a folder, built unless it is there of the same files and options."""
         target, stamp = folder / self.name, folder / f"{self.name}.json"

@@ -18,7 +18,7 @@ from geoscene import __version__
 from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
-from geoscene.support.cluster import Cluster, connected
+from geoscene.support.cluster import DaskCluster, connected
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import digest_of, exclusive, write_json
 from geoscene.support.processes import run_tasks
@@ -164,7 +164,12 @@ def recorded(
 
 
 def _scenes(
-    drives: Sequence[GridDrive], folder: Path, *, workers: int, cluster: Cluster | None, progress: Progress
+    drives: Sequence[GridDrive],
+    folder: Path,
+    *,
+    workers: int,
+    cluster: DaskCluster | None,
+    progress: Progress,
 ) -> dict[str, Path | str]:
     """Scenes of maps by name, in folder ``scenes``, each built once, as needed; or why it cannot be built."""
     scenes: dict[str, Path | str] = {}
@@ -221,7 +226,7 @@ def _with_pick(task: _Task, *, progress: Progress) -> _Task:
 
 
 def _results(
-    tasks: Sequence[_Task], *, workers: int, cluster: Cluster | None
+    tasks: Sequence[_Task], *, workers: int, cluster: DaskCluster | None
 ) -> Iterator[tuple[int, DriveRow]]:
     """Rows of the table as the drives end, with their numbers."""
     if cluster is not None:

@@ -11,9 +11,9 @@ from geoscene.typing import Ints
 from lidar.options import TradeoffOptions
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.devices import Camera
-from lidar.tools.tradeoff.comparison import Comparison
+from lidar.tools.tradeoff.comparison import SensorComparison
 from lidar.tools.tradeoff.costs import costs
-from lidar.tools.tradeoff.errors import IMAGE_STATISTICS, Estimate, ImageError, estimates
+from lidar.tools.tradeoff.errors import IMAGE_STATISTICS, ErrorEstimate, ImageError, estimates
 from lidar.tools.tradeoff.images import (
     BLOCK,
     Pixels,
@@ -28,7 +28,7 @@ from lidar.tools.tradeoff.simulate import EXACT, FAST, Bench
 from lidar.tools.tradeoff.variants import (
     CAMERA_VALUES,
     OF_EMBREE,
-    Variant,
+    SettingVariant,
     camera_basis,
     camera_variants,
     coarser,
@@ -43,7 +43,7 @@ _PART = slice(None, None, 4)
 
 def compared_camera(
     bench: Bench, camera: Camera, *, compared: TradeoffOptions, scenes: Sequence[str], progress: Progress
-) -> Comparison:
+) -> SensorComparison:
     """The comparison of a camera; ``scenes`` are labels of the scenes after the first."""
     plan, contents = bench.plan, bench.plan.options.contents()
     exposed = camera.spec.exposure_ns > 0
@@ -98,7 +98,7 @@ def compared_camera(
         further=[_against_means(figures(errors)) for errors in reduced],
     )
     moments = basis.exact.moments(camera.spec)
-    return Comparison(
+    return SensorComparison(
         f"{camera.name} ({camera.spec.width} x {camera.spec.height} pixels)",
         f"float64 ray casting, {basis.exact.supersample**2 * moments} rays per pixel, shadows and detail;"
         " about half as many rays",
@@ -110,7 +110,7 @@ def compared_camera(
     )
 
 
-def _against_means(error: dict[str, Estimate]) -> str:
+def _against_means(error: dict[str, ErrorEstimate]) -> str:
     """What an image of lower resolution is off as an image of its own."""
     if not error:
         return ""
@@ -132,7 +132,7 @@ class _Look:
 
     def pixels(
         self,
-        variant: Variant[CameraSettings],
+        variant: SettingVariant[CameraSettings],
         settings: CameraSettings,
         *,
         world: WorldSettings,
@@ -149,7 +149,7 @@ class _Look:
         )
         return pixels(self.shot, self.blocks, world=around, settings=settings, resolution=variant.resolution)
 
-    def used(self, variant: Variant[CameraSettings]) -> Pixels:
+    def used(self, variant: SettingVariant[CameraSettings]) -> Pixels:
         """The pixels with the user's settings, changed as in a variant."""
         if variant.changes not in self._known:
             self._known[variant.changes] = self.pixels(
@@ -157,7 +157,7 @@ class _Look:
             )
         return self._known[variant.changes]
 
-    def alone(self, variant: Variant[CameraSettings]) -> Pixels:
+    def alone(self, variant: SettingVariant[CameraSettings]) -> Pixels:
         """The pixels of the reference, changed as in a variant."""
         backend = FAST if variant.names <= OF_EMBREE else EXACT
         return self.pixels(variant, variant.alone, world=variant.alone_world, backend=backend)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Literal
 
 from geoscene.drawing.figures import metres
 from lidar.errors import InputError
-from lidar.options import Accuracy
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.options import AccuracyTarget
+from lidar.tools.tradeoff.errors import ErrorEstimate
 from lidar.tools.tradeoff.sensor_errors import error_text
 from lidar.tools.tradeoff.words import levels
 
@@ -38,12 +38,12 @@ class Choice:
         return tuple(part for part in (self.scanners, self.cameras) if part is not None)
 
     @property
-    def cpu_s(self) -> Estimate:
+    def cpu_s(self) -> ErrorEstimate:
         """CPU seconds per simulated second of all sensors."""
-        return sum((part.cpu_s for part in self.parts), Estimate(0.0, 0.0, 0.0))
+        return sum((part.cpu_s for part in self.parts), ErrorEstimate(0.0, 0.0, 0.0))
 
     @property
-    def errors(self) -> dict[str, dict[str, Estimate]]:
+    def errors(self) -> dict[str, dict[str, ErrorEstimate]]:
         """Figures of each sensor."""
         return {name: figures for part in self.parts for name, figures in part.errors.items()}
 
@@ -71,7 +71,7 @@ class Wanted:
     free     : kinds of sensors for which may be picked
     """
 
-    accuracy: Accuracy | None = None
+    accuracy: AccuracyTarget | None = None
     pace: float = 0.0
     budget: str = ""
     workers: int = 1
@@ -113,13 +113,13 @@ def _given(profile: Profile, given: Mapping[str, int]) -> Choice:
     return Choice(own(profile.scanners), own(profile.cameras))
 
 
-def _limits(accuracy: Accuracy) -> list[tuple[str, float]]:
+def _limits(accuracy: AccuracyTarget) -> list[tuple[str, float]]:
     """Figures of errors, and what they must not exceed."""
     lengths = [(f"{kind}_{accuracy.percent:g}_m", accuracy.metres) for kind in ("range", "depth")]
     return lengths * bool(accuracy.metres) + [("rgb_rms", accuracy.levels)] * bool(accuracy.levels)
 
 
-def _accurate(profile: Profile, accuracy: Accuracy, *, begin: Choice) -> Choice:
+def _accurate(profile: Profile, accuracy: AccuracyTarget, *, begin: Choice) -> Choice:
     """The first candidates whose errors are within an accuracy; depths do not depend on the candidate."""
     chosen = begin
     kinds: dict[str, Kind] = {"range": "scanners", "rgb": "cameras", "depth": "cameras"}
@@ -167,7 +167,7 @@ def _affordable(profile: Profile, wanted: Wanted, *, begin: Choice) -> Choice:
         at = dearer[0]
 
 
-def _out_of_reach(candidates: Sequence[Candidate], accuracy: Accuracy, *, figure: str) -> str:
+def _out_of_reach(candidates: Sequence[Candidate], accuracy: AccuracyTarget, *, figure: str) -> str:
     """The message of an accuracy that no candidate reaches, with the nearest."""
     best = min(candidates, key=lambda c: worst(c, figure).high)
     error = worst(best, figure)
@@ -199,7 +199,7 @@ def _smaller(percent: float) -> float:
     return 99.0 if percent > 99 else 95.0 if percent > 95 else 90.0 if percent > 90 else 50.0
 
 
-def worst(candidate: Candidate, figure: str) -> Estimate:
+def worst(candidate: Candidate, figure: str) -> ErrorEstimate:
     """A figure of the sensor with the largest upper end."""
     return max((of[figure] for of in candidate.errors.values() if figure in of), key=lambda error: error.high)
 
@@ -221,7 +221,7 @@ def _label(settings: Mapping[str, int]) -> str:
     return " ".join(f"{name}={value}" for name, value in settings.items())
 
 
-def speed(cost: Estimate, workers: int) -> float:
+def speed(cost: ErrorEstimate, workers: int) -> float:
     """Simulated seconds per second of wall time at a cost, if all workers are always busy."""
     return threads(workers) / cost.value
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.tools.tradeoff.errors import ErrorEstimate
 
 Kind = Literal["scanner", "camera"]
 
@@ -14,7 +14,7 @@ TAILS: dict[Kind, str] = {"scanner": "range_99.9_m", "camera": "rgb_rms"}
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class VariantRow:
     """A measured variant.
 
     error  : of the user's settings with this one changed, against the reference; see `errors.STATISTICS`
@@ -27,15 +27,15 @@ class Row:
     """
 
     label: str
-    error: dict[str, Estimate]
-    alone: dict[str, Estimate]
-    cost: dict[str, Estimate]
+    error: dict[str, ErrorEstimate]
+    alone: dict[str, ErrorEstimate]
+    cost: dict[str, ErrorEstimate]
     note: str = ""
     choice: bool = True
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class SensorComparison:
     """The rows of a sensor.
 
     sensor    : name on the rig, with its preset or size
@@ -48,8 +48,8 @@ class Comparison:
 
     sensor: str
     reference: str
-    residual: dict[str, Estimate]
-    rows: tuple[Row, ...]
+    residual: dict[str, ErrorEstimate]
+    rows: tuple[VariantRow, ...]
     samples: int
     frames: int
     kind: Kind = "scanner"

@@ -8,10 +8,10 @@ import numpy as np
 
 from geoscene.support.progress import Progress
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.tools.tradeoff.errors import Estimate, median
+from lidar.tools.tradeoff.errors import ErrorEstimate, median
 from lidar.tools.tradeoff.memory import Task, peaks
 from lidar.tools.tradeoff.simulate import FAST, Bench
-from lidar.tools.tradeoff.variants import S, Variant
+from lidar.tools.tradeoff.variants import S, SettingVariant
 from lidar.world.world import World
 
 
@@ -19,11 +19,11 @@ def costs(
     bench: Bench,
     sensor: Scanner | Camera,
     *,
-    variants: Sequence[Variant[S]],
-    frame_cost: Callable[[int, World, Variant[S]], tuple[float, int]],
+    variants: Sequence[SettingVariant[S]],
+    frame_cost: Callable[[int, World, SettingVariant[S]], tuple[float, int]],
     repetitions: int,
     progress: Progress,
-) -> list[dict[str, Estimate]]:
+) -> list[dict[str, ErrorEstimate]]:
     """CPU seconds and bytes per simulated second and peak memory of variants.
 
     frame_cost : CPU seconds and bytes of a whole frame
@@ -64,7 +64,7 @@ def costs(
     ]
 
 
-def _task(bench: Bench, sensor: Scanner | Camera, *, variant: Variant[S]) -> Task:
+def _task(bench: Bench, sensor: Scanner | Camera, *, variant: SettingVariant[S]) -> Task:
     plan = bench.plan
     frame = bench.frames[sensor.name][0]
     start = sensor.frame_start_ns(frame)

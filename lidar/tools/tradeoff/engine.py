@@ -16,7 +16,7 @@ from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan, plan_drive, schedule
 from lidar.tools.tradeoff.cameras import compared_camera
-from lidar.tools.tradeoff.comparison import Comparison, Listing
+from lidar.tools.tradeoff.comparison import Listing, SensorComparison
 from lidar.tools.tradeoff.errors import percentile
 from lidar.tools.tradeoff.files import formats_listing
 from lidar.tools.tradeoff.projections import frames_listing
@@ -32,7 +32,7 @@ COMPARED = tuple(dict.fromkeys((*SCANNER_VALUES, *CAMERA_VALUES, *_OF_SENSORS, *
 
 
 @dataclass(frozen=True, slots=True)
-class Tradeoff:
+class DriveTradeoff:
     """Comparisons of all sensors of a rig on a drive.
 
     georeferencing : metres between the affine map and the full projection; empty where not compared
@@ -40,7 +40,7 @@ class Tradeoff:
     """
 
     plan: DrivePlan
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[SensorComparison, ...]
     georeferencing: dict[str, float]
     listings: tuple[Listing, ...]
 
@@ -52,7 +52,7 @@ def tradeoff(
     compared: TradeoffOptions = TradeoffOptions(),
     others: Sequence[Scene] = (),
     progress: Progress = silent,
-) -> Tradeoff:
+) -> DriveTradeoff:
     """Errors and costs of settings on a drive; the drive is planned once, in the first scene.
 
     others : further scenes of the same place, in the same frame
@@ -83,7 +83,7 @@ def tradeoff(
             bench.close(backend=EXACT)
     wanted = compared.compare or COMPARED
     geo = _georeferencing(bench) if "georeferencing" in wanted else {}
-    return Tradeoff(plan, tuple(found), geo, tuple(_listings(bench, wanted, progress=progress)))
+    return DriveTradeoff(plan, tuple(found), geo, tuple(_listings(bench, wanted, progress=progress)))
 
 
 def _listings(bench: Bench, wanted: Sequence[str], *, progress: Progress) -> Iterator[Listing]:

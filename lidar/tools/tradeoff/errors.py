@@ -17,7 +17,7 @@ RESAMPLES = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Returns(Columns):
+class PulseReturns(Columns):
     """Returns of some pulses of a frame.
 
     key   : (n,) int64, ascending: 256 times the row of the pulse plus the rank of the return in it
@@ -33,7 +33,7 @@ class Returns(Columns):
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class ErrorEstimate:
     """A figure with a 95 % interval: of itself, or for the next drive (see `next_drive`)."""
 
     value: float
@@ -46,17 +46,17 @@ class Estimate:
         return {name: float(f"{v:.6g}") if np.isfinite(v) else None for name, v in figures.items()}
 
     @classmethod
-    def from_json(cls, figures: Mapping[str, float]) -> Estimate:
+    def from_json(cls, figures: Mapping[str, float]) -> ErrorEstimate:
         """The figures of `to_json`, all finite; raises KeyError, TypeError or ValueError for others."""
         return cls(float(figures["value"]), float(figures["low"]), float(figures["high"]))
 
-    def __add__(self, other: Estimate) -> Estimate:
+    def __add__(self, other: ErrorEstimate) -> ErrorEstimate:
         """The sum, with the ends of both."""
-        return Estimate(self.value + other.value, self.low + other.low, self.high + other.high)
+        return ErrorEstimate(self.value + other.value, self.low + other.low, self.high + other.high)
 
 
 @dataclass(frozen=True, slots=True)
-class FrameError:
+class FrameDifferences:
     """Differences of one frame from the reference.
 
     range, position : (m,) metres, absolute, of returns that both have: of ranges, and of points in the world
@@ -75,12 +75,12 @@ class FrameError:
     returns: int
 
 
-def frame_error(found: Returns, exact: Returns) -> FrameError:
+def frame_error(found: PulseReturns, exact: PulseReturns) -> FrameDifferences:
     """Differences between the returns of the same pulses."""
     _, a, b = np.intersect1d(found.key, exact.key, assume_unique=True, return_indices=True)
     position = np.linalg.norm(found.xyz[a] - exact.xyz[b], axis=1)
     there, back = cloud_distances(found.xyz, exact.xyz)
-    return FrameError(
+    return FrameDifferences(
         np.abs(found.range[a] - exact.range[b]),
         position,
         there,
@@ -111,7 +111,7 @@ def percentile(values: Float, share: float) -> float:
     return float(np.quantile(values, share, method="higher")) if len(values) else 0.0
 
 
-Statistic = Callable[[Sequence[FrameError]], float]
+Statistic = Callable[[Sequence[FrameDifferences]], float]
 
 
 def _of_all(name: str, figure: Callable[[Float], float]) -> Statistic:
@@ -122,13 +122,13 @@ def _share(name: str) -> Statistic:
     return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(f.returns for f in frames))
 
 
-def _chamfer(frames: Sequence[FrameError]) -> float:
+def _chamfer(frames: Sequence[FrameDifferences]) -> float:
     there, back = (np.concatenate([getattr(f, side) for f in frames]) for side in ("there", "back"))
     return float(np.mean(there) + np.mean(back)) / 2 if len(there) else 0.0
 
 
 def _hausdorff(share: float) -> Statistic:
-    def distance(frames: Sequence[FrameError]) -> float:
+    def distance(frames: Sequence[FrameDifferences]) -> float:
         sides = (np.concatenate([getattr(f, side) for f in frames]) for side in ("there", "back"))
         return max(percentile(side, share) for side in sides)
 
@@ -208,7 +208,7 @@ E = TypeVar("E")
 
 def estimates(
     frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
-) -> dict[str, Estimate]:
+) -> dict[str, ErrorEstimate]:
     """All figures of an error, with intervals by resampling frames; none without frames."""
     return resampled(
         frames, seed=seed, figures=lambda of: {name: figure(of) for name, figure in statistics.items()}
@@ -217,7 +217,7 @@ def estimates(
 
 def resampled(
     frames: Sequence[E], *, seed: int, figures: Callable[[Sequence[E]], Mapping[str, float]]
-) -> dict[str, Estimate]:
+) -> dict[str, ErrorEstimate]:
     """Figures of frames with 95 % intervals by resampling these; not those that are NaN.
 
     None without frames.
@@ -230,11 +230,11 @@ def resampled(
     for name, value in figures(frames).items():
         if not np.isnan(value):
             low, high = np.nanpercentile([one[name] for one in again], [2.5, 97.5])
-            found[name] = Estimate(value, float(low), float(high))
+            found[name] = ErrorEstimate(value, float(low), float(high))
     return found
 
 
-def next_drive(values: Sequence[float], *, least: float) -> Estimate:
+def next_drive(values: Sequence[float], *, least: float) -> ErrorEstimate:
     """The typical error of drives, at least two, and the 95 % prediction interval for that of one more.
 
     Errors of drives spread by factors, and their logarithms about as a normal distribution does: the interval
@@ -247,12 +247,12 @@ def next_drive(values: Sequence[float], *, least: float) -> Estimate:
     logs = np.log(np.maximum(values, least))
     n, middle = len(logs), float(np.mean(logs))
     reach = float(stdtrit(n - 1, 0.975)) * float(np.std(logs, ddof=1)) * (1 + 1 / n) ** 0.5
-    return Estimate(*np.exp([middle, middle - reach, middle + reach]).tolist())
+    return ErrorEstimate(*np.exp([middle, middle - reach, middle + reach]).tolist())
 
 
-def median(values: Sequence[float], *, seed: int) -> Estimate:
+def median(values: Sequence[float], *, seed: int) -> ErrorEstimate:
     """The median of repetitions with the 95 % interval by resampling them."""
     data = np.asarray(values, float)
     picks = np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))
     low, high = np.percentile(np.median(data[picks], axis=1), [2.5, 97.5])
-    return Estimate(float(np.median(data)), float(low), float(high))
+    return ErrorEstimate(float(np.median(data)), float(low), float(high))

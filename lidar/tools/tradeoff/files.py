@@ -21,7 +21,7 @@ from lidar.geometry.time_scales import gps_seconds
 from lidar.sensors.rig.devices import Scanner
 from lidar.tools.tradeoff.comparison import Listing, Record
 from lidar.tools.tradeoff.errors import percentile, rms
-from lidar.tools.tradeoff.simulate import Bench, Measured, measured_frame
+from lidar.tools.tradeoff.simulate import Bench, SimulatedFrame, measured_frame
 
 _STEPS = {"csv": 1e-4}
 """Metres between numbers of formats that write decimals."""
@@ -125,7 +125,7 @@ def float32_bound(xyz: Float) -> float:
     return float(np.linalg.norm(np.spacing(far).astype(np.float64))) / 2
 
 
-def _in_sensor_frame(bench: Bench, scanner: Scanner, *, seen: Measured, frame: int) -> Iterator[Stored]:
+def _in_sensor_frame(bench: Bench, scanner: Scanner, *, seen: SimulatedFrame, frame: int) -> Iterator[Stored]:
     """Formats of the sensor frame; KITTI's are de-skewed to the frame's start."""
     table, mount = cloud_table(seen.cloud), scanner.spec.mount
     pose = bench.plan.trajectory.at([scanner.frame_start_ns(frame)]).mounted(
@@ -144,7 +144,7 @@ def _in_sensor_frame(bench: Bench, scanner: Scanner, *, seen: Measured, frame: i
             yield Stored(form.name, form, columns, exact, form.write, bound, note)
 
 
-def _in_world(bench: Bench, scanner: Scanner, *, seen: Measured) -> Iterator[Stored]:
+def _in_world(bench: Bench, scanner: Scanner, *, seen: SimulatedFrame) -> Iterator[Stored]:
     """LAS and LAZ in steps of several sizes, and maps as PCD and PLY, in the export CRS."""
     plan = bench.plan
     exact, mount = plan.geo.points(seen.placed), scanner.spec.mount

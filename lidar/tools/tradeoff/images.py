@@ -12,7 +12,7 @@ from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.png import depth_to_counts, encode_png, feature_to_image
-from lidar.sensors.camera.render import Frame, exposure_times, render
+from lidar.sensors.camera.render import CameraImage, exposure_times, render
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.camera.signal_lamps import Lamps
 from lidar.sensors.rig.devices import Camera
@@ -87,7 +87,7 @@ def coarse(camera: CameraSpec, resolution: int) -> CameraSpec:
     )
 
 
-def image(shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1) -> Frame:
+def image(shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1) -> CameraImage:
     """The whole frame."""
     return _rendered(shot, coarse(shot.camera.spec, resolution), world=world, settings=settings)
 
@@ -105,7 +105,7 @@ def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) ->
     return (BLOCK * np.column_stack([column[chosen], row[chosen]])).astype(np.int64)
 
 
-def strip(shot: Shot, *, world: World, settings: CameraSettings, top: int, height: int) -> Frame:
+def strip(shot: Shot, *, world: World, settings: CameraSettings, top: int, height: int) -> CameraImage:
     """The rows of a frame from ``top`` on."""
     spec = shot.camera.spec
     window = replace(spec, height=height, cy=spec.cy - top)
@@ -133,7 +133,9 @@ def pixels(
     return Pixels(np.stack(rgb), np.stack(depth), np.stack(klass))
 
 
-def _rendered(shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSettings, top: int = 0) -> Frame:
+def _rendered(
+    shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSettings, top: int = 0
+) -> CameraImage:
     """A frame of a camera, or of the part of it that begins at its row ``top``."""
     start = shot.camera.frame_start_ns(shot.frame)
     times = exposure_times(spec, start + top * spec.row_ns, samples=settings.moments(spec))
@@ -164,7 +166,7 @@ def image_error(found: Pixels, exact: Pixels) -> ImageError:
     )
 
 
-def encoded(frame: Frame, camera: Camera) -> int:
+def encoded(frame: CameraImage, camera: Camera) -> int:
     """Bytes of the images of a frame as PNG, as a drive writes them; optical flow is left out."""
     images: dict[str, NDArray[np.uint8] | NDArray[np.uint16] | None] = {
         "rgb": frame.rgb,

@@ -6,17 +6,19 @@ from collections.abc import Sequence
 from typing import Any
 
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.tools.tradeoff.comparison import Row
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.tools.tradeoff.comparison import VariantRow
+from lidar.tools.tradeoff.errors import ErrorEstimate
 from lidar.tools.tradeoff.simulate import FAST, Bench
-from lidar.tools.tradeoff.variants import KINDS, MODELS, Variant
+from lidar.tools.tradeoff.variants import KINDS, MODELS, SettingVariant
 from lidar.world.settings import WorldSettings
 
 
 class Notes:
     """Gathers over frames which changes make no difference to a sensor, and says so."""
 
-    def __init__(self, bench: Bench, sensor: Scanner | Camera, *, variants: Sequence[Variant[Any]]) -> None:
+    def __init__(
+        self, bench: Bench, sensor: Scanner | Camera, *, variants: Sequence[SettingVariant[Any]]
+    ) -> None:
         self._bench = bench
         self._sensor = sensor
         self._variants = variants
@@ -53,18 +55,18 @@ class Notes:
         self,
         asked: str,
         *,
-        used: Sequence[dict[str, Estimate]],
-        alone: Sequence[dict[str, Estimate]],
-        spent: Sequence[dict[str, Estimate]],
+        used: Sequence[dict[str, ErrorEstimate]],
+        alone: Sequence[dict[str, ErrorEstimate]],
+        spent: Sequence[dict[str, ErrorEstimate]],
         further: Sequence[str] = (),
-    ) -> tuple[Row, ...]:
+    ) -> tuple[VariantRow, ...]:
         """Rows of the variants.
 
         asked   : the settings as asked, in words
         further : notes of each variant beside these
         """
         return tuple(
-            Row(
+            VariantRow(
                 variant.label or f"as asked ({asked})",
                 used[i],
                 alone[i],
@@ -75,7 +77,7 @@ class Notes:
             for i, variant in enumerate(self._variants)
         )
 
-    def _absent(self, variant: Variant[Any]) -> bool:
+    def _absent(self, variant: SettingVariant[Any]) -> bool:
         """Whether a variant's world holds as many faces and instances as the one of the settings as asked."""
         sizes = {self._size(of.world) for of in (variant, self._variants[0])}
         return len(sizes) == 1

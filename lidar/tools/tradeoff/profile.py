@@ -31,7 +31,7 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.plan import DrivePlan, plan_drive, sensors_of
 from lidar.tools.selftest.run import machine
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.tools.tradeoff.errors import ErrorEstimate
 from lidar.tools.tradeoff.profile_costs import costs
 from lidar.tools.tradeoff.profile_errors import Errors, camera_errors, measuring, scanner_errors
 from lidar.tools.tradeoff.sampling import REFERENCE_RAYS
@@ -74,8 +74,8 @@ class Candidate:
     """
 
     settings: dict[str, int]
-    errors: dict[str, dict[str, Estimate]]
-    cpu_s: Estimate
+    errors: dict[str, dict[str, ErrorEstimate]]
+    cpu_s: ErrorEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ class Profile:
     scanners: tuple[Candidate, ...]
     cameras: tuple[Candidate, ...]
     drives: int
-    load_s: Estimate
+    load_s: ErrorEstimate
     made: bool = False
 
 
@@ -237,16 +237,16 @@ def _profile(path: Path, document: dict[str, Any]) -> Profile:
             Candidate(
                 {name: int(value) for name, value in row["settings"].items()},
                 {
-                    sensor: {name: Estimate.from_json(error) for name, error in figures.items()}
+                    sensor: {name: ErrorEstimate.from_json(error) for name, error in figures.items()}
                     for sensor, figures in row["errors"].items()
                 },
-                Estimate.from_json(row["cpu_s"]),
+                ErrorEstimate.from_json(row["cpu_s"]),
             )
             for row in document[kind]
         )
         for kind in ("scanners", "cameras")
     )
-    load = Estimate.from_json(document["load_cpu_s"])
+    load = ErrorEstimate.from_json(document["load_cpu_s"])
     return Profile(path, scanners, cameras, int(document["drives"]), load)
 
 
@@ -281,7 +281,7 @@ def _measured(
 
 
 def _rows(
-    settings: Sequence[dict[str, int]], *, errors: Errors, seconds: Sequence[Estimate]
+    settings: Sequence[dict[str, int]], *, errors: Errors, seconds: Sequence[ErrorEstimate]
 ) -> list[dict[str, Any]]:
     """Candidates as JSON."""
     return [

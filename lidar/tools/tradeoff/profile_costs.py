@@ -20,7 +20,7 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan
 from lidar.simulation.record import record_frame
-from lidar.tools.tradeoff.errors import Estimate, median
+from lidar.tools.tradeoff.errors import ErrorEstimate, median
 from lidar.tools.tradeoff.images import strip
 from lidar.tools.tradeoff.simulate import bench_of, spread_frames, swept
 from lidar.world.thread_worlds import Worlds
@@ -42,7 +42,7 @@ def costs(
     scanner: Sequence[ScannerSettings],
     camera: Sequence[CameraSettings],
     progress: Progress,
-) -> tuple[list[Estimate], list[Estimate], Estimate]:
+) -> tuple[list[ErrorEstimate], list[ErrorEstimate], ErrorEstimate]:
     """CPU seconds per simulated second of all scanners and of all cameras, and those to load the tiles.
 
     scanner, camera : settings, the cheapest first

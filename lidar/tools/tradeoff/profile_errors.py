@@ -14,11 +14,11 @@ from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.errors import E, Estimate, next_drive, resampled
+from lidar.tools.tradeoff.errors import E, ErrorEstimate, next_drive, resampled
 from lidar.tools.tradeoff.sampled_images import image_errors_of, image_figures
 from lidar.tools.tradeoff.sampling import errors_of, places, range_figures
 
-Errors = dict[str, list[dict[str, Estimate]]]
+Errors = dict[str, list[dict[str, ErrorEstimate]]]
 """Figures of each setting, by sensor."""
 
 _LEAST_M, _LEAST = 1e-6, {"rgb_rms": 0.01, "lost": 1e-5}
@@ -106,7 +106,7 @@ def _estimates(
 
 def drive_estimates(
     samples: Sequence[tuple[int, E]], *, figures: Callable[[Sequence[E]], Mapping[str, float]]
-) -> dict[str, Estimate]:
+) -> dict[str, ErrorEstimate]:
     """Figures of frames, each with the number of its drive, which ascends.
 
     The intervals are those of the next drive; of frames of one drive, those of this drive. Figures that are

@@ -10,7 +10,7 @@ from typing import Any
 
 from geoscene.drawing.charts import (
     Axes,
-    Point,
+    ChartPoint,
     html_page,
     html_picture,
     html_table,
@@ -20,9 +20,9 @@ from geoscene.drawing.charts import (
 )
 from geoscene.drawing.figures import metres, share, size
 from geoscene.support.files import write_atomically, write_json
-from lidar.tools.tradeoff.comparison import Comparison, Kind, Listing, Row
-from lidar.tools.tradeoff.engine import Tradeoff
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.tools.tradeoff.comparison import Kind, Listing, SensorComparison, VariantRow
+from lidar.tools.tradeoff.engine import DriveTradeoff
+from lidar.tools.tradeoff.errors import ErrorEstimate
 from lidar.tools.tradeoff.words import (
     candidates,
     pareto,
@@ -60,7 +60,7 @@ def heads(kind: Kind) -> tuple[str, ...]:
     return ("setting", *errors[kind], alone[kind], "CPU s/s", "memory", "bytes/s", "note")
 
 
-def cells(row: Row, comparison: Comparison) -> list[str]:
+def cells(row: VariantRow, comparison: SensorComparison) -> list[str]:
     """Texts of a row of the table."""
     e, c, kind = row.error, row.cost, comparison.kind
     tail = e[comparison.tail]
@@ -132,17 +132,17 @@ def table_of(listing: Listing) -> tuple[list[str], list[list[str]]]:
     return [listing.name, *(HEADINGS[n] for n in names), "note"], rows
 
 
-def _with_interval(cost: Estimate) -> str:
+def _with_interval(cost: ErrorEstimate) -> str:
     return f"{cost.value:.3g} ({cost.low:.3g} to {cost.high:.3g})"
 
 
-def headline(comparison: Comparison) -> str:
+def headline(comparison: SensorComparison) -> str:
     """What was compared."""
     what = "pulses" if comparison.kind == "scanner" else "pixels"
     return f"{comparison.sensor}: {comparison.samples:,} {what} of {comparison.frames} frames"
 
 
-def georeferencing_text(found: Tradeoff) -> str:
+def georeferencing_text(found: DriveTradeoff) -> str:
     """Error of the affine map of georeferencing; empty if it was not compared."""
     if not found.georeferencing:
         return ""
@@ -152,7 +152,7 @@ def georeferencing_text(found: Tradeoff) -> str:
     return f"Georeferencing: the affine map is within {metres(worst)} of the full projection (`exact`)."
 
 
-def print_tables(found: Tradeoff) -> None:
+def print_tables(found: DriveTradeoff) -> None:
     """Print the tables and recommendations."""
     for comparison in found.comparisons:
         rows = [cells(row, comparison) for row in comparison.rows]
@@ -164,7 +164,7 @@ def print_tables(found: Tradeoff) -> None:
     print_lines([georeferencing_text(found), NOISE])
 
 
-def document(found: Tradeoff) -> dict[str, Any]:
+def document(found: DriveTradeoff) -> dict[str, Any]:
     """The contents of ``tradeoff.json``."""
     plan = found.plan
     return {
@@ -190,7 +190,7 @@ def document(found: Tradeoff) -> dict[str, Any]:
     }
 
 
-def _sensor_json(comparison: Comparison) -> dict[str, Any]:
+def _sensor_json(comparison: SensorComparison) -> dict[str, Any]:
     return {
         "sensor": comparison.sensor,
         "kind": comparison.kind,
@@ -213,11 +213,11 @@ def _sensor_json(comparison: Comparison) -> dict[str, Any]:
     }
 
 
-def _json_of(figures: dict[str, Estimate]) -> dict[str, Any]:
+def _json_of(figures: dict[str, ErrorEstimate]) -> dict[str, Any]:
     return {name: figure.to_json() for name, figure in figures.items()}
 
 
-def write_report(found: Tradeoff, out: Path) -> None:
+def write_report(found: DriveTradeoff, out: Path) -> None:
     """Write ``tradeoff.json``, ``tradeoff.html`` and a plot for each sensor into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     plots = []
@@ -228,7 +228,7 @@ def write_report(found: Tradeoff, out: Path) -> None:
     write_json(out / "tradeoff.json", document(found))
 
 
-def pareto_plot(comparison: Comparison) -> bytes:
+def pareto_plot(comparison: SensorComparison) -> bytes:
     """A PNG: error against CPU time.
 
     Settings that miss or add too many returns are not drawn, see `words.reached`.
@@ -241,7 +241,7 @@ def pareto_plot(comparison: Comparison) -> bytes:
         if math.isfinite(reached(comparison, row)):
             name = row.label.partition(" (")[0]
             cpu, away = (cost.low, cost.high), (error.low, error.high)
-            points.append(Point(name, cost.value, error.value, row in best, cpu, away))
+            points.append(ChartPoint(name, cost.value, error.value, row in best, cpu, away))
     left_out = f"; {hidden} settings that miss or add returns are not drawn" if hidden else ""
     axes = Axes(
         headline(comparison) + left_out,
@@ -252,7 +252,7 @@ def pareto_plot(comparison: Comparison) -> bytes:
     return scatter(points, axes)
 
 
-def _page(found: Tradeoff, plots: Sequence[bytes]) -> bytes:
+def _page(found: DriveTradeoff, plots: Sequence[bytes]) -> bytes:
     """A self-contained HTML page."""
     parts = []
     for comparison, plot in zip(found.comparisons, plots, strict=True):

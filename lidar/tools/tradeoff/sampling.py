@@ -17,7 +17,7 @@ from lidar.sensors.physics.settings import MOST_RAYS, ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan, schedule
-from lidar.tools.tradeoff.errors import Returns
+from lidar.tools.tradeoff.errors import PulseReturns
 from lidar.tools.tradeoff.simulate import EXACT, FAST, Bench, chosen_pulses, returns_of, spread_frames
 from lidar.tools.tradeoff.variants import noiseless, reference
 
@@ -89,7 +89,7 @@ class SampledError:
     returns: float
 
 
-def sampled_error(found: Returns, *, exact: Returns, weights: Float) -> SampledError:
+def sampled_error(found: PulseReturns, *, exact: PulseReturns, weights: Float) -> SampledError:
     """Differences between the returns of the same pulses; ``weights`` are by row of a pulse in its frame."""
     _, a, b = np.intersect1d(found.key, exact.key, assume_unique=True, return_indices=True)
     of_found, of_exact = (weights[returns.key // 256] for returns in (found, exact))
@@ -131,7 +131,7 @@ def _returns(
     settings: ScannerSettings,
     pulses: NDArray[np.int64],
     backend: str = FAST,
-) -> Returns:
+) -> PulseReturns:
     """Returns of some pulses of a frame; of the reference's backend, in the whole world."""
     near = bench.plan.options.contents().world
     around = near if backend == FAST else replace(near, origin="near", reach=inf)
@@ -147,7 +147,7 @@ def _returns(
 
 
 def _stratified(
-    pulses: NDArray[np.int64], looks: Sequence[Returns], *, count: int, rng: np.random.Generator
+    pulses: NDArray[np.int64], looks: Sequence[PulseReturns], *, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float]:
     """Pulses to compare of some that were cast with different rays, and weights (count,) by row of a pulse.
 

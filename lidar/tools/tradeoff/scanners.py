@@ -14,15 +14,15 @@ from lidar.options import TradeoffOptions
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Scanner
 from lidar.sensors.rig.scanner import firings
-from lidar.tools.tradeoff.comparison import Comparison
+from lidar.tools.tradeoff.comparison import SensorComparison
 from lidar.tools.tradeoff.costs import costs
-from lidar.tools.tradeoff.errors import STATISTICS, FrameError, Returns, estimates, frame_error
+from lidar.tools.tradeoff.errors import STATISTICS, FrameDifferences, PulseReturns, estimates, frame_error
 from lidar.tools.tradeoff.notes import Notes
 from lidar.tools.tradeoff.simulate import EXACT, FAST, Bench, chosen_pulses, frame_cost, returns_of
 from lidar.tools.tradeoff.variants import (
     OF_EMBREE,
     SCANNER_VALUES,
-    Variant,
+    SettingVariant,
     next_step,
     scanner_basis,
     scanner_variants,
@@ -34,7 +34,7 @@ from lidar.world.settings import WorldSettings
 
 def compared_scanner(
     bench: Bench, scanner: Scanner, *, compared: TradeoffOptions, scenes: Sequence[str], progress: Progress
-) -> Comparison:
+) -> SensorComparison:
     """The comparison of a scanner; ``scenes`` are labels of the scenes after the first."""
     plan, contents = bench.plan, bench.plan.options.contents()
     basis = scanner_basis(
@@ -46,9 +46,9 @@ def compared_scanner(
     frames = bench.frames[scanner.name]
     per_frame = -(-compared.pulses // len(frames))
     finer = replace(basis.exact, rays=next_step(basis.exact.rays))
-    used: list[list[FrameError]] = [[] for _ in variants]
-    alone: list[list[FrameError]] = [[] for _ in variants]
-    residual: list[FrameError] = []
+    used: list[list[FrameDifferences]] = [[] for _ in variants]
+    alone: list[list[FrameDifferences]] = [[] for _ in variants]
+    residual: list[FrameDifferences] = []
     notes = Notes(bench, scanner, variants=variants)
     pulses = 0
     for k, frame in enumerate(frames):
@@ -85,7 +85,7 @@ def compared_scanner(
         alone=[figures(errors) for errors in alone],
         spent=spent,
     )
-    return Comparison(
+    return SensorComparison(
         f"{scanner.name} ({scanner.spec.preset})",
         f"float64 ray casting, {basis.exact.rays} rays per pulse, a pose for every firing; 1.5 times as many"
         " rays",
@@ -104,7 +104,7 @@ class _Look:
     scanner: Scanner
     frame: int
     pulses: NDArray[np.int64]
-    _known: dict[tuple[tuple[str, object], ...], Returns] = field(default_factory=dict)
+    _known: dict[tuple[tuple[str, object], ...], PulseReturns] = field(default_factory=dict)
 
     def returns(
         self,
@@ -114,7 +114,7 @@ class _Look:
         scene: int = 0,
         traffic: bool = True,
         world: WorldSettings = WHOLE,
-    ) -> Returns:
+    ) -> PulseReturns:
         """The returns of these pulses."""
         around = self.bench.world(
             self.scanner, self.frame, backend=backend, scene=scene, traffic=traffic, settings=world
@@ -128,7 +128,7 @@ class _Look:
             pulses=self.pulses,
         )
 
-    def used(self, variant: Variant[ScannerSettings]) -> Returns:
+    def used(self, variant: SettingVariant[ScannerSettings]) -> PulseReturns:
         """The returns with the user's settings, changed as in a variant."""
         if variant.changes not in self._known:
             self._known[variant.changes] = self.returns(
@@ -140,7 +140,7 @@ class _Look:
             )
         return self._known[variant.changes]
 
-    def alone(self, variant: Variant[ScannerSettings]) -> Returns:
+    def alone(self, variant: SettingVariant[ScannerSettings]) -> PulseReturns:
         """The returns of the reference, changed as in a variant."""
         return self.returns(
             variant.alone,
@@ -151,5 +151,5 @@ class _Look:
         )
 
 
-def _equal(one: Returns, other: Returns) -> bool:
+def _equal(one: PulseReturns, other: PulseReturns) -> bool:
     return np.array_equal(one.key, other.key) and np.array_equal(one.xyz, other.xyz)

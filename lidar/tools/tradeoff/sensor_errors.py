@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from geoscene.drawing.figures import metres, share
-from lidar.options import Accuracy
-from lidar.tools.tradeoff.errors import Estimate
+from lidar.options import AccuracyTarget
+from lidar.tools.tradeoff.errors import ErrorEstimate
 from lidar.tools.tradeoff.words import LOST, levels
 
 
@@ -24,10 +24,10 @@ class SensorErrors:
     """
 
     percent: float
-    ranges: dict[str, Estimate] = field(default_factory=dict)
-    depths: dict[str, Estimate] = field(default_factory=dict)
-    colours: dict[str, Estimate] = field(default_factory=dict)
-    lost: dict[str, Estimate] = field(default_factory=dict)
+    ranges: dict[str, ErrorEstimate] = field(default_factory=dict)
+    depths: dict[str, ErrorEstimate] = field(default_factory=dict)
+    colours: dict[str, ErrorEstimate] = field(default_factory=dict)
+    lost: dict[str, ErrorEstimate] = field(default_factory=dict)
 
     def to_json(self, prefix: str) -> dict[str, Any]:
         """The errors that there are, such as ``expected_error_m``, for a prefix."""
@@ -42,7 +42,7 @@ class SensorErrors:
         """The errors of `to_json`; raises KeyError, TypeError or ValueError for others."""
         every = {
             kind: {
-                sensor: Estimate.from_json(error)
+                sensor: ErrorEstimate.from_json(error)
                 for sensor, error in document.get(f"{prefix}_{name}", {}).items()
             }
             for kind, name in _KEYS.items()
@@ -60,7 +60,7 @@ class SensorErrors:
         ]
         return ", ".join(filter(None, texts)) or "no errors are known"
 
-    def beyond(self, asked: Accuracy) -> list[str]:
+    def beyond(self, asked: AccuracyTarget) -> list[str]:
         """Those that are larger than what was asked for, in words."""
         lengths = {name: e for name, e in (self.ranges | self.depths).items() if e.value > asked.metres > 0}
         colours = {name: e for name, e in self.colours.items() if e.value > asked.levels > 0}
@@ -73,17 +73,17 @@ class SensorErrors:
 _KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels", "lost": "lost"}
 
 
-def error_text(error: Estimate, *, size: Callable[[float], str] = metres) -> str:
+def error_text(error: ErrorEstimate, *, size: Callable[[float], str] = metres) -> str:
     """An error with its interval."""
     return f"{size(error.value)} ({size(error.low)} to {size(error.high)})"
 
 
-def _listed(errors: Mapping[str, Estimate], *, size: Callable[[float], str] = metres) -> str:
+def _listed(errors: Mapping[str, ErrorEstimate], *, size: Callable[[float], str] = metres) -> str:
     return ", ".join(f"{error_text(error, size=size)} for {name}" for name, error in errors.items())
 
 
 def stated(
-    errors: Mapping[str, Mapping[str, Estimate]], *, percent: float, kinds: Collection[str]
+    errors: Mapping[str, Mapping[str, ErrorEstimate]], *, percent: float, kinds: Collection[str]
 ) -> SensorErrors:
     """Of all figures of sensors, by their names, those of some kinds: ranges, depths and colours."""
     names = {"ranges": f"range_{percent:g}_m", "depths": f"depth_{percent:g}_m", "colours": "rgb_rms"}
@@ -96,7 +96,7 @@ def stated(
     return SensorErrors(percent, **found, lost={s: share for s, share in lost.items() if share.value > LOST})
 
 
-def kinds_of(asked: Accuracy | None) -> tuple[str, ...]:
+def kinds_of(asked: AccuracyTarget | None) -> tuple[str, ...]:
     """Kinds of errors that are stated for an accuracy, or for a drive for which none was asked."""
     if asked is None:
         return ("ranges", "colours")

@@ -15,13 +15,13 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import cloud_table, records
 from lidar.sensors.camera.sun import sun_direction
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.laser.scan import Detection, Sweep, cast, detect, deviates_of, report
+from lidar.sensors.laser.scan import DetectedEchoes, Sweep, cast, detect, deviates_of, report
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan
 from lidar.simulation.signals import lamps_at
-from lidar.tools.tradeoff.errors import Returns
+from lidar.tools.tradeoff.errors import PulseReturns
 from lidar.tools.tradeoff.images import Shot
 from lidar.tools.tradeoff.variants import noiseless
 from lidar.world.actors import actor_shapes, actor_transforms
@@ -134,7 +134,7 @@ def swept(
     settings: ScannerSettings,
     pulses: NDArray[np.int64] | None = None,
     threads: int = 1,
-) -> tuple[Sweep, Detection]:
+) -> tuple[Sweep, DetectedEchoes]:
     """Pulses of a frame and what the scanner detects."""
     sweep = cast(
         scanner.sensor,
@@ -159,7 +159,7 @@ def returns_of(
     settings: ScannerSettings,
     pulses: NDArray[np.int64],
     threads: int = 1,
-) -> Returns:
+) -> PulseReturns:
     """Returns of some pulses of a frame, placed in the scene in float64."""
     sweep, found = swept(
         plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses, threads=threads
@@ -173,11 +173,11 @@ def returns_of(
     )
     first = np.searchsorted(rows, rows)  # rows are sorted by pulse and range
     key = 256 * pulses[rows] + np.arange(len(rows)) - first
-    return Returns(key, found.range, found.echoes.klass, placed)
+    return PulseReturns(key, found.range, found.echoes.klass, placed)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class SimulatedFrame:
     """A frame of a scanner without noise, with one ray per pulse; n returns.
 
     cloud   : as the sensor reports it, float32
@@ -196,7 +196,7 @@ class Measured:
     range: Float
 
 
-def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1) -> Measured:
+def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1) -> SimulatedFrame:
     """Every n-th pulse of a frame."""
     plan = bench.plan
     settings = replace(noiseless(plan.options.contents().scanner), rays=1)
@@ -212,7 +212,7 @@ def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1
         plan.trajectory.place(xyz, time_ns, translation=mount.translation, rotation=mount.rotation)
         for xyz in (exact, origin)
     )
-    return Measured(report(sweep, found), time_ns, exact, placed, start, away)
+    return SimulatedFrame(report(sweep, found), time_ns, exact, placed, start, away)
 
 
 def frame_cost(

@@ -10,7 +10,7 @@ from typing import Any
 from geoscene.support.progress import Progress, silent
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.errors import Estimate, resampled
+from lidar.tools.tradeoff.errors import ErrorEstimate, resampled
 from lidar.tools.tradeoff.profile_errors import blocks_of, measuring
 from lidar.tools.tradeoff.sampled_images import image_errors_of, image_figures
 from lidar.tools.tradeoff.sampling import errors_of, places, range_figures
@@ -32,7 +32,7 @@ class SpotCheck:
 
     percent: float
     kinds: Collection[str]
-    errors: dict[str, dict[str, Estimate]]
+    errors: dict[str, dict[str, ErrorEstimate]]
     frames: dict[str, int]
 
     @property

@@ -80,7 +80,7 @@ S = TypeVar("S", ScannerSettings, CameraSettings)
 
 
 @dataclass(frozen=True, slots=True)
-class Variant(Generic[S]):
+class SettingVariant(Generic[S]):
     """One row of a comparison of settings of a scanner or a camera.
 
     changes : name and value of each setting that is changed; empty for the user's own settings
@@ -137,11 +137,11 @@ class Basis(Generic[S]):
 
     def variant(
         self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
-    ) -> Variant[S]:
+    ) -> SettingVariant[S]:
         """The variant with some settings changed."""
         changes = tuple(changes)
         values = dict(changes)
-        return Variant(
+        return SettingVariant(
             changes,
             _changed(self.used, values),
             _changed(self.exact, values),
@@ -228,7 +228,7 @@ def scanner_variants(
     compared: Sequence[str] = (),
     scenes: Sequence[str] = (),
     traffic: bool = False,
-) -> list[Variant[ScannerSettings]]:
+) -> list[SettingVariant[ScannerSettings]]:
     """The user's settings, these with one of them changed, and combinations of cheap ones.
 
     compared : names of settings; all by default
@@ -267,7 +267,7 @@ def camera_variants(
     compared: Sequence[str] = (),
     scenes: Sequence[str] = (),
     traffic: bool = False,
-) -> list[Variant[CameraSettings]]:
+) -> list[SettingVariant[CameraSettings]]:
     """As `scanner_variants`, of a camera."""
     return _variants(
         basis,
@@ -287,7 +287,7 @@ def _variants(
     scenes: Sequence[str],
     traffic: bool,
     cheaper: Sequence[Sequence[tuple[str, Any]]],
-) -> list[Variant[S]]:
+) -> list[SettingVariant[S]]:
     """Variants of settings of a sensor, whose first one counts its rays, and of the world."""
     chosen = {n: v for n, v in {**values, **WORLD_VALUES}.items() if not compared or n in compared}
     rows = [basis.variant()]
@@ -314,7 +314,7 @@ def _variants(
     return rows
 
 
-def without_each(basis: Basis[S], variant: Variant[S]) -> Iterator[tuple[str, Variant[S]]]:
+def without_each(basis: Basis[S], variant: SettingVariant[S]) -> Iterator[tuple[str, SettingVariant[S]]]:
     """Each change of a variant, as text, and the variant without it."""
     for k, (name, value) in enumerate(variant.changes):
         rest = variant.changes[:k] + variant.changes[k + 1 :]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf
 
 from geoscene.drawing.figures import metres, share
-from lidar.tools.tradeoff.comparison import Comparison, Kind, Row
+from lidar.tools.tradeoff.comparison import Kind, SensorComparison, VariantRow
 
 TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera": (1.0, 3.0, 10.0)}
 """Errors for which a setting is recommended: metres at 99.9 %, and levels of 255 rms."""
@@ -29,17 +29,17 @@ def size_of(error: float, kind: Kind) -> str:
     return metres(error) if kind == "scanner" else levels(error)
 
 
-def candidates(comparison: Comparison) -> list[Row]:
+def candidates(comparison: SensorComparison) -> list[VariantRow]:
     """Rows that are choices for a drive in this world: not those of another model, scene or traffic."""
     return [row for row in comparison.rows if row.choice]
 
 
-def pareto(comparison: Comparison) -> list[Row]:
+def pareto(comparison: SensorComparison) -> list[VariantRow]:
     """Choices of which no other is both cheaper and at least as exact (see `reached`), the cheapest first.
 
     Settings that miss or add more than `LOST` of the returns are left out.
     """
-    best: list[Row] = []
+    best: list[VariantRow] = []
     ranked = [(row.cost["cpu_s"].value, reached(comparison, row), row) for row in candidates(comparison)]
     for _, error, row in sorted(ranked, key=lambda r: r[:2]):
         if error < (reached(comparison, best[-1]) if best else inf):
@@ -47,7 +47,7 @@ def pareto(comparison: Comparison) -> list[Row]:
     return best
 
 
-def reached(comparison: Comparison, row: Row) -> float:
+def reached(comparison: SensorComparison, row: VariantRow) -> float:
     """The error by which a row is ranked: the upper end of its interval.
 
     inf if more than `LOST` of the returns are missed or extra.
@@ -57,7 +57,7 @@ def reached(comparison: Comparison, row: Row) -> float:
     return row.error[comparison.tail].high
 
 
-def recommendation(comparison: Comparison, target: float) -> str:
+def recommendation(comparison: SensorComparison, target: float) -> str:
     """The cheapest setting that is sure to reach an error (see `TARGETS`), or that none is."""
     kind, rows = comparison.kind, pareto(comparison)
     wanted = f"For {size_of(target, kind)} {'at 99.9 %' if kind == 'scanner' else 'rms'}"
@@ -86,12 +86,12 @@ def recommendation(comparison: Comparison, target: float) -> str:
     )
 
 
-def recommendations(comparison: Comparison) -> list[str]:
+def recommendations(comparison: SensorComparison) -> list[str]:
     """A sentence for each of `TARGETS`."""
     return [recommendation(comparison, target) for target in TARGETS[comparison.kind]]
 
 
-def tail_text(comparison: Comparison) -> str:
+def tail_text(comparison: SensorComparison) -> str:
     """That the errors at 99.9 % are those of a few pulses; empty for enough of them."""
     if comparison.kind != "scanner" or comparison.samples >= _ENOUGH:
         return ""
@@ -103,7 +103,7 @@ def tail_text(comparison: Comparison) -> str:
     )
 
 
-def residual_text(comparison: Comparison) -> str:
+def residual_text(comparison: SensorComparison) -> str:
     """How far the reference has converged."""
     gap = comparison.residual
     if comparison.kind == "scanner":

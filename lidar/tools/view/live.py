@@ -34,13 +34,13 @@ _QUALITY = 85
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class LiveTarget:
     """Where a drive is shown: in the file, or in a viewer without one."""
 
     file: Path | None
 
 
-def live_target(words: Sequence[str] | None, *, overwrite: bool) -> Target | None:
+def live_target(words: Sequence[str] | None, *, overwrite: bool) -> LiveTarget | None:
     """Where the words of an option show a drive; None without the option.
 
     Raises InputError for other words than a free file name that ends with .rrd, and MissingExtraError without
@@ -57,11 +57,11 @@ def live_target(words: Sequence[str] | None, *, overwrite: bool) -> Target | Non
     file = Path(words[0]) if words else None
     if file is not None and file.exists() and not overwrite:
         raise InputError(f"`live` {file}: exists already; give another name, or set `overwrite`")
-    return Target(file)
+    return LiveTarget(file)
 
 
 @contextmanager
-def opened_live(target: Target | None) -> Iterator[Live | None]:
+def opened_live(target: LiveTarget | None) -> Iterator[Live | None]:
     """Yield what `simulation.drive.drive` shows frames with; None without a target. A file is written whole.
 
     Raises LidarError if no viewer opens.

@@ -17,7 +17,7 @@ from geoscene.classes import materials
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
 from geoscene.geometry.watertight import validate_mesh
-from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.sources.data import Area, OsmData, TaggedNode, Way
 
 FRAME = Frame.at(8.7, 49.4)
 GLASS = materials()["glass"].code
@@ -35,7 +35,9 @@ def house(number, shape, **tags):
 
 def node(xy, number=1, **tags):
     lon, lat = lonlat([xy])[0]
-    return Point(f"node/{number}", {key.replace("__", ":"): value for key, value in tags.items()}, lon, lat)
+    return TaggedNode(
+        f"node/{number}", {key.replace("__", ":"): value for key, value in tags.items()}, lon, lat
+    )
 
 
 def entrance(xy, kind="yes"):

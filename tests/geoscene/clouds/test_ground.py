@@ -4,8 +4,15 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.clouds.ground import MARGIN, Grid, bridged, bridged_by_blocks, ground_heights, ground_returns
-from geoscene.clouds.spool import Points
+from geoscene.clouds.ground import (
+    MARGIN,
+    CloudGrid,
+    bridged,
+    bridged_by_blocks,
+    ground_heights,
+    ground_returns,
+)
+from geoscene.clouds.spool import SurveyPoints
 
 
 def sloping(gradient, *, azimuth, seed, wave=0.0, noise=0.03):
@@ -21,10 +28,10 @@ def sloping(gradient, *, azimuth, seed, wave=0.0, noise=0.03):
 
 
 def of(xyz):
-    return Points(xyz, np.zeros(len(xyz), np.uint8), np.ones(len(xyz), bool))
+    return SurveyPoints(xyz, np.zeros(len(xyz), np.uint8), np.ones(len(xyz), bool))
 
 
-GRID = Grid(0.0, 0.0, 90, 90, 1.0)
+GRID = CloudGrid(0.0, 0.0, 90, 90, 1.0)
 
 
 FEW = settings(max_examples=6, deadline=None)
@@ -70,7 +77,7 @@ def test_classified_ground_is_used_as_it_is():
     xyz, height = sloping(0.2, azimuth=1.0, seed=2)
     klass = np.where(np.arange(len(xyz)) % 4 == 0, 2, 1).astype(np.uint8)
     xyz[klass == 1, 2] += 0.4  # low vegetation that no filter tells from the ground
-    points = Points(xyz, klass, np.ones(len(xyz), bool))
+    points = SurveyPoints(xyz, klass, np.ones(len(xyz), bool))
     found = ground_heights(points, GRID, classified=True, built=np.zeros(GRID.shape, bool))
     east, north = GRID.centres()
     assert np.nanpercentile(np.abs(found - height(east, north)), 99) < 0.1

@@ -7,7 +7,7 @@ from pyproj import CRS
 from scipy.spatial import cKDTree
 
 from geoscene.clouds.read import open_cloud
-from geoscene.clouds.spool import Points, spool_clouds, without_outliers
+from geoscene.clouds.spool import SurveyPoints, spool_clouds, without_outliers
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 
@@ -122,7 +122,7 @@ def test_birds_and_low_noise_are_left_out_and_nothing_else():
     ground = rng.uniform((0, 0, 0), (60, 60, 0.1), (4000, 3))
     birds = np.array([[10, 10, 50], [30, 40, -20], [31, 40.5, -20.2]], float)
     xyz = np.concatenate([ground, birds])
-    points = Points(xyz, np.zeros(len(xyz), np.uint8), np.ones(len(xyz), bool))
+    points = SurveyPoints(xyz, np.zeros(len(xyz), np.uint8), np.ones(len(xyz), bool))
     assert np.array_equal(without_outliers(points).xyz, ground)
 
 

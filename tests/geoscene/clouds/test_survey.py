@@ -17,7 +17,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline.build import build
-from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.sources.data import Area, OsmData, TaggedNode, Way
 from geoscene.support.files import digest_of
 
 CENTRE = (9.5, 47.1)
@@ -77,7 +77,7 @@ def village_map(*, tags=None):
     east, north = FRAME.to_geographic(50, 50)
     middle = (float(west + east) / 2, float(south + north) / 2)
     bounds = (middle[0] - 0.0007, middle[1] - 0.00045, middle[0] + 0.0007, middle[1] + 0.00045)
-    tree = Point("node/1", {"natural": "tree"}, float(lon), float(lat))
+    tree = TaggedNode("node/1", {"natural": "tree"}, float(lon), float(lat))
     return OsmData(bounds, [], areas, [tree], [], source="village")
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from geoscene.clouds.ground import Grid
+from geoscene.clouds.ground import CloudGrid
 from geoscene.clouds.trees import find_trees
 
-GRID = Grid(0.0, 0.0, 120, 120, 0.5)
+GRID = CloudGrid(0.0, 0.0, 120, 120, 0.5)
 CROWNS = {(15.0, 15.0): (12.0, 8.0), (45.0, 15.0): (7.0, 4.5), (24.5, 17.0): (10.0, 7.0)}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageFont
 
 from geoscene.drawing.canvas import drawable
-from geoscene.drawing.charts import Axes, Point, scatter
+from geoscene.drawing.charts import Axes, ChartPoint, scatter
 from geoscene.drawing.figures import metres, share
 
 RED = (200, 60, 40)
@@ -34,8 +34,8 @@ def test_the_font_of_pictures_has_every_letter_of_lengths():
 
 
 def test_intervals_are_lines_within_the_axes():
-    plain = red_box(Point("a", 2.0, 0.1, True))
-    wide = red_box(Point("a", 2.0, 0.1, True, (1.0, 30.0), (0.0, 0.4)))
+    plain = red_box(ChartPoint("a", 2.0, 0.1, True))
+    wide = red_box(ChartPoint("a", 2.0, 0.1, True, (1.0, 30.0), (0.0, 0.4)))
     assert (plain[2] - plain[0], plain[3] - plain[1]) == (8, 8)
     assert wide[2] - wide[0] > 500
     assert 90 <= wide[0] < wide[2] <= 970

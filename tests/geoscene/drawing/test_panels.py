@@ -12,7 +12,7 @@ from PIL import Image
 from geoscene.drawing.axes import Axis, linear_axis, log_axis
 from geoscene.drawing.canvas import Canvas
 from geoscene.drawing.charts import Axes
-from geoscene.drawing.panels import Band, Panel, Raster, Series, figure
+from geoscene.drawing.panels import Panel, Raster, Series, ShadedBand, figure
 
 NUMBERS = st.floats(-1e6, 1e6).filter(lambda v: v == 0 or abs(v) > 1e-6)
 RED = (200, 60, 40)
@@ -69,7 +69,7 @@ def test_a_line_is_at_the_same_pixels_in_png_and_svg():
 def test_gaps_break_lines_and_bands():
     gap = math.nan
     points = [(0, 1), (1, 2), (2, gap), (3, 2), (4, 1)]
-    band = Band("b", [(x, -y, y) for x, y in points])
+    band = ShadedBand("b", [(x, -y, y) for x, y in points])
     canvas = figure([Panel(TEXTS, [Series("a", points)], x_log=False, y_log=False, bands=[band])])
     assert [len(line) for line in polylines(canvas, "a")] == [2, 2]
     assert canvas.svg().decode().count('<polygon data-name="b"') == 2

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from PIL import Image
 
-from geoscene.drawing.previews import PAPER, Plan, card
+from geoscene.drawing.previews import PAPER, PreviewPlan, card
 
 RED, BLUE = (200, 0, 0), (0, 0, 200)
 
@@ -24,7 +24,7 @@ def at(image, bounds, xy):
 
 def test_courtyards_stay_open_and_north_is_up():
     bounds = (100.0, 50.0, 200.0, 150.0)
-    plan = Plan(bounds, PAPER)
+    plan = PreviewPlan(bounds, PAPER)
     ring = shapely.box(110, 90, 190, 140).difference(shapely.box(130, 100, 150, 120))
     plan.polygons([shapely.MultiPolygon([ring]), shapely.Point(120, 60)], RED)
     image = pixels(plan.png())
@@ -33,7 +33,7 @@ def test_courtyards_stay_open_and_north_is_up():
 
 
 def test_the_higher_of_two_points_is_seen():
-    plan = Plan((0.0, 0.0, 10.0, 20.0), PAPER)
+    plan = PreviewPlan((0.0, 0.0, 10.0, 20.0), PAPER)
     xyz = [[5.0, 5.0, 3.0], [5.0, 5.0, 1.0], [2.0, 15.0, 0.0], [99.0, 5.0, 0.0]]
     plan.points(xyz, np.array([RED, BLUE, BLUE, RED], np.uint8))
     image = pixels(plan.png())

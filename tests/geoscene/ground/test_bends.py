@@ -7,14 +7,14 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.ground.faces import Faces, faces
+from geoscene.ground.faces import GroundFaces, faces
 
 SIDE = 12
 corner = st.tuples(st.integers(-3, SIDE + 3), st.integers(-3, SIDE + 3))
 outline = st.lists(corner, min_size=2, max_size=9, unique=True)
 
 
-def of(outlines: list[list[tuple[int, int]]]) -> Faces:
+def of(outlines: list[list[tuple[int, int]]]) -> GroundFaces:
     lines = [shapely.box(0, 0, SIDE, SIDE).exterior, *map(shapely.LineString, outlines)]
     noded = shapely.get_parts(shapely.union_all(lines, grid_size=1.0))
     segments = np.concatenate(
@@ -26,7 +26,7 @@ def of(outlines: list[list[tuple[int, int]]]) -> Faces:
     return faces(points, ends, rank=np.arange(ends.size).reshape(-1, 2).T, box=box)
 
 
-def assert_as_geos(found: Faces, bend: float) -> None:
+def assert_as_geos(found: GroundFaces, bend: float) -> None:
     expected = shapely.coverage_simplify(found.polygons(), bend, simplify_boundary=False)
     assert shapely.to_wkt(found.simplified(bend)).tolist() == shapely.to_wkt(expected).tolist()
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.errors import GeosceneError
-from geoscene.ground.faces import Faces, faces
+from geoscene.ground.faces import GroundFaces, faces
 
 SIDE = 12
 BOX = (0.0, 0.0, float(SIDE), float(SIDE))
@@ -19,7 +19,7 @@ corner = st.tuples(st.integers(-3, SIDE + 3), st.integers(-3, SIDE + 3))
 outline = st.lists(corner, min_size=2, max_size=6, unique=True)
 
 
-def of(lines: list[shapely.LineString]) -> Faces:
+def of(lines: list[shapely.LineString]) -> GroundFaces:
     noded = shapely.get_parts(shapely.union_all(lines, grid_size=1.0))
     segments = np.concatenate(
         [np.stack([c[:-1], c[1:]], axis=1) for c in map(shapely.get_coordinates, noded)]

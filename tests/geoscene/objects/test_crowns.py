@@ -16,7 +16,7 @@ from geoscene.objects.forests import Forests, forest_trees
 from geoscene.objects.shapes import LEAF_AREA_DENSITY, leaf_area_density, shapes
 from geoscene.objects.solids import lathe
 from geoscene.objects.vegetation import CROWN, read_trees, tree_instances
-from geoscene.sources.data import OsmData, Point
+from geoscene.sources.data import OsmData, TaggedNode
 
 FRAME = Frame.at(11.0, 50.0)
 
@@ -27,7 +27,9 @@ def volume(points, faces):
 
 
 def trees_of(*tags, relief=True):
-    points = [Point(f"node/{k}", {"natural": "tree", **t}, 11.0 + k / 1000, 50.0) for k, t in enumerate(tags)]
+    points = [
+        TaggedNode(f"node/{k}", {"natural": "tree", **t}, 11.0 + k / 1000, 50.0) for k, t in enumerate(tags)
+    ]
     return read_trees(OsmData((10.9, 49.9, 11.1, 50.1), [], [], points, []), FRAME, relief=relief)[0]
 
 

@@ -15,7 +15,7 @@ from geoscene.objects.barriers import barrier_meshes, open_barriers, read_barrie
 from geoscene.objects.furniture import furniture_instances, read_furniture, shape_of
 from geoscene.objects.shapes import shapes
 from geoscene.sources import read_osm
-from geoscene.sources.data import Area, OsmData, Point, Way
+from geoscene.sources.data import Area, OsmData, TaggedNode, Way
 from geoscene.structures.ground_contact import OPENING
 
 FRAME = Frame.at(9.0, 50.0)
@@ -29,7 +29,7 @@ def lonlat(xy):
 
 def node(number, xy, **tags):
     lon, lat = lonlat(xy)[0]
-    return Point(f"node/{number}", tags, lon, lat)
+    return TaggedNode(f"node/{number}", tags, lon, lat)
 
 
 def way(number, xy, nodes=None, **tags):
@@ -38,8 +38,8 @@ def way(number, xy, nodes=None, **tags):
 
 
 def osm_of(*features):
-    kinds = {kind: [f for f in features if isinstance(f, kind)] for kind in (Way, Area, Point)}
-    return OsmData((8.9, 49.9, 9.1, 50.1), kinds[Way], kinds[Area], kinds[Point], [])
+    kinds = {kind: [f for f in features if isinstance(f, kind)] for kind in (Way, Area, TaggedNode)}
+    return OsmData((8.9, 49.9, 9.1, 50.1), kinds[Way], kinds[Area], kinds[TaggedNode], [])
 
 
 def plan_with(roads=(), houses=(), mouths=()):

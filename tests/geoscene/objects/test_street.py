@@ -21,7 +21,7 @@ from geoscene.objects.street_shapes import street_shapes
 from geoscene.options import BuildOptions
 from geoscene.pipeline.plan import make_plan
 from geoscene.sources import read_osm
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 from geoscene.support.progress import silent
 
 FRAME = Frame.at(11.0, 50.0)
@@ -33,7 +33,7 @@ def lonlat_of(*xy):
 
 
 def osm_of(*points, ways=()):
-    nodes = [Point(f"node/{k}", tags, *lonlat_of(xy)[0]) for k, (xy, tags) in enumerate(points)]
+    nodes = [TaggedNode(f"node/{k}", tags, *lonlat_of(xy)[0]) for k, (xy, tags) in enumerate(points)]
     return OsmData((10.99, 49.99, 11.01, 50.01), list(ways), [], nodes, [])
 
 

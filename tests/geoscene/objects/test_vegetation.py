@@ -12,14 +12,15 @@ from geoscene.geometry.mesh import Mesh
 from geoscene.ground import Layers, building_pads, plan_ground
 from geoscene.objects.shapes import LEAF_AREA_DENSITY, place, shapes
 from geoscene.objects.vegetation import clear_of, read_trees, tree_instances
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 
 FRAME = Frame.at(11.0, 50.0)
 
 
 def osm_of(trees=(), ways=()):
     points = [
-        Point(f"node/{k}", {"natural": "tree", **tags}, *lonlat) for k, (lonlat, tags) in enumerate(trees)
+        TaggedNode(f"node/{k}", {"natural": "tree", **tags}, *lonlat)
+        for k, (lonlat, tags) in enumerate(trees)
     ]
     return OsmData((10.9, 49.9, 11.1, 50.1), list(ways), [], points, [])
 

@@ -11,7 +11,7 @@ from geoscene.objects.wires import read_wires, wire_instances
 from geoscene.options import BuildOptions
 from geoscene.pipeline.plan import make_plan
 from geoscene.sources import read_osm
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 from geoscene.support.progress import silent
 
 FRAME = Frame.at(11.0, 50.0)
@@ -23,7 +23,7 @@ def line_of(tags, *xy, poles=True):
     lonlat = np.column_stack(FRAME.to_geographic(*np.array(xy, float).T))
     nodes = np.arange(1, len(xy) + 1)
     points = [
-        Point(f"node/{n}", {"power": "pole"}, *at) for n, at in zip(nodes, lonlat, strict=True) if poles
+        TaggedNode(f"node/{n}", {"power": "pole"}, *at) for n, at in zip(nodes, lonlat, strict=True) if poles
     ]
     return OsmData((10.9, 49.9, 11.1, 50.1), [Way("way/3", tags, nodes, lonlat)], [], points, [])
 

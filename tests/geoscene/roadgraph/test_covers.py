@@ -8,7 +8,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.ground.layers import COVERS, GULLIES, PATCHES
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.covers import cover_rows
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 
 FRAME = Frame.at(10.0, 50.0)
 STREET = {"highway": "residential", "width": "8", "sidewalk": "left"}
@@ -26,7 +26,7 @@ def covers(ways, points=(), *, guess=True):
         )
         for number, (tags, xy) in ways.items()
     ]
-    nodes = [Point(f"node/{k}", tags, *FRAME.to_geographic(*xy)) for k, (tags, xy) in enumerate(points)]
+    nodes = [TaggedNode(f"node/{k}", tags, *FRAME.to_geographic(*xy)) for k, (tags, xy) in enumerate(points)]
     osm = OsmData(bounds=(9.9, 49.9, 10.1, 50.1), ways=roads, areas=[], points=nodes, relations=[])
     table = read_carriageways(osm, FRAME, sidewalks="mapped", left_hand=False)
     return cover_rows(osm, table, frame=FRAME, guess=guess), table

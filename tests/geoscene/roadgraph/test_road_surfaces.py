@@ -16,7 +16,7 @@ from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.surface_rows import GRID, SurfaceRows
 from geoscene.roadgraph.surfaces import SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.sources import read_osm
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 
 FRAME = Frame.at(10.0, 50.0)
 DEMO = Path(geoscene.__file__).parent / "demo" / "helsinki.osm.pbf"
@@ -32,7 +32,7 @@ def surfaces_of(places, ways, points=(), **options):
             for k, (tags, nodes) in enumerate(ways)
         ],
         areas=[],
-        points=[Point(f"node/{n}", tags, *lonlat[n]) for n, tags in points],
+        points=[TaggedNode(f"node/{n}", tags, *lonlat[n]) for n, tags in points],
         relations=[],
     )
     graph, _ = build_road_graph(osm, FRAME)

@@ -31,7 +31,7 @@ from geoscene.roadgraph.routing import (
 from geoscene.roadgraph.speeds import speed_limit
 from geoscene.roadgraph.tags import drivable, read_street
 from geoscene.sources import read_osm
-from geoscene.sources.data import OsmData, Point, Relation, Way
+from geoscene.sources.data import OsmData, Relation, TaggedNode, Way
 
 FRAME = Frame.at(10.0, 50.0)
 KMH = 1 / 3.6
@@ -54,7 +54,7 @@ def town(places, ways, points=(), relations=()):
             for k, (tags, nodes) in enumerate(ways)
         ],
         areas=[],
-        points=[Point(f"node/{n}", tags, *lonlat[n]) for n, tags in points],
+        points=[TaggedNode(f"node/{n}", tags, *lonlat[n]) for n, tags in points],
         relations=[Relation(f"relation/{k}", tags, members) for k, (tags, members) in enumerate(relations)],
     )
 

@@ -8,7 +8,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from geoscene.sources.rings import Assembly, Chain, assemble, close_cut_ring
+from geoscene.sources.rings import Assembly, RingMember, assemble, close_cut_ring
 
 
 @st.composite
@@ -31,7 +31,7 @@ def cities(draw):
     return blocks, rng
 
 
-def chains_of(blocks, rng) -> tuple[list[Chain], np.ndarray]:
+def chains_of(blocks, rng) -> tuple[list[RingMember], np.ndarray]:
     """The rings cut at random nodes into pieces of random direction, shuffled."""
     xy = []
     chains = []
@@ -44,7 +44,7 @@ def chains_of(blocks, rng) -> tuple[list[Chain], np.ndarray]:
             bounds = [0, *cuts.tolist(), len(nodes) - 1]
             for a, b in pairwise(bounds):
                 piece = nodes[a : b + 1]
-                chains.append(Chain(piece[::-1] if rng.random() < 0.5 else piece, inner))
+                chains.append(RingMember(piece[::-1] if rng.random() < 0.5 else piece, inner))
     order = rng.permutation(len(chains))
     return [chains[i] for i in order], np.array(xy)
 
@@ -68,7 +68,7 @@ def test_pieces_in_any_order_and_direction_make_the_area(city):
 def test_roles_do_not_matter_if_the_boundary_is_valid(city):
     blocks, rng = city
     chains, xy = chains_of(blocks, rng)
-    lied = [Chain(c.nodes, bool(rng.random() < 0.5)) for c in chains]
+    lied = [RingMember(c.nodes, bool(rng.random() < 0.5)) for c in chains]
     assert shapely.equals(assemble(lied, xy).geometry, area_of(blocks))
 
 
@@ -84,9 +84,9 @@ def test_a_member_listed_twice_counts_once(city):
 
 def test_an_inner_ring_that_equals_its_outer_ring_leaves_no_area():
     xy = np.array([(0, 0), (4, 0), (4, 4), (0, 4), (9, 9), (10, 9), (10, 10)], float)
-    outer = Chain(np.array([0, 1, 2, 3, 0]), inner=False)
-    same = Chain(np.array([2, 1, 0, 3, 2]), inner=True)
-    island = Chain(np.array([4, 5, 6, 4]), inner=False)
+    outer = RingMember(np.array([0, 1, 2, 3, 0]), inner=False)
+    same = RingMember(np.array([2, 1, 0, 3, 2]), inner=True)
+    island = RingMember(np.array([4, 5, 6, 4]), inner=False)
     assert assemble([outer, same], xy) == assemble([same, outer], xy) == Assembly(None, "both-roles")
     made = assemble([outer, same, island], xy)
     assert (made.geometry.area, made.reason) == (0.5, "both-roles")
@@ -113,9 +113,9 @@ def test_a_missing_piece_drops_only_its_ring(city):
 
 def test_holes_that_share_a_side_become_one():
     xy = np.array([(0, 0), (9, 0), (9, 9), (0, 9), (2, 2), (4, 2), (6, 2), (6, 4), (4, 4), (2, 4)], float)
-    outer = Chain(np.array([0, 1, 2, 3, 0]), inner=False)
-    left = Chain(np.array([4, 5, 8, 9, 4]), inner=True)
-    right = Chain(np.array([5, 6, 7, 8, 5]), inner=True)
+    outer = RingMember(np.array([0, 1, 2, 3, 0]), inner=False)
+    left = RingMember(np.array([4, 5, 8, 9, 4]), inner=True)
+    right = RingMember(np.array([5, 6, 7, 8, 5]), inner=True)
     made = assemble([outer, left, right], xy)
     assert made.reason == ""
     assert made.geometry.area == 81 - 8
@@ -124,7 +124,10 @@ def test_holes_that_share_a_side_become_one():
 
 def test_overlapping_outlines_are_united_not_cancelled():
     xy = np.array([(0, 0), (4, 0), (4, 4), (0, 4), (2, 2), (6, 2), (6, 6), (2, 6)], float)
-    one, two = Chain(np.array([0, 1, 2, 3, 0]), inner=False), Chain(np.array([4, 5, 6, 7, 4]), inner=False)
+    one, two = (
+        RingMember(np.array([0, 1, 2, 3, 0]), inner=False),
+        RingMember(np.array([4, 5, 6, 7, 4]), inner=False),
+    )
     made = assemble([one, two], xy)
     assert made.reason == "self-crossing"
     assert made.geometry.area == 16 + 16 - 4
@@ -132,7 +135,7 @@ def test_overlapping_outlines_are_united_not_cancelled():
 
 def test_open_boundary_has_no_area():
     xy = np.array([(0, 0), (4, 0), (4, 4)], float)
-    made = assemble([Chain(np.array([0, 1, 2]), inner=False)], xy)
+    made = assemble([RingMember(np.array([0, 1, 2]), inner=False)], xy)
     assert made.geometry is None
     assert made.reason == "open-ring"
 

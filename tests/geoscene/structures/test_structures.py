@@ -31,7 +31,14 @@ from geoscene.structures import (
     structure_meshes,
     within_extent,
 )
-from geoscene.structures.layered import PRECISION, Plan, cut_plan, half_edges, raise_shell, without_slivers
+from geoscene.structures.layered import (
+    PRECISION,
+    LayerTriangulation,
+    cut_plan,
+    half_edges,
+    raise_shell,
+    without_slivers,
+)
 
 FRAME = Frame.at(10.0, 50.0)
 SIZES = StructureOptions()
@@ -200,14 +207,14 @@ def test_a_thin_triangle_with_its_short_side_at_the_border_leaves_no_slit():
     rim = [(0, 0), (-2, 1), (-1179, 622), (-500, 1500), (900, 1200), (800, -300), (209, -112)]
     tip = len(rim)
     faces = np.array([(k, tip, (k + 1) % tip) for k in range(tip)])
-    plan = without_slivers(Plan(np.array([*rim, (213, -105)]) * PRECISION, faces))
+    plan = without_slivers(LayerTriangulation(np.array([*rim, (213, -105)]) * PRECISION, faces))
     start, _, _, other = half_edges(plan)
     assert len(plan.faces) == tip - 1
     assert tip not in start[other < 0]
 
 
 def test_shell_volume_is_that_of_the_solid_layers():
-    plan = Plan(np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    plan = LayerTriangulation(np.array([[0, 0], [2, 0], [2, 2], [0, 2.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     levels = np.tile([0.0, 1.0, 3.0], (4, 1))
     shell = raise_shell(plan, levels, solid=np.array([[True, True], [True, False]]))
     verdict = validate_mesh(Mesh.of(shell.vertices, shell.faces, feature=0, closed=True))

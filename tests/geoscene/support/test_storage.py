@@ -11,7 +11,7 @@ from helpers.scenes import same_files
 from geoscene.errors import InputError, MissingExtraError, SceneFormatError, StorageError
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
-from geoscene.support.storage import Stored, cache_folder, published, url_of
+from geoscene.support.storage import StoredFolder, cache_folder, published, url_of
 
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.usefixtures("home")]
 BOX = "--bbox=24.9425,60.1665,24.9465,60.1690"
@@ -45,7 +45,7 @@ def test_urls_are_recognised_as_paths_of_pathlib_too(given, url):
 @pytest.mark.parametrize("place", ["memory://bucket/scene", "file://{tmp}/there/scene"])
 def test_published_scene_is_fetched_as_it_was(place, scene, tmp_path):
     url = place.format(tmp=tmp_path)
-    Stored(url).publish(scene.path, last="scene.json")
+    StoredFolder(url).publish(scene.path, last="scene.json")
     opened = open_scene(url)
     assert opened.location == url
     for tile in opened.tiles():
@@ -57,7 +57,7 @@ def test_published_scene_is_fetched_as_it_was(place, scene, tmp_path):
 
 @pytest.mark.usefixtures("memory")
 def test_only_files_that_are_read_are_fetched(scene):
-    Stored("memory://bucket/scene").publish(scene.path, last="scene.json")
+    StoredFolder("memory://bucket/scene").publish(scene.path, last="scene.json")
     opened = open_scene("memory://bucket/scene")
     assert {path.name for path in opened.path.iterdir()} == {"scene.json", "tiles.json"}
     i, j = opened.tile_indices[1]
@@ -66,7 +66,7 @@ def test_only_files_that_are_read_are_fetched(scene):
 
 
 def test_tile_of_another_build_is_refused(scene, memory):
-    Stored("memory://bucket/scene").publish(scene.path, last="scene.json")
+    StoredFolder("memory://bucket/scene").publish(scene.path, last="scene.json")
     i, j = scene.tile_indices[0]
     memory.pipe_file(f"/bucket/scene/tiles/{i}_{j}.npz", b"other")
     opened = open_scene("memory://bucket/scene")
@@ -77,7 +77,7 @@ def test_tile_of_another_build_is_refused(scene, memory):
 
 @pytest.mark.usefixtures("memory")
 def test_interrupted_upload_is_no_scene_and_is_completed(scene, monkeypatch):
-    stored, put = Stored("memory://bucket/scene"), Stored._put
+    stored, put = StoredFolder("memory://bucket/scene"), StoredFolder._put
     sent = []
 
     def failing(self, name, path):
@@ -86,7 +86,7 @@ def test_interrupted_upload_is_no_scene_and_is_completed(scene, monkeypatch):
         sent.append(name)
         put(self, name, path)
 
-    monkeypatch.setattr(Stored, "_put", failing)
+    monkeypatch.setattr(StoredFolder, "_put", failing)
     with pytest.raises(StorageError, match="lost"):
         stored.publish(scene.path, last="scene.json")
     assert "scene.json" not in stored.listed()
@@ -94,7 +94,7 @@ def test_interrupted_upload_is_no_scene_and_is_completed(scene, monkeypatch):
         open_scene(stored.url)
     again = []
     monkeypatch.setattr(
-        Stored, "_put", lambda self, name, path: (again.append(name), put(self, name, path))[1]
+        StoredFolder, "_put", lambda self, name, path: (again.append(name), put(self, name, path))[1]
     )
     stored.publish(scene.path, last="scene.json")
     assert not set(again) & set(sent)
@@ -108,16 +108,18 @@ def test_file_of_an_interrupted_upload_that_the_next_one_lacks_is_removed(
     folder = tmp_path / "scene"
     shutil.copytree(scene.path, folder)
     (folder / "tiles" / "99_99.npz").write_bytes(b"of other options")
-    put = Stored._put
+    put = StoredFolder._put
     monkeypatch.setattr(
-        Stored, "_put", lambda self, name, path: put(self, name, path) if name != "scene.json" else 1 / 0
+        StoredFolder,
+        "_put",
+        lambda self, name, path: put(self, name, path) if name != "scene.json" else 1 / 0,
     )
     with pytest.raises(ZeroDivisionError):
-        Stored("memory://bucket/scene").publish(folder, last="scene.json")
-    monkeypatch.setattr(Stored, "_put", put)
+        StoredFolder("memory://bucket/scene").publish(folder, last="scene.json")
+    monkeypatch.setattr(StoredFolder, "_put", put)
     memory.pipe_file("/bucket/scene/notes.txt", b"of others")
-    Stored("memory://bucket/scene").publish(scene.path, last="scene.json")
-    names = set(Stored("memory://bucket/scene").listed())
+    StoredFolder("memory://bucket/scene").publish(scene.path, last="scene.json")
+    names = set(StoredFolder("memory://bucket/scene").listed())
     assert "tiles/99_99.npz" not in names
     assert {"scene.json", "notes.txt"} <= names
     assert "scene.json.part" not in names

@@ -13,7 +13,7 @@ from PIL import Image
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions
 from geoscene.sources import demo_path, read_osm
-from geoscene.tradeoff.engine import Cost, Row, Tradeoff, tradeoff
+from geoscene.tradeoff.engine import BuildCost, BuildRow, BuildTradeoff, tradeoff
 from geoscene.tradeoff.report import document, pareto, recommendations, write_report
 from geoscene.tradeoff.variants import coarse_elevation, variants
 
@@ -56,12 +56,12 @@ def test_report_has_table_plot_page_and_document(found, tmp_path):
 
 def row(label, cpu, rms, **missing):
     error = {"height_rms_m": rms, "height_99_m": 3 * rms, "height_max_m": 9 * rms}
-    return Row(label, (Cost(cpu, 10**8, 10**6),), error, missing)
+    return BuildRow(label, (BuildCost(cpu, 10**8, 10**6),), error, missing)
 
 
 def test_recommendations_name_the_cheapest_that_is_enough():
     some = (row("a", 4.0, 0.05), row("b", 5.0, 0.06), row("c", 2.0, 0.5, trees=3), row("d", 8.5, 0.001))
-    compared = Tradeoff("here", 1.0, (row("full scene", 9.0, 0.0), *some))
+    compared = BuildTradeoff("here", 1.0, (row("full scene", 9.0, 0.0), *some))
     assert [r.label for r in pareto(compared)] == ["c", "a", "d", "full scene"]
     centimetre, decimetre, metre = recommendations(compared)
     assert "no setting that was compared saves 10 %" in centimetre

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.classes import Class
-from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Instances, Mesh, concatenate
+from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Mesh, ShapeInstances, concatenate
 from geoscene.view.coarse import coarser_mesh, fewer_instances
 
 BOX = (0.0, 0.0, 64.0, 64.0)
@@ -127,7 +127,7 @@ def test_fewer_trees_cover_as_much_and_do_not_depend_on_the_others():
     for axis in range(3):
         matrix[:, axis, axis] = rng.uniform(3, 9, count)
     matrix[:, :2, 3] = rng.uniform(-500, 500, (count, 2))
-    trees = Instances(np.zeros(count, np.int32), matrix, np.arange(count, dtype=np.int32))
+    trees = ShapeInstances(np.zeros(count, np.int32), matrix, np.arange(count, dtype=np.int32))
     sizes = np.ones((1, 3))
     some = fewer_instances(trees, sizes, cell=2.0, share=0.25, seed=1)
     assert len(some) == pytest.approx(0.25 * count, rel=0.08)

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import Instances, Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.options import BuildOptions, ViewOptions
 from geoscene.pipeline.build import build
 from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
 from geoscene.view.lonlat import ACCURACY, lonlat_grid
-from geoscene.view.looks import Facades, read_looks
+from geoscene.view.looks import FacadeLooks, read_looks
 from geoscene.view.tiles import STEP, Groups, groups_of, pack_tile
 
 BOX = (24.9405, 60.1655, 24.9475, 60.1690)
@@ -297,7 +297,7 @@ def test_quantisation_moves_a_vertex_by_at_most_half_a_step(points, scale, place
     vertices = np.array(points) * scale
     faces = np.arange(len(points) // 3 * 3).reshape(-1, 3)
     tile = Tile(np.array([*place, 0.0]), Mesh.of(vertices, faces))
-    told, data = pack_tile(tile, Groups(("ground",), np.zeros(1, np.uint8)), facades=Facades.none())
+    told, data = pack_tile(tile, Groups(("ground",), np.zeros(1, np.uint8)), facades=FacadeLooks.none())
     back, _ = unpack_tile(told, data)
     step = told["step"]
     assert np.abs(back.mesh.vertices + back.origin - vertices - tile.origin).max() <= step / 2 + 1e-9
@@ -313,7 +313,9 @@ def test_adjacent_tiles_quantise_shared_vertices_equally(x, y, z):
     for origin in (np.zeros(3), np.array([250.0, -500.0, 0.0])):
         apart = np.array([[7.3, 0, 0], [0, 11.1, 3.7]]) * (1 if origin.any() else -1)
         vertices = np.vstack([corner, corner + apart]) - origin
-        told, data = pack_tile(Tile(origin, Mesh.of(vertices, [[0, 1, 2]])), groups, facades=Facades.none())
+        told, data = pack_tile(
+            Tile(origin, Mesh.of(vertices, [[0, 1, 2]])), groups, facades=FacadeLooks.none()
+        )
         back, _ = unpack_tile(told, data)
         found.append(back.mesh.vertices[0] + back.origin)
     assert np.array_equal(*found)
@@ -332,12 +334,12 @@ def test_quantisation_moves_an_instance_by_less_than_two_centimetres(seed, uprig
     matrix[:, :, 3] = rng.uniform(-250, 250, (count, 3))
     if not upright:
         matrix[:, 2, 0] += rng.uniform(0.01, 0.5, count)  # leaning
-    given_copies = Instances(
+    given_copies = ShapeInstances(
         rng.integers(0, 3, count).astype(np.int32), matrix, np.arange(count, dtype=np.int32)
     )
     tile = Tile(np.array([500.0, -250.0, 3.7]), Mesh.empty(), given_copies)
     told, data = pack_tile(
-        tile, Groups(("ground", "trees"), np.ones(count + 1, np.uint8)), facades=Facades.none()
+        tile, Groups(("ground", "trees"), np.ones(count + 1, np.uint8)), facades=FacadeLooks.none()
     )
     back, _ = unpack_tile(told, data)
     assert told["upright"] == upright
@@ -352,7 +354,9 @@ def test_quantisation_moves_an_instance_by_less_than_two_centimetres(seed, uprig
 
 def test_an_empty_tile_can_be_packed():
     groups = Groups(("ground", "trees"), np.zeros(1, np.uint8))
-    told, data = pack_tile(Tile(np.zeros(3), Mesh.empty(), Instances.empty()), groups, facades=Facades.none())
+    told, data = pack_tile(
+        Tile(np.zeros(3), Mesh.empty(), ShapeInstances.empty()), groups, facades=FacadeLooks.none()
+    )
     back, _ = unpack_tile(told, data)
     assert len(back.mesh) == len(back.instances) == 0
 

@@ -28,13 +28,13 @@ from lidar.tools.apply import apply_stages
 from lidar.tools.denoise.denoise import denoise
 from lidar.tools.denoise.filters import read_methods
 from lidar.tools.integrity.keys import Hmac
-from lidar.tools.integrity.watermark import Watermark
+from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.maps.aggregate import aggregate
 from lidar.tools.sign import sign_dataset
 from lidar.tools.tamper import read_replacement, tamper
 from lidar.tools.verify import verify_dataset
 
-KEY, MARK = Hmac(b"fedcba9876543210"), Watermark(b"0123456789abcdef")
+KEY, MARK = Hmac(b"fedcba9876543210"), WatermarkKey(b"0123456789abcdef")
 OPTIONS = DriveOptions(rig="vlp16", duration=0.3, seed=3, formats=("pcd", "kitti"), workers=1)
 LOSSY = ApplyOptions(stages=read_stages(["dropped_packets:loss=0.1"]).stages)
 

@@ -18,7 +18,7 @@ from lidar.dataset.formats import FORMATS, npz, parquet, pcd_compressed, read_ta
 from lidar.dataset.formats.lzf import compressed, decompressed
 from lidar.dataset.formats.table import FrameInfo
 from lidar.errors import FormatError
-from lidar.settings import Contents
+from lidar.settings import RecordingSettings
 
 
 def table(n=400, seed=0):
@@ -187,4 +187,4 @@ def test_changed_bytes_are_read_or_refused_in_one_line(tmp_path_factory, name, s
 def test_a_drive_names_the_extra_that_its_format_needs_before_it_starts(monkeypatch, name, extra):
     monkeypatch.setitem(sys.modules, FORMATS[name].extra.split()[0], None)
     with pytest.raises(MissingExtraError, match=rf"geoscene\[{extra}\]"):
-        Contents(formats=("pcd", name))
+        RecordingSettings(formats=("pcd", name))

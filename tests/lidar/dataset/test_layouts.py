@@ -23,7 +23,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.dataset.layouts.coco import THINGS, encoded_mask
 from lidar.dataset.layouts.kitti_360 import SEQUENCE
-from lidar.dataset.layouts.waymo_range_images import Grid, pixels
+from lidar.dataset.layouts.waymo_range_images import RangeImageGrid, pixels
 from lidar.dataset.recorded import Stream, labelled_clouds, still_points
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
@@ -399,7 +399,7 @@ def test_columns_of_range_images_are_the_nearest_azimuths(yaw, azimuth, width):
     turned = np.eye(4)
     turned[:3, :3] = Rotation.from_euler("z", yaw).as_matrix()
     stream = Stream("top", {"vehicle_from_sensor": turned.tolist()}, np.arange(1), np.arange(1), ())
-    grid = Grid(1, stream, np.zeros(1), width)
+    grid = RangeImageGrid(1, stream, np.zeros(1), width)
     column = grid.column(np.array([azimuth]))
     assert 0 <= column[0] < width
     away = np.angle(np.exp(1j * (grid.azimuth(column)[0] - azimuth)))
@@ -408,7 +408,7 @@ def test_columns_of_range_images_are_the_nearest_azimuths(yaw, azimuth, width):
 
 def test_second_echoes_are_in_the_second_range_image_and_third_ones_in_none():
     stream = Stream("top", {"vehicle_from_sensor": np.eye(4).tolist()}, np.arange(1), np.arange(1), ())
-    grid = Grid(1, stream, np.array([-0.1, 0.1]), 360)
+    grid = RangeImageGrid(1, stream, np.array([-0.1, 0.1]), 360)
     columns = {"x": [9, 8, 7, 9, 0], "y": [0, 0, 0, 0, -9], "ring": [1, 1, 1, 1, 0], "echo": [1, 2, 3, 1, 1]}
     kept, pixel = pixels(grid, {name: np.array(values) for name, values in columns.items()})
     assert kept.tolist() == [0, 4, 1]  # the fourth has the pixel of the first

@@ -35,7 +35,7 @@ from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import load_sensor
-from lidar.settings import Contents
+from lidar.settings import RecordingSettings
 from lidar.simulation.drive import drive
 from lidar.tools.maps.aggregate import aggregate
 from lidar.traffic.populate import TrafficOptions
@@ -808,7 +808,7 @@ def test_a_map_reports_missing_frames(scene, rig, tmp_path):
 )
 def test_invalid_contents_are_refused(change, says):
     with pytest.raises(InputError, match=says):
-        Contents(**change)
+        RecordingSettings(**change)
 
 
 def test_a_sensor_without_returns_is_reported(scene, tmp_path):

@@ -27,7 +27,7 @@ from lidar.dataset.layouts import EXPORTERS, ros_topics
 from lidar.dataset.layouts.ros_drive import RosDrive, ros_name
 from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
 from lidar.dataset.layouts.ros_topics import topics_of
-from lidar.dataset.navigation_files import Heights, read_fixes
+from lidar.dataset.navigation_files import FixHeights, read_fixes
 from lidar.errors import DatasetError, FormatError
 from lidar.options import DriveOptions
 from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png
@@ -413,7 +413,7 @@ def test_altitudes_are_above_the_ellipsoid(recorded, monkeypatch, caplog):
     fixes, _ = read_fixes(recorded.paths, "gnss", vertical="flat")
     separation = np.linspace(17, 18, len(fixes))
     for known, altitude in ((separation, fixes.lonlath[:, 2] + separation), (None, np.nan)):
-        heights = Heights("orthometric", known)
+        heights = FixHeights("orthometric", known)
         monkeypatch.setattr(ros_topics, "read_fixes", lambda *_, h=heights, **__: (fixes, h))
         (topic,) = (t for t in topics_of(RosDrive(recorded)) if t.name == "/gnss/fix")
         np.testing.assert_allclose([make().altitude for _, make in topic.messages], altitude)

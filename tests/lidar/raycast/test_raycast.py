@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
-from lidar.raycast import ALL, Caster, Instances, caster, library
+from lidar.raycast import ALL, Caster, MeshInstances, caster, library
 from lidar.raycast.columns import CHUNK
 from lidar.raycast.geometry import planes
 from lidar.raycast.hull import displacements
@@ -384,10 +384,10 @@ def crowd(rng, backend, steps=None):
         out[..., 3] += transforms[..., :3] @ far_box[:, 3]
         return out
 
-    groups = [Instances((shape,), np.zeros(6, np.int32), near(placed(rng, 6)))]
+    groups = [MeshInstances((shape,), np.zeros(6, np.int32), near(placed(rng, 6)))]
     bits = np.array([1, 2, 3, 1], np.uint32)
     if steps:
-        groups.append(Instances((shape,), np.zeros(4, np.int32), near(placed(rng, 4, steps)), mask=bits))
+        groups.append(MeshInstances((shape,), np.zeros(4, np.int32), near(placed(rng, 4, steps)), mask=bits))
     return Caster(vertices, faces, mask=rng.integers(1, 4, 500), instances=groups, backend=backend)
 
 
@@ -417,7 +417,7 @@ def test_each_ray_intersects_a_moving_instance_at_its_own_time(backend):
     wall = Caster(*sheet([-1, 0, 0], np.zeros(3), size=5.0), backend=backend)
     path = np.tile(np.eye(3, 4), (1, 3, 1, 1))
     path[0, :, 0, 3] = [10, 20, 20]
-    cast = Caster(instances=[Instances((wall,), np.zeros(1, np.int32), path)], backend=backend)
+    cast = Caster(instances=[MeshInstances((wall,), np.zeros(1, np.int32), path)], backend=backend)
     time = np.linspace(0, 1, 101)
     hits = cast.cast([0, 0.1, 0.2], np.tile([1.0, 0, 0], (101, 1)), time=time)
     np.testing.assert_allclose(hits.range, np.minimum(10 + 20 * time, 20), atol=1e-5)  # times are float32
@@ -429,7 +429,7 @@ def test_a_mirrored_instance_still_faces_outwards(backend):
     box = trimesh.creation.box([2, 2, 2])
     shape = Caster(box.vertices, box.faces, backend=backend)
     mirror = np.array([[[-1.0, 0, 0, 10], [0, 3, 0, 0], [0, 0, 1, 0]]])
-    hits = Caster(instances=[Instances((shape,), np.zeros(1, np.int32), mirror)], backend=backend).cast(
+    hits = Caster(instances=[MeshInstances((shape,), np.zeros(1, np.int32), mirror)], backend=backend).cast(
         [0, 2.5, 0.3], [[1.0, 0, 0]], normals=True
     )
     np.testing.assert_allclose(hits.range, 9)
@@ -510,7 +510,7 @@ def test_invalid_meshes_are_refused():
         Caster(np.zeros((3, 3)), [[0, 1, 3]])
     shape = Caster(*sheet([0, 0, 1], np.zeros(3)))
     with pytest.raises(InputError, match="beyond the 1"):
-        Instances((shape,), np.ones(1, np.int32), np.eye(3, 4)[None])
+        MeshInstances((shape,), np.ones(1, np.int32), np.eye(3, 4)[None])
 
 
 @BACKENDS
@@ -592,7 +592,7 @@ def test_a_single_instance_has_its_own_shape():
     corners = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
     shapes = [Caster(corners + np.array([0.0, 0.0, height]), [[0, 1, 2]]) for height in (1.0, 2.0, 3.0)]
     stay = np.eye(3, 4)[None]
-    caster = Caster(instances=[Instances(shapes, np.array([2], np.int32), stay)])
+    caster = Caster(instances=[MeshInstances(shapes, np.array([2], np.int32), stay)])
     hits = caster.cast([[0.0, 0.0, 10.0]], [[0.0, 0.0, -1.0]])
     assert hits.range[0] == 7.0
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
-from lidar.raycast import ALL, Caster, Instances
+from lidar.raycast import ALL, Caster, MeshInstances
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
 
@@ -46,8 +46,8 @@ def crowd(rng, offset, **chosen):
     )
     moves[..., 3] += offset
     groups = [
-        Instances((shape,), np.zeros(6, np.int32), moves[:6, 0]),
-        Instances((shape,), np.zeros(4, np.int32), moves[6:], mask=np.array([1, 2, 3, 1], np.uint32)),
+        MeshInstances((shape,), np.zeros(6, np.int32), moves[:6, 0]),
+        MeshInstances((shape,), np.zeros(4, np.int32), moves[6:], mask=np.array([1, 2, 3, 1], np.uint32)),
     ]
     return Caster(
         triangles.reshape(-1, 3) + offset,
@@ -171,6 +171,6 @@ def test_shapes_and_backends_of_other_devices_are_refused():
     box = trimesh.creation.box([1, 1, 1])
     shape = Caster(box.vertices, box.faces, backend="float64")
     with pytest.raises(BackendError, match="same backend"):
-        Caster(instances=[Instances((shape,), np.zeros(1, np.int32), np.eye(3, 4)[None])], device=DEVICE)
+        Caster(instances=[MeshInstances((shape,), np.zeros(1, np.int32), np.eye(3, 4)[None])], device=DEVICE)
     with pytest.raises(InputError, match="embree"):
         Caster(box.vertices, box.faces, backend="embree", device=DEVICE)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast, scan
 from lidar.sensors.physics.echoes import Origin, joined
@@ -242,7 +242,7 @@ def test_a_stage_may_act_on_one_sensor():
 def test_lost_rows_are_black_and_kept_as_truth():
     rgb = np.arange(1, 1 + 40 * 4 * 3, dtype=np.int64).astype(np.uint8).reshape(40, 4, 3) | 1
     blank = np.zeros((40, 4))
-    frame = Frame(rgb, blank.astype(np.float32), blank.astype(np.uint8), blank.astype(np.int32))
+    frame = CameraImage(rgb, blank.astype(np.float32), blank.astype(np.uint8), blank.astype(np.int32))
     stages = read_stages(["lost_rows:loss=0.5,rows=4"], seed=3)
     found = altered_image(frame, stages, at=Situation("front", 0))
     black = (found.rgb == 0).all(axis=(1, 2))

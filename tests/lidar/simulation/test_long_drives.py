@@ -23,7 +23,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.motion import clearance, speed_profile, steering
 from lidar.motion import path as path_module
-from lidar.motion.clearance import Line, Setting, touching
+from lidar.motion.clearance import PathParameters, RouteLine, touching
 from lidar.motion.motion import drive_path, poses_along, speed_limits
 from lidar.motion.path import plan_path
 from lidar.motion.route import RouteOptions, free_route, plan_route
@@ -232,7 +232,7 @@ def test_obstacles_along_a_track_are_found_block_by_block(monkeypatch):
     xy = np.column_stack([np.arange(0.0, 100.0, 0.25), np.zeros(400)])
     track = follow(xy, load_vehicle("car"), scale=1.0, step=0.25)
     n = len(xy)
-    line = Line(
+    line = RouteLine(
         np.column_stack([xy, np.zeros(n)]),
         np.zeros(n, np.int32),
         np.full(n, 10.0),
@@ -240,7 +240,7 @@ def test_obstacles_along_a_track_are_found_block_by_block(monkeypatch):
         np.zeros(n, bool),
     )
     tree = shapely.STRtree([shapely.box(20, 0.5, 25, 3), shapely.box(60, -3, 70, 3)])
-    setting = Setting(load_vehicle("car"), FRAME, tree, margin=0.2, step=0.25, side="right")
+    setting = PathParameters(load_vehicle("car"), FRAME, tree, margin=0.2, step=0.25, side="right")
     whole = touching(track, line, setting=setting)
     monkeypatch.setattr(clearance, "_BODIES", 7)
     parts = touching(track, line, setting=setting)

@@ -6,7 +6,7 @@ import pytest
 from helpers.programs import run_program
 from helpers.scenes import same_files
 
-from geoscene.support.storage import Stored, cache_folder
+from geoscene.support.storage import StoredFolder, cache_folder
 from lidar.dataset.layout import open_dataset
 
 pytestmark = pytest.mark.filterwarnings("default")
@@ -20,7 +20,7 @@ def lidar(*words):
 
 
 def test_drive_and_map_through_a_bucket_have_the_bytes_of_local_ones(s3, scene, tmp_path):
-    Stored("s3://bucket/scene").publish(scene.path, last="scene.json")
+    StoredFolder("s3://bucket/scene").publish(scene.path, last="scene.json")
     lidar("drive", scene.path, *OPTIONS, "-o", tmp_path / "drive")
     drive = ("drive", "s3://bucket/scene", *OPTIONS, "-o", "s3://bucket/drives/one")
     assert "next: lidar map s3://bucket/drives/one" in lidar(*drive)
@@ -34,9 +34,9 @@ def test_drive_and_map_through_a_bucket_have_the_bytes_of_local_ones(s3, scene, 
     same_files(tmp_path / "drive", tmp_path / "fetched")
     assert open_dataset("s3://bucket/drives/one").scene_path.name == "scene"
 
-    first = Stored("s3://bucket/drives/one").listed()
+    first = StoredFolder("s3://bucket/drives/one").listed()
     assert "recorded before" in lidar(*drive)
-    assert {n: row["LastModified"] for n, row in Stored("s3://bucket/drives/one").listed().items()} == {
+    assert {n: row["LastModified"] for n, row in StoredFolder("s3://bucket/drives/one").listed().items()} == {
         n: row["LastModified"] for n, row in first.items()
     }
     lidar("drive", "s3://bucket/scene", *OPTIONS, "-o", tmp_path / "local")
@@ -61,9 +61,9 @@ def test_drive_with_other_options_is_refused_and_replaced_on_request(s3, scene, 
 
 
 def test_dataset_whose_upload_was_interrupted_is_no_dataset(s3, scene, monkeypatch):
-    put = Stored._put
+    put = StoredFolder._put
     monkeypatch.setattr(
-        Stored, "_put", lambda self, name, path: put(self, name, path) if "laz" in name else 1 / 0
+        StoredFolder, "_put", lambda self, name, path: put(self, name, path) if "laz" in name else 1 / 0
     )
     words = ("drive", scene.path, *OPTIONS, "-o", "s3://bucket/one")
     with pytest.raises(ZeroDivisionError):
@@ -71,9 +71,9 @@ def test_dataset_whose_upload_was_interrupted_is_no_dataset(s3, scene, monkeypat
     assert run_program("lidar", "map", "s3://bucket/one", "-o", "x.laz").stderr.startswith(
         "lidar: s3://bucket/one: is not there"
     )
-    monkeypatch.setattr(Stored, "_put", put)
+    monkeypatch.setattr(StoredFolder, "_put", put)
     assert "recorded before" in lidar(*words)
-    assert "dataset.json.part" not in Stored("s3://bucket/one").listed()
+    assert "dataset.json.part" not in StoredFolder("s3://bucket/one").listed()
     assert s3.exists("bucket/one/dataset.json")
 
 
@@ -110,7 +110,7 @@ def stored(s3, scene, tmp_path):  # noqa: ARG001
         "--traffic=on",
     )
     lidar("drive", scene.path, *words, "--rig", tmp_path / "three.toml", "-o", tmp_path / "drive")
-    Stored("s3://bucket/drive").publish(tmp_path / "drive", last="dataset.json")
+    StoredFolder("s3://bucket/drive").publish(tmp_path / "drive", last="dataset.json")
     return tmp_path / "drive", "s3://bucket/drive"
 
 

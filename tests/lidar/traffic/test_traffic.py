@@ -122,13 +122,13 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
     ego = driving(graph, seed, 90.0)
     route = plan_route(graph, Plane(), spec="random", options=RouteOptions(seed=seed, duration=90.0))
     own = ego_trip(plan_path(route, CAR, frame=Plane()), CAR)
-    numbered = simulation_windows.Simulation._numbered
+    numbered = simulation_windows.TrafficSimulation._numbered
 
     def counted(self, rows, tables, *, known):
         most.append(len(rows))
         return numbered(self, rows, tables, known=known)
 
-    monkeypatch.setattr(simulation_windows.Simulation, "_numbered", counted)
+    monkeypatch.setattr(simulation_windows.TrafficSimulation, "_numbered", counted)
     found = []
     for window in (10_000, steps):
         monkeypatch.setattr(simulation_windows, "_STEPS", window)

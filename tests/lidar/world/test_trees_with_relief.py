@@ -5,14 +5,14 @@ import numpy as np
 from geoscene.classes import Class
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
-from geoscene.sources.data import OsmData, Point, Way
+from geoscene.sources.data import OsmData, TaggedNode, Way
 from lidar.world.world import World
 
 
 def test_leaves_let_rays_pass_and_limbs_do_not(tmp_path):
     """A crown holds leaf clusters and limbs; only the faces of clusters have leaves behind them."""
     road = Way("way/1", {"highway": "residential"}, np.arange(2), np.array([[11.0, 50.0], [11.001, 50.0]]))
-    tree = Point("node/9", {"natural": "tree"}, 11.0005, 50.0002)
+    tree = TaggedNode("node/9", {"natural": "tree"}, 11.0005, 50.0002)
     osm = OsmData((11.0, 49.9995, 11.001, 50.0005), [road], [], [tree], [])
     scene = build(osm, tmp_path / "scene", options=BuildOptions(relief="plain"))
     world = World.load(scene)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from lidar.sensors.camera.outline import outline
 from lidar.sensors.laser.doppler import surface_velocity
-from lidar.world.actor_shapes import Shape
+from lidar.world.actor_shapes import ActorShape
 from lidar.world.actors import Actors
 from lidar.world.visibility import Visibility
 
@@ -20,7 +20,7 @@ LENGTH, WIDTH, HEIGHT = 4.0, 2.0, 1.5
 def one_car(place=(20.0, 0.0, 0.0), *, yaw=0.0, velocity=(0.0, 0.0, 0.0), turning=0.0, seconds=2.0):
     """One box, feature 100, that drives straight or turns on the spot."""
     mesh = box((-LENGTH / 2, -WIDTH / 2, 0.0), (LENGTH / 2, WIDTH / 2, HEIGHT), klass=Class.CAR)
-    shape = Shape("box", "sedan", Class.CAR, LENGTH, WIDTH, HEIGHT, 2.5, mesh)
+    shape = ActorShape("box", "sedan", Class.CAR, LENGTH, WIDTH, HEIGHT, 2.5, mesh)
     t = np.arange(0, round(seconds * 1e9) + 1, 100_000_000, dtype=np.int64)
     n, s = len(t), t * 1e-9
     angles = np.zeros((n, 3))

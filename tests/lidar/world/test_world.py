@@ -8,7 +8,7 @@ import trimesh
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
-from geoscene.geometry.mesh import WALL, Instances, Mesh, concatenate
+from geoscene.geometry.mesh import WALL, Mesh, ShapeInstances, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_shapes, write_tile
@@ -55,7 +55,7 @@ def tile(i, j, rank):
     tree = np.zeros((1, 3, 4))
     tree[0, :, :3] = np.eye(3) * 1.5
     tree[0, :, 3] = [-20, -20, 0]
-    copies = Instances(np.zeros(1, np.int32), tree, np.array([1000 + rank], np.int32))
+    copies = ShapeInstances(np.zeros(1, np.int32), tree, np.array([1000 + rank], np.int32))
     return Tile(np.array([(i + 0.5) * TILE, (j + 0.5) * TILE, 0.0]), mesh, copies)
 
 
@@ -285,7 +285,7 @@ def test_classes_of_settings_are_left_out_of_tiles(tmp_path, name, klass):
     files = SceneFiles(tmp_path)
     files.tiles.mkdir()
     parts = [ground(0), box([1, 1, 6], [30, 30, 3.0], klass=klass, feature=55)]
-    copies = Instances(np.zeros(1, np.int32), np.array([np.eye(3, 4)]), np.array([77], np.int32))
+    copies = ShapeInstances(np.zeros(1, np.int32), np.array([np.eye(3, 4)]), np.array([77], np.int32))
     write_tile(files.tile(0, 0), Tile(np.full(3, TILE / 2) * [1, 1, 0], concatenate(parts), copies))
     write_shapes(files.shapes, {"thing": box([4, 4, 4], [0, 0, 4.0], klass=klass)})
     manifest = {
@@ -324,7 +324,7 @@ def test_what_lies_under_a_roof_is_neither_wet_nor_under_snow(tmp_path):
     (tmp_path / "tiles").mkdir()
     files = SceneFiles(tmp_path)
     whole = concatenate([sheltered, deck, beside])
-    none = Instances(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))
+    none = ShapeInstances(np.empty(0, np.int32), np.empty((0, 3, 4)), np.empty(0, np.int32))
     write_tile(files.tile(0, 0), Tile(np.zeros(3), whole, none))
     write_shapes(files.shapes, {})
     manifest = {

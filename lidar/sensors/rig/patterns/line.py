@@ -16,7 +16,7 @@ LAWS = ("polygon", "zigzag", "sine", "conical")
 
 
 @dataclass(frozen=True)
-class Line:
+class LinePattern:
     """One beam that points down (-z) and is deflected to the left and right of the flight line (x).
 
     polygon  : right to left, repeatedly: theta = t (frac(L s) - 1/2), t the turn; no pulses beyond the half
@@ -65,7 +65,7 @@ class Line:
         return np.stack([np.zeros(len(swing)), np.sin(theta), -np.cos(theta)], axis=1)
 
 
-def read_line(table: Table) -> Line:
+def read_line(table: Table) -> LinePattern:
     """The pattern that a ``[line]`` table describes.
 
     Raises RigError for keys that are missing, unknown or out of bounds.
@@ -73,7 +73,7 @@ def read_line(table: Table) -> Line:
     law = table.text("law", among=LAWS)
     half = table.number("half_angle_deg", above=0.0, high=180.0)
     turn = table.number("turn_deg", 2 * half, low=2 * half, high=360.0) if law == "polygon" else 2 * half
-    pattern = Line(
+    pattern = LinePattern(
         law=law,
         half_angle=float(np.radians(half)),
         turn=float(np.radians(turn)),

@@ -22,7 +22,7 @@ from lidar.toml_table import Table
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class SweepPattern:
     """Beams that fire in turn: elevation as a triangle wave, azimuth at a constant rate or as such a wave.
 
     elevation = centre + half range * tri(f_e t + line / lines), tri from -1 to 1; azimuth = 2 pi f_a t, or
@@ -89,7 +89,7 @@ class Listed:
         return from_origin(start_ns + time[rows], direction, column=column, channel=channel)
 
 
-def read_sweep(table: Table) -> Sweep:
+def read_sweep(table: Table) -> SweepPattern:
     """The pattern that a ``[sweep]`` table describes.
 
     Raises RigError for keys that are missing, unknown or out of bounds.
@@ -102,7 +102,7 @@ def read_sweep(table: Table) -> Sweep:
     )
     if sector and not -np.pi <= sector[0] < sector[1] <= np.pi:
         raise table.error("azimuth_deg", "give the lowest and the highest azimuth, within 180 degrees")
-    pattern = Sweep(
+    pattern = SweepPattern(
         azimuth_hz=table.number("azimuth_hz"),
         elevation_hz=table.number("elevation_hz"),
         low=float(low),

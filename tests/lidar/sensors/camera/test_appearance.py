@@ -6,7 +6,7 @@ import pytest
 from geoscene.classes import Class, materials
 from geoscene.objects.shapes import shapes
 from geoscene.objects.signs import sign_codes
-from lidar.raycast import Caster, Instances
+from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.appearance import SIGN_HEIGHT, colors
 from lidar.sensors.camera.sign_faces import OF_SHAPE, face_levels, known, plate_levels, sampled
 from lidar.world.actor_shapes import CLOTHES, PAINTS, catalogue
@@ -81,7 +81,7 @@ class Street:
         shape = Caster(mesh.vertices, mesh.faces)
         still = np.eye(3, 4)[None]
         self.mesh, self.shape = mesh, shape
-        self.caster = Caster(instances=[Instances((shape,), np.zeros(1, np.int32), still)])
+        self.caster = Caster(instances=[MeshInstances((shape,), np.zeros(1, np.int32), still)])
 
     def shot(self, start, direction, *, feature):
         """Colours where rays hit, and the faces that they hit."""

@@ -29,7 +29,7 @@ def painted(relief):
     mesh = plane_mesh(relief)
     caster = Caster(mesh.vertices, mesh.faces, backend="float64")
     caster.refiners = [WallRefiner(tables)]
-    return seen.Facades(tables, True, color, material, GLASS), caster
+    return seen.RenderedFacades(tables, True, color, material, GLASS), caster
 
 
 @settings(max_examples=40, deadline=None)

@@ -13,7 +13,7 @@ from geoscene.geometry.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.raycast import Caster, Instances
+from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.png import encode_png
 from lidar.sensors.camera.render import RenderOptions, _shared_rays, exposure_times, optical_flow, render
@@ -467,7 +467,7 @@ class ActorWorld:
         self.back = MeshWorld(back)
         self.surfaces, self.walls = self.back.surfaces, self.back.walls
         self.caster = Caster(
-            back.vertices, back.faces, instances=[Instances((shape,), np.zeros(1, np.int32), transform)]
+            back.vertices, back.faces, instances=[MeshInstances((shape,), np.zeros(1, np.int32), transform)]
         )
 
     def lookup(self, hits):

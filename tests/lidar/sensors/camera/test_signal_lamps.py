@@ -10,7 +10,7 @@ from geoscene.geometry.mesh import concatenate
 from geoscene.objects.shapes import shapes
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.raycast import Caster, Instances
+from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import RenderOptions, render
 from lidar.sensors.camera.signal_lamps import APART, LENSES, RADIUS, Lamps, emitted
@@ -34,7 +34,7 @@ class SignalWorld(MeshWorld):
         shape = Caster(head.vertices, head.faces)
         still = np.column_stack([np.eye(3), np.zeros(3)])[None]
         self.caster = Caster(
-            back.vertices, back.faces, instances=[Instances((shape,), np.zeros(1, np.int32), still)]
+            back.vertices, back.faces, instances=[MeshInstances((shape,), np.zeros(1, np.int32), still)]
         )
 
     def lookup(self, hits):

@@ -16,7 +16,7 @@ from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast.relief import pairs_of, tables_of
 from lidar.sensors.camera import shade
-from lidar.sensors.camera.facades import Facades
+from lidar.sensors.camera.facades import RenderedFacades
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import RenderOptions, render
 from lidar.sensors.camera.sun import sun_direction
@@ -48,7 +48,7 @@ def facades(rng, *, deep):
     glass, wood = (materials()[name].code for name in ("glass", "wood"))
     m = len(tables.wall)
     color = rng.integers(0, 256, (m, 3)).astype(np.uint8)
-    return Facades(tables, deep, color, rng.choice([glass, wood], m).astype(np.uint8), glass)
+    return RenderedFacades(tables, deep, color, rng.choice([glass, wood], m).astype(np.uint8), glass)
 
 
 def pixels(rng, walls, *, n=3000):

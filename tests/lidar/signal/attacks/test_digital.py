@@ -13,7 +13,7 @@ from geoscene.geometry.frames import Frame as SceneFrame
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL_QUAT, Mount
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.gnss import Fixes
 from lidar.sensors.physics.echoes import Origin
@@ -207,7 +207,9 @@ def test_an_offset_to_the_left_is_across_the_driven_direction():
 def picture(depth=20.0):
     shape = (60, 80)
     rgb = np.full((*shape, 3), 90, np.uint8)
-    return Frame(rgb, np.full(shape, depth, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.int32))
+    return CameraImage(
+        rgb, np.full(shape, depth, np.float32), np.zeros(shape, np.uint8), np.zeros(shape, np.int32)
+    )
 
 
 def photographed(frame, *, poses=None, geo=None, **table):

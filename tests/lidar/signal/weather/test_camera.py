@@ -13,13 +13,13 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera import shade
 from lidar.sensors.camera.light import daylight
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
 from lidar.signal.weather.camera import falling, linear_of, weathered
 from lidar.signal.weather.media import medium_of
 from lidar.signal.weather.setting import WeatherSetting
-from lidar.signal.weather.streaks import Particles, streak_cover
+from lidar.signal.weather.streaks import FallingParticles, streak_cover
 from lidar.signal.weather.window_drops import Drops, drops_on, through_drops
 
 CAMERA = CameraSpec("front", Mount(), 320, 180, 300.0, 300.0, 159.5, 89.5, exposure_ns=5_000_000)
@@ -44,7 +44,7 @@ def picture(depth, value=0, camera=CAMERA):
     """A wall that faces the camera at a depth, or the sky if it is inf."""
     shape = camera.height, camera.width
     klass = Class.SKY if np.isinf(depth) else Class.BUILDING
-    return Frame(
+    return CameraImage(
         np.full((*shape, 3), value, np.uint8),
         np.full(shape, depth, np.float32),
         np.full(shape, klass, np.uint8),
@@ -157,7 +157,7 @@ def cover_of(particles, exposure, *, air=(0.0, 0.0, 0.0), distance=np.inf, seed=
     )
 
 
-BIG = Particles(np.array([4e-3]), np.array([300.0]), np.array([8.0]))
+BIG = FallingParticles(np.array([4e-3]), np.array([300.0]), np.array([8.0]))
 
 
 def test_drops_cover_their_cross_section_whatever_the_exposure():
@@ -173,20 +173,20 @@ def test_drops_cover_their_cross_section_whatever_the_exposure():
 
 def test_rain_fades_with_the_root_of_the_exposure():
     """As Garg and Nayar (IJCV 2007) measured, from 8 to 125 ms."""
-    rain = Particles(np.array([3e-3]), np.array([2000.0]), np.array([8.0]))
+    rain = FallingParticles(np.array([3e-3]), np.array([2000.0]), np.array([8.0]))
     spread = [cover_of(rain, t, distance=3.0).std() for t in (4e-3, 16e-3)]
     assert spread[0] / spread[1] == pytest.approx(2.0, rel=0.25)
 
 
 def test_streaks_are_as_long_as_the_exposure_and_as_the_speed():
-    one = Particles(np.array([4e-3]), np.array([3.0]), np.array([8.0]))
+    one = FallingParticles(np.array([4e-3]), np.array([3.0]), np.array([8.0]))
 
     def longest(cover):
         rows = np.flatnonzero((cover > 0).any(axis=1))
         return len(rows)
 
-    still = cover_of(Particles(one.diameter, np.array([0.5]), one.fall), 0.0, distance=3.0)
-    moving = cover_of(Particles(one.diameter, np.array([0.5]), one.fall), 10e-3, distance=3.0)
+    still = cover_of(FallingParticles(one.diameter, np.array([0.5]), one.fall), 0.0, distance=3.0)
+    moving = cover_of(FallingParticles(one.diameter, np.array([0.5]), one.fall), 10e-3, distance=3.0)
     assert longest(moving) > longest(still)
     # Seen from a fast car the streaks spread from where it drives to.
     driven = cover_of(BIG, 10e-3, air=(0.0, 0.0, -30.0), distance=10.0)

@@ -21,7 +21,7 @@ from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, ROAD_USERS, pulses_of
 from lidar.signal.weather.air import through_air
-from lidar.signal.weather.fields import Field, Rays, _add_spray, amounts, plume_pattern
+from lidar.signal.weather.fields import Field, WeatherBeams, _add_spray, amounts, plume_pattern
 from lidar.signal.weather.glass import glare_noise, through_glass
 from lidar.signal.weather.media import medium_of, rain
 from lidar.signal.weather.setting import WeatherSetting, read_weather
@@ -119,7 +119,7 @@ def test_an_even_field_gives_what_even_air_does():
 def test_the_column_of_a_field_is_its_integral():
     y, x = np.indices((201, 201)) * 2.0 - 200
     field = Field((-200.0, -200.0), np.exp(-np.hypot(x, y) / 40), 0.0, np.inf)
-    rays = Rays(np.zeros((1, 3)), np.array([[0.6, 0.8, 0.0]]))
+    rays = WeatherBeams(np.zeros((1, 3)), np.array([[0.6, 0.8, 0.0]]))
     here, column = amounts(field, rays, pulse=np.zeros(1, np.int64), distance=np.array([120.0]))
     assert column[0] == pytest.approx(40 * (1 - np.exp(-3)), rel=0.01)
     assert here[0] == pytest.approx(np.exp(-3), rel=0.05)

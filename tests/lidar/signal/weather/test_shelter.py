@@ -11,7 +11,7 @@ from geoscene.geometry.frames import Frame as GeoFrame
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera.light import daylight
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.scan import cast
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.physics.settings import ScannerSettings
@@ -62,7 +62,7 @@ def image(text, around):
         return Poses(np.tile([0.0, 0, 1.9], (n, 1)), np.tile(AHEAD, (n, 1, 1)), np.ones((n, 3)))
 
     shape = CAMERA.height, CAMERA.width
-    black = Frame(
+    black = CameraImage(
         np.zeros((*shape, 3), np.uint8),
         np.full(shape, 40.0, np.float32),
         np.full(shape, Class.BUILDING, np.uint8),

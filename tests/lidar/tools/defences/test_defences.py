@@ -17,15 +17,15 @@ from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.defences.azimuth import Azimuth
 from lidar.tools.defences.map import Map
-from lidar.tools.defences.navigation import Navigation as Consistency
-from lidar.tools.defences.observation import Navigation, Picture
+from lidar.tools.defences.navigation import NavigationDefence as Consistency
+from lidar.tools.defences.observation import NavigationMeasurements, Picture
 from lidar.tools.defences.occlusion import Occlusion
 from lidar.tools.defences.overlay import Overlay, projected
 from lidar.tools.defences.physics import Physics
 from lidar.tools.defences.registry import read_defences
 from lidar.tools.defences.run import able
 from lidar.tools.defences.shadow import Shadow
-from lidar.tools.defences.statistical import Statistical
+from lidar.tools.defences.statistical import StatisticalDefence
 from lidar.tools.defences.temporal import Temporal
 from lidar.tools.defences.timing import Timing
 from lidar.tools.defences.void import Void
@@ -241,10 +241,10 @@ def test_scattered_returns_are_outliers(frame):
     some = rng.permutation(len(frame))[:60]
     xyz = frame.xyz.copy()
     xyz[some] = frame.direction[some] * rng.uniform(2, 8, 60)[:, None]
-    verdict = judged(Statistical(), replace(frame, xyz=xyz))
+    verdict = judged(StatisticalDefence(), replace(frame, xyz=xyz))
     assert np.median(verdict.returns[some]) > 0.5
     assert np.median(verdict.returns) < 0.1
-    assert verdict.frame > judged(Statistical(), frame).frame
+    assert verdict.frame > judged(StatisticalDefence(), frame).frame
 
 
 def followed(speed, frames=9):
@@ -351,7 +351,7 @@ def with_fixes(frames, *, spoofed=(0.0, 0.0), gyro_z=0.0):
     imu_ns = np.arange(0, 2 * 10**9, 10**7)
     rate = gyro_z + 0.002 * rng.standard_normal(len(imu_ns))
     gnss = {"time_ns": time_ns, "quality": 4 * ones, "hdop": ones}
-    data = Navigation(gnss, {"time_ns": imu_ns, "gyro_z": rate}, np.zeros(3), place)
+    data = NavigationMeasurements(gnss, {"time_ns": imu_ns, "gyro_z": rate}, np.zeros(3), place)
     return [replace(frame, navigation=data) for frame in frames]
 
 

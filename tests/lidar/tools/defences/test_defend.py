@@ -23,7 +23,7 @@ from lidar.tools.defences.reading import SEEN, read_scans
 from lidar.tools.defences.registry import defence_names, read_defences
 from lidar.tools.defences.run import DETECTOR
 from lidar.tools.detection.registry import read_detector
-from lidar.tools.integrity.watermark import Watermark
+from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset
 
 RIG = """
@@ -143,7 +143,7 @@ def test_defences_see_no_ground_truth(attacked, tmp_path):
 
 def test_the_watermark_tells_injected_returns_apart(plain, tmp_path):
     (tmp_path / "key").write_text("00112233445566778899aabbccddeeff")
-    mark = Watermark(bytes.fromhex("00112233445566778899aabbccddeeff"))
+    mark = WatermarkKey(bytes.fromhex("00112233445566778899aabbccddeeff"))
     sign_dataset(plain, tmp_path / "signed", watermark=mark)
     stages = read_stages(["insert:distance=7,start=0.2"]).stages
     apply_stages(tmp_path / "signed", tmp_path / "forged", options=ApplyOptions(stages))

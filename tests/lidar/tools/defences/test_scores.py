@@ -10,7 +10,7 @@ from lidar.errors import InputError
 from lidar.tools.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
 from lidar.tools.defences.fusion import FUSIONS, fused, fused_threshold, joint_of
 from lidar.tools.defences.registry import defence_names, defence_rows, read_defences
-from lidar.tools.defences.scores import FALSE_ALARMS, Samples, score, threshold_at
+from lidar.tools.defences.scores import FALSE_ALARMS, SuspicionCounts, score, threshold_at
 from lidar.tools.defences.verdict import Verdict
 
 
@@ -25,7 +25,7 @@ def normal_frames(rng, shift, frames=100, each=100):
 
 def test_area_and_detection_are_those_of_two_normal_distributions():
     rng = np.random.default_rng(3)
-    samples = Samples.of(normal_frames(rng, 1.5))
+    samples = SuspicionCounts.of(normal_frames(rng, 1.5))
     threshold = threshold_at(samples, 0.05)
     found = score(samples, threshold=threshold, rng=rng)
     assert found.auc[0] == pytest.approx(norm.cdf(1.5 / np.sqrt(2)), abs=0.01)
@@ -42,7 +42,7 @@ def test_area_and_detection_are_those_of_two_normal_distributions():
 def test_intervals_hold_the_truth_as_often_as_they_say():
     rng, truth, inside = np.random.default_rng(4), norm.cdf(1 / np.sqrt(2)), 0
     for _ in range(60):
-        found = score(Samples.of(normal_frames(rng, 1.0, frames=30, each=30)), threshold=0.9, rng=rng)
+        found = score(SuspicionCounts.of(normal_frames(rng, 1.0, frames=30, each=30)), threshold=0.9, rng=rng)
         inside += found.auc[1] <= truth <= found.auc[2]
     assert inside >= 51  # 95 % of 60 is 57; 51 is 3 standard deviations below
 
@@ -51,12 +51,12 @@ def test_frames_that_are_alike_within_give_wide_intervals():
     """Returns of a frame are not independent: a bootstrap of returns would be far too sure."""
     rng = np.random.default_rng(5)
     rows = [(np.full(500, rng.random()), np.full(500, k % 2 == 0)) for k in range(20)]
-    _, low, high = score(Samples.of(rows), threshold=0.5, rng=rng).tpr
+    _, low, high = score(SuspicionCounts.of(rows), threshold=0.5, rng=rng).tpr
     assert high - low > 0.25
 
 
 def calibrated(rng):
-    samples = Samples.of([(rng.random(1000), np.zeros(1000, bool)) for _ in range(100)])
+    samples = SuspicionCounts.of([(rng.random(1000), np.zeros(1000, bool)) for _ in range(100)])
     levels = [(name, level) for name in ("one", "other") for level in ("returns", "objects", "frames")]
     return Calibration(dict.fromkeys(levels, tail_of(samples)), "uniform")
 
@@ -112,7 +112,9 @@ def dependent(rng, frames=200, each=100):
 def jointly_calibrated(rng):
     frames = list(dependent(rng))
     tails = {
-        (name, level): tail_of(Samples.of([(row[name], np.zeros(len(row[name]), bool)) for row in frames]))
+        (name, level): tail_of(
+            SuspicionCounts.of([(row[name], np.zeros(len(row[name]), bool)) for row in frames])
+        )
         for name in NAMES
         for level in FALSE_ALARMS
     }
@@ -182,7 +184,7 @@ def test_a_suspicion_that_most_genuine_samples_have_is_not_unusual():
     """Most returns have suspicion 0; several stored shares are then those of 0."""
     rng = np.random.default_rng(8)
     column = np.where(rng.random(100_000) < 0.97, 0.0, np.where(rng.random(100_000) < 0.5, 0.2, 0.8))
-    tail = tail_of(Samples.of([(column, np.zeros(len(column), bool))]))
+    tail = tail_of(SuspicionCounts.of([(column, np.zeros(len(column), bool))]))
     share = tail.of(np.array([0.0, 0.1, 0.2, 0.5, 0.8]))
     assert share[0] == 1
     true = np.array([np.mean(column >= s) for s in (0.0, 0.1, 0.2, 0.5, 0.8)])

@@ -17,8 +17,8 @@ from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
 from lidar.tools.denoise.denoise import denoise
-from lidar.tools.denoise.filters import METHODS, Ddior, Dror, Dsor, Lior, Statistical, read_methods
-from lidar.tools.denoise.scores import Tally
+from lidar.tools.denoise.filters import METHODS, Ddior, Dror, Dsor, Lior, StatisticalFilter, read_methods
+from lidar.tools.denoise.scores import FilterTally
 
 
 def wall(distance, *, step=0.05):
@@ -87,14 +87,14 @@ def test_the_statistical_filter_is_that_of_the_point_cloud_library():
     rng = np.random.default_rng(2)
     xyz = rng.normal(size=(300, 3))
     away = np.sort(np.linalg.norm(xyz[:, None] - xyz[None], axis=2), axis=1)[:, 1:9].mean(axis=1)
-    kept = Statistical(neighbours=8, deviations=0.5).kept(xyz, np.zeros(300))
+    kept = StatisticalFilter(neighbours=8, deviations=0.5).kept(xyz, np.zeros(300))
     assert kept.tolist() == (away < away.mean() + 0.5 * away.std(ddof=1)).tolist()
 
 
 def test_scores_of_counts():
     kept = np.array([True, True, False, False, False, True])
     weather = np.array([False, False, True, True, False, True])
-    tally = Tally().with_frame(kept, weather)
+    tally = FilterTally().with_frame(kept, weather)
     assert (tally.precision, tally.recall, tally.lost) == (2 / 3, 2 / 3, 1 / 3)
     assert tally.f1 == pytest.approx(2 / 3)
     both = tally.with_frame(kept, weather)

@@ -26,7 +26,7 @@ from lidar.tools.detection.forest import forest_of, read_forest
 from lidar.tools.detection.learned import CLASSES, Learned, read_model, scores_of
 from lidar.tools.detection.registry import MODEL, read_detector
 from lidar.tools.redteam.evaluate import accuracies
-from lidar.tools.redteam.measure import Case, measured
+from lidar.tools.redteam.measure import AttackCase, measured
 from lidar.tools.redteam.plan import Measure
 from lidar.tools.train import examples_of, train
 from lidar.traffic.populate import TrafficOptions
@@ -201,7 +201,7 @@ def test_an_empty_cloud_has_no_road_users() -> None:
 def _f1(folder: Path, out: Path, detector: str) -> float:
     """Of road users within 40 m that have ten returns or more."""
     measure = Measure()
-    case = Case(folder, None, out / f"{detector}.json", (), measure.score, detector)
+    case = AttackCase(folder, None, out / f"{detector}.json", (), measure.score, detector)
     frames = [(k, frame) for k, frame in enumerate(measured(case)["frames"])]
     rows = [
         row

@@ -5,7 +5,7 @@ import pytest
 
 from lidar.errors import FormatError
 from lidar.tools.evaluation.kitti_detection import labels_of
-from lidar.tools.evaluation.tracking import Tracks, read_tracks, score_tracks, steps_of
+from lidar.tools.evaluation.tracking import ObjectTracks, read_tracks, score_tracks, steps_of
 
 
 def at(*rows):
@@ -13,7 +13,7 @@ def at(*rows):
     lines = [
         f"{kind} 0 0 0 {left} 100 {left + 100} 200 1.5 2 4 {left / 50} 1.5 20 0" for _, left, kind in rows
     ]
-    return Tracks(np.array([track for track, *_ in rows], np.int64), labels_of(lines, name="test"))
+    return ObjectTracks(np.array([track for track, *_ in rows], np.int64), labels_of(lines, name="test"))
 
 
 def score(true, found, *, kind="Car", measure="2d", frames=10):

@@ -22,7 +22,7 @@ from lidar.geometry.time_scales import posix_ns
 from lidar.options import EvaluateOptions
 from lidar.tools.evaluation.figures import qualities
 from lidar.tools.evaluation.intervals import correlation_time, statistics
-from lidar.tools.evaluation.matching import Pairs, alignment, matched
+from lidar.tools.evaluation.matching import PosePairs, alignment, matched
 from lidar.tools.evaluation.pose_errors import (
     absolute,
     by_axis,
@@ -33,7 +33,7 @@ from lidar.tools.evaluation.pose_errors import (
 )
 from lidar.tools.evaluation.trajectories import Path3D, read_path, read_truth, true_path
 from lidar.tools.evaluation.trajectory import evaluate_trajectory
-from lidar.tools.odometry.estimate import Estimate, write_estimate
+from lidar.tools.odometry.estimate import MotionEstimate, write_estimate
 
 STEP_NS = 100_000_000
 
@@ -74,7 +74,7 @@ def evo_aligned(estimate, truth, kind):
 
 def aligned(estimate, truth, kind):
     pairs = matched(estimate, truth, how="nearest")
-    return Pairs(alignment(pairs, kind).of(pairs.estimate), pairs.truth, pairs.left_out)
+    return PosePairs(alignment(pairs, kind).of(pairs.estimate), pairs.truth, pairs.left_out)
 
 
 @pytest.mark.parametrize("kind", ["none", "origin", "se3", "sim3"])
@@ -208,7 +208,7 @@ def test_errors_by_axis_are_those_of_the_body():
     truth = Path3D(np.array([0, 10**9]), np.zeros((2, 3)), north)
     tilted = north @ Rotation.from_euler("y", 2.0, degrees=True).as_matrix()
     estimate = Path3D(truth.time_ns, np.tile([1.0, 0.0, 0.25], (2, 1)), tilted)
-    off, turn = by_axis(Pairs(estimate, truth, 0))
+    off, turn = by_axis(PosePairs(estimate, truth, 0))
     np.testing.assert_allclose(off, [[0, -1, 0.25]] * 2, atol=1e-12)
     np.testing.assert_allclose(np.degrees(turn), [[0, 2, 0]] * 2, atol=1e-9)
 
@@ -397,7 +397,9 @@ def test_folders_of_odometry_are_estimates_with_their_own_times(tmp_path):
     poses[:, :3, :3], poses[:, :3, 3] = truth.rotation, truth.position
     first = np.linalg.inv(poses[0]) @ poses
     folder.mkdir()
-    estimate = Estimate(truth.time_ns - posix_ns(START), first, quality={"matches": np.arange(len(truth))})
+    estimate = MotionEstimate(
+        truth.time_ns - posix_ns(START), first, quality={"matches": np.arange(len(truth))}
+    )
     write_estimate(folder, estimate, dataset=data)
     (tmp_path / "d" / "top" / "timestamps.csv").write_text("frame,time_ns\n0,0\n")
     for source in (folder, folder / "trajectory.tum", folder / "trajectory.kitti", folder / "poses.csv"):

@@ -22,11 +22,11 @@ from lidar.tools.integrity.directions import LEAST, cells_by_direction, is_marke
 from lidar.tools.integrity.keys import Hmac
 from lidar.tools.integrity.marked_clouds import coarseness
 from lidar.tools.integrity.tampering import frame_verdict
-from lidar.tools.integrity.watermark import Watermark
+from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset
 from lidar.tools.verify import verify_dataset
 
-MARK = Watermark(b"0123456789abcdef")
+MARK = WatermarkKey(b"0123456789abcdef")
 HMAC = Hmac(b"fedcba9876543210")
 
 

@@ -16,11 +16,11 @@ from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.integrity.keys import Hmac, read_secret, read_signer
 from lidar.tools.integrity.merkle import block_digests, merkle_root
-from lidar.tools.integrity.watermark import Watermark
+from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset
 from lidar.tools.verify import verify_dataset
 
-MARK = Watermark(b"0123456789abcdef")
+MARK = WatermarkKey(b"0123456789abcdef")
 HMAC = Hmac(b"fedcba9876543210")
 RIG = """
 name = "small"

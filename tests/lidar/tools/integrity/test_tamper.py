@@ -13,7 +13,7 @@ from lidar.dataset.truth_files import read_truth
 from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.sensors.camera.png import read_png
-from lidar.sensors.camera.render import Frame
+from lidar.sensors.camera.render import CameraImage
 from lidar.signal.registry import numbered, read_stage, read_stages
 from lidar.signal.run import image_past
 from lidar.signal.weather.setting import read_weather
@@ -148,7 +148,7 @@ def image_without_stages(folder, frame):
     rgb = read_png(folder / f"front/rgb/{frame:06d}.png")
     nothing = np.empty(0)
     truth = read_truth(folder / f"front/truth/{frame:06d}.npz")
-    return image_past(Frame(rgb, nothing, nothing, nothing), truth).rgb
+    return image_past(CameraImage(rgb, nothing, nothing, nothing), truth).rgb
 
 
 @pytest.mark.parametrize(

@@ -12,9 +12,9 @@ from hypothesis.extra import numpy as npst
 from lidar.errors import InputError
 from lidar.tools.integrity.linkage import joined, linked_clusters
 from lidar.tools.integrity.tampering import frame_verdict
-from lidar.tools.integrity.watermark import Cells, Watermark, bit_error_rate
+from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey, bit_error_rate
 
-MARK = Watermark(b"0123456789abcdef")
+MARK = WatermarkKey(b"0123456789abcdef")
 RINGS, COLUMNS = 16, 900
 
 
@@ -30,13 +30,13 @@ def scan(frame=7, *, seed=0):
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )
     seen = rng.random(len(ring)) > 0.05
-    cells = Cells("top", frame, ring, column, np.ones(len(ring), np.uint8)).where(seen)
+    cells = WatermarkCells("top", frame, ring, column, np.ones(len(ring), np.uint8)).where(seen)
     return (away[:, None] * unit)[seen], cells
 
 
 def extended(cells, other):
     columns = (np.append(getattr(cells, name), getattr(other, name)) for name in ("ring", "column", "echo"))
-    return Cells(cells.sensor, cells.frame, *columns)
+    return WatermarkCells(cells.sensor, cells.frame, *columns)
 
 
 def distance(place, xyz):
@@ -208,7 +208,7 @@ def test_an_empty_cloud_and_single_returns_have_a_verdict():
 
 def test_a_step_out_of_bounds_is_refused():
     with pytest.raises(InputError, match=r"`step` 0: give 0\.0001 to 1 metre"):
-        Watermark(b"0123456789abcdef", 0.0)
+        WatermarkKey(b"0123456789abcdef", 0.0)
 
 
 @given(

@@ -18,7 +18,7 @@ from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.raycast.nearest import lower_to_nearest
 from lidar.raycast.tree import tree_of
-from lidar.tools.maps.compare import LIMIT, Comparison
+from lidar.tools.maps.compare import LIMIT, SurfaceComparison
 from lidar.tools.maps.surfaces import TrueSurfaces
 from lidar.world.world import World
 
@@ -123,7 +123,7 @@ def test_rows_and_files_of_a_comparison_hold_the_distances(places, tmp_path):
     label[:500] = Class.CAR
     east, north, up = geo.points(points).T
     table = {"x": east, "y": north, "z": up, "label": label}
-    comparison = Comparison(places, places.frame, crs=crs)
+    comparison = SurfaceComparison(places, places.frame, crs=crs)
     halves = [{k: v[:2000] for k, v in table.items()}, {k: v[2000:] for k, v in table.items()}]
     assert sum(len(t["x"]) for t in comparison.measured(iter(halves))) == 4000
     rows = {row.name: row for row in comparison.rows()}
@@ -147,7 +147,7 @@ def test_percentiles_are_those_of_all_distances(places):
     points[:, 2] += np.linspace(0, 3, 3000)
     true = TrueSurfaces(places, limit=LIMIT).distances(points)
     east, north, up = Georeference(places.frame, crs, exact=True).points(points).T
-    comparison = Comparison(places, places.frame, crs=crs)
+    comparison = SurfaceComparison(places, places.frame, crs=crs)
     label = np.full(3000, Class.ROAD, np.uint8)
     list(comparison.measured(iter([{"x": east, "y": north, "z": up, "label": label}])))
     row = comparison.rows()[0]
@@ -160,4 +160,4 @@ def test_percentiles_are_those_of_all_distances(places):
 def test_a_scene_with_other_heights_is_refused(scene):
     frame = Frame(scene.frame.wkt, scene.frame.origin, "ellipsoidal")
     with pytest.raises(InputError, match="ellipsoidal"):
-        Comparison(scene, frame, crs=export_crs(scene.frame))
+        SurfaceComparison(scene, frame, crs=export_crs(scene.frame))

@@ -17,7 +17,7 @@ from lidar.sensors.rig.camera_model import project
 from lidar.tools.maps.picture import (
     BACKGROUND,
     VIEWS,
-    View,
+    PictureView,
     _eye,
     class_colors,
     cloud_picture,
@@ -49,7 +49,7 @@ def _where(image, color):
 )
 def test_all_points_are_in_view_and_fill_it(azimuth, elevation, fov, size, span):
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * span + [50, -70, 9]
-    camera, pose = _eye(corners, View(azimuth, elevation, fov), size=size)
+    camera, pose = _eye(corners, PictureView(azimuth, elevation, fov), size=size)
     pixels, depth = project(camera, (corners - pose.position) @ pose.rotation[0])
     assert (depth > 0).all()
     share = (pixels + 0.5) / size

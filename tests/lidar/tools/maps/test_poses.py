@@ -20,7 +20,7 @@ from lidar.geometry.trajectory_tum import read_tum, write_tum
 from lidar.options import MapOptions
 from lidar.tools.maps.aggregate import aggregate
 from lidar.tools.maps.aligned_motion import aligned_motion
-from lidar.tools.maps.measured_poses import Measured, Motion, measured_motion, poses_by_fixes
+from lidar.tools.maps.measured_poses import MeasuredPositions, RelativeMotion, measured_motion, poses_by_fixes
 from lidar.tools.maps.pose_graph import fitted
 
 LEVER = np.array([0.6, 0.2, 1.6])
@@ -43,7 +43,7 @@ def fixes_of(poses, *, sigma, rng, outliers=0):
     yaw = np.unwrap(np.arctan2(poses[:-1, 1, 0], poses[:-1, 0, 0]))
     time_ns = np.arange(len(position)) * 10**9
     shape = np.full((len(position), 3), max(sigma, 0.01))
-    return Measured(time_ns, position, shape, yaw, np.full(len(position), 6.0), LEVER, 1.0)
+    return MeasuredPositions(time_ns, position, shape, yaw, np.full(len(position), 6.0), LEVER, 1.0)
 
 
 def motion_of(poses, *, longer=0.0, turned=0.0):
@@ -52,7 +52,7 @@ def motion_of(poses, *, longer=0.0, turned=0.0):
     step[:, :3, 3] *= 1 + longer
     step[:, :3, :3] = step[:, :3, :3] @ Rotation.from_euler("z", [turned]).as_matrix()
     sigma = np.tile([0.002] * 3 + [0.02] * 3, (len(step), 1))
-    return Motion(np.arange(len(poses)) * 10**9, step, sigma)
+    return RelativeMotion(np.arange(len(poses)) * 10**9, step, sigma)
 
 
 def errors(found, true):
@@ -123,7 +123,7 @@ def test_speeds_of_an_antenna_off_the_rear_axle_give_the_axle_s_motion():
     fixes = fixes_of(poses, sigma=0.0, rng=np.random.default_rng(0))
     time_ns = np.arange(601) * 10**8
     speed = np.hypot(60.0 - 0.2, 0.6) * 0.1
-    fixes = Measured(time_ns[:-1], *(getattr(fixes, k) for k in ("position", "sigma", "yaw")),
+    fixes = MeasuredPositions(time_ns[:-1], *(getattr(fixes, k) for k in ("position", "sigma", "yaw")),
                      np.full(600, speed), LEVER, 1.0)  # fmt: skip
     found = measured_motion(None, fixes, unit="", time_ns=time_ns[100:500])
     true = np.linalg.inv(poses[100:499]) @ poses[101:500]
@@ -287,7 +287,7 @@ def test_sweeps_tell_the_motion_between_them(tmp_path):
     wrong = exact.copy()
     wrong[:, :3, 3] += rng.normal(0, 0.02, (25, 3))
     wrong[:, :3, :3] = wrong[:, :3, :3] @ Rotation.from_rotvec(rng.normal(0, 0.002, (25, 3))).as_matrix()
-    given_motion = Motion(np.arange(26) * 10**8, wrong, np.tile([0.002] * 3 + [0.02] * 3, (25, 1)))
+    given_motion = RelativeMotion(np.arange(26) * 10**8, wrong, np.tile([0.002] * 3 + [0.02] * 3, (25, 1)))
     found = aligned_motion(clouds, given_motion, progress=silent)
     np.testing.assert_array_equal(found.step[-1], wrong[-1])  # of the last frame's motion no cloud tells
     poses, measured = found.poses()[:-1], given_motion.poses()[:-1]
@@ -305,7 +305,7 @@ def test_motion_is_kept_where_sweeps_tell_nothing(tmp_path):
     for path in clouds.files:
         FORMATS["pcd"].write(path, nothing)
     step = np.linalg.inv(true[:-1]) @ true[1:]
-    given_motion = Motion(np.arange(5) * 10**8, step, np.full((4, 6), 0.01))
+    given_motion = RelativeMotion(np.arange(5) * 10**8, step, np.full((4, 6), 0.01))
     found = aligned_motion(clouds, given_motion, progress=silent)
     np.testing.assert_array_equal(found.step, step)
     np.testing.assert_array_equal(found.sigma, given_motion.sigma)

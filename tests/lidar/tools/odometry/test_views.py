@@ -13,7 +13,7 @@ from lidar.geometry.mounts import Mount
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.feature_depths import laser_distances, stereo_distances, unhidden
-from lidar.tools.odometry.features import Features, _spread, matches, read_features
+from lidar.tools.odometry.features import ImageFeatures, _spread, matches, read_features
 from lidar.tools.odometry.keyframes import Keyframe, close_loops, refine_window
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import (
@@ -69,7 +69,7 @@ def features(bearing, camera, *, seed=0, seconds=None):
     descriptor = np.random.default_rng(seed).integers(0, 256, (count, 32), dtype=np.uint8)
     seconds = np.zeros(count) if seconds is None else seconds
     pixel, _ = project(camera, bearing)
-    return Features(pixel, bearing, np.full(count, 1.0 / camera.fx), seconds, descriptor)
+    return ImageFeatures(pixel, bearing, np.full(count, 1.0 / camera.fx), seconds, descriptor)
 
 
 def difference(first, second):

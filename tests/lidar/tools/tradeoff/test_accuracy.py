@@ -20,7 +20,7 @@ from lidar.tools.sweep import sweep
 from lidar.tools.tradeoff import accuracy, profile
 from lidar.tools.tradeoff.accuracy import CheckedDrive, Planned, driven, pace_of, picked
 from lidar.tools.tradeoff.choice import Wanted, choice, worst
-from lidar.tools.tradeoff.errors import Estimate, Returns, next_drive, resampled
+from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, next_drive, resampled
 from lidar.tools.tradeoff.profile import Candidate, Profile, profile_of
 from lidar.tools.tradeoff.profile_errors import drive_estimates
 from lidar.tools.tradeoff.sampling import SampledError, range_figures, sampled_error
@@ -91,7 +91,7 @@ def test_other_budgets_are_refused(text):
 
 
 def around(error, *, least=0.5, most=2.0):
-    return Estimate(error, least * error, most * error)
+    return ErrorEstimate(error, least * error, most * error)
 
 
 def candidate(rays, cpu, *errors):
@@ -112,7 +112,7 @@ PROFILE = Profile(
     (candidate(1, 0.1, 0.1, 0.2), candidate(7, 0.4, 0.02, 0.04), candidate(19, 0.9, 0.004, 0.009)),
     (),
     drives=12,
-    load_s=Estimate(0.1, 0.1, 0.1),
+    load_s=ErrorEstimate(0.1, 0.1, 0.1),
 )
 CAMERAS = (camera_candidate(1, 0.3, 4.0), camera_candidate(2, 0.7, 1.0), camera_candidate(3, 2.0, 0.5))
 BOTH = replace(PROFILE, cameras=CAMERAS)
@@ -222,7 +222,7 @@ def test_errors_that_are_given_as_the_nearest_are_enough():
 
 def returns(rows, ranges):
     n = len(rows)
-    return Returns(256 * np.array(rows), np.array(ranges, float), np.ones(n, np.uint8), np.zeros((n, 3)))
+    return PulseReturns(256 * np.array(rows), np.array(ranges, float), np.ones(n, np.uint8), np.zeros((n, 3)))
 
 
 def test_weighted_errors_of_matched_missed_and_extra_returns():
@@ -239,7 +239,7 @@ def test_weighted_errors_of_matched_missed_and_extra_returns():
 
 
 def test_missed_and_extra_returns_are_stated_where_they_matter():
-    half, few = Estimate(0.5, 0.4, 0.6), Estimate(1e-4, 0.0, 1e-3)
+    half, few = ErrorEstimate(0.5, 0.4, 0.6), ErrorEstimate(1e-4, 0.0, 1e-3)
     errors = {"a": {"range_99_m": few, "lost": half}, "b": {"range_99_m": few, "lost": few}}
     found = stated(errors, percent=99.0, kinds=("ranges",))
     assert found.lost == {"a": half}

@@ -12,10 +12,17 @@ from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.simulation.plan import plan_drive
-from lidar.tools.tradeoff.comparison import Comparison, Row
+from lidar.tools.tradeoff.comparison import SensorComparison, VariantRow
 from lidar.tools.tradeoff.costs import costs
 from lidar.tools.tradeoff.engine import scene_label, tradeoff
-from lidar.tools.tradeoff.errors import STATISTICS, Estimate, Returns, estimates, frame_error, median
+from lidar.tools.tradeoff.errors import (
+    STATISTICS,
+    ErrorEstimate,
+    PulseReturns,
+    estimates,
+    frame_error,
+    median,
+)
 from lidar.tools.tradeoff.report import document, write_report
 from lidar.tools.tradeoff.simulate import bench_of, chosen_pulses, spread_frames
 from lidar.tools.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
@@ -36,19 +43,19 @@ def returns(key, distance, klass=None):
     n = len(key)
     xyz = np.column_stack([distance, np.zeros(n), np.zeros(n)]).astype(float)
     kinds = np.ones(n, np.uint8) if klass is None else np.array(klass, np.uint8)
-    return Returns(np.array(key, np.int64), np.array(distance, float), kinds, xyz)
+    return PulseReturns(np.array(key, np.int64), np.array(distance, float), kinds, xyz)
 
 
 def row(label, error, cpu, *, lost=0.0):
-    figures = {name: Estimate(error, error, error) for name in STATISTICS}
-    figures |= {name: Estimate(lost, lost, lost) for name in ("missed", "extra")}
-    cost = {name: Estimate(cpu, cpu, cpu) for name in ("cpu_s", "bytes", "memory_bytes")}
-    return Row(label, figures, {}, cost)
+    figures = {name: ErrorEstimate(error, error, error) for name in STATISTICS}
+    figures |= {name: ErrorEstimate(lost, lost, lost) for name in ("missed", "extra")}
+    cost = {name: ErrorEstimate(cpu, cpu, cpu) for name in ("cpu_s", "bytes", "memory_bytes")}
+    return VariantRow(label, figures, {}, cost)
 
 
 def comparison(*rows, residual=0.0):
-    gap = {name: Estimate(residual, residual, residual) for name in STATISTICS}
-    return Comparison("top (vlp16)", "exact", gap, rows, 10, 1)
+    gap = {name: ErrorEstimate(residual, residual, residual) for name in STATISTICS}
+    return SensorComparison("top (vlp16)", "exact", gap, rows, 10, 1)
 
 
 def statistics_of(error):
@@ -204,7 +211,7 @@ def test_the_cheapest_sufficient_setting_is_recommended():
 
 def test_recommendations_count_the_upper_end_of_the_interval():
     unsure = row("rays=7", 0.008, 4.0)
-    unsure.error["range_99.9_m"] = Estimate(0.008, 0.002, 0.03)
+    unsure.error["range_99.9_m"] = ErrorEstimate(0.008, 0.002, 0.03)
     several = comparison(unsure, row("rays=19", 0.009, 9.0))
     said = recommendation(several, 0.01)
     assert "cheapest setting is rays=19" in said
