@@ -20,7 +20,7 @@ from geoscene.scene.layout import SceneFiles
 from lidar.dataset.layout import Paths
 from lidar.tools.detection.registry import MODEL
 from lidar.tools.redteam.evaluate import DetectorAccuracy, accuracies
-from lidar.tools.redteam.measure import AttackCase, measured
+from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure
 
 PLACES = {
@@ -129,7 +129,7 @@ def _accuracy(detector: str, drives: list[Path], figures: Path) -> list[Detector
     for drive in drives:
         case = AttackCase(drive, None, figures / f"{drive.name}.json", (), MEASURE.score, detector)
         figures.mkdir(parents=True, exist_ok=True)
-        rows = measured(case)["frames"]
+        rows = measure_drive(case)["frames"]
         frames += [((drive.name, int(frame["seconds"] // MEASURE.block)), frame) for frame in rows]
     return list(accuracies(frames, measure=MEASURE, known={"setting": {}, "scene": "all"}))
 

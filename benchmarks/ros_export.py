@@ -28,7 +28,7 @@ from geoscene.support.progress import silent
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.layouts import ros2
 from lidar.dataset.layouts.ros_drive import RosDrive, Topic
-from lidar.dataset.layouts.ros_messages import encoded, typestore
+from lidar.dataset.layouts.ros_messages import encode, typestore
 from lidar.dataset.layouts.ros_topics import topics_of
 
 Messages = list[tuple[int, int, Any]]
@@ -38,7 +38,7 @@ def in_memory(dataset: Dataset) -> tuple[list[Topic], Messages]:
     """The topics of a drive, and its messages: time in nanoseconds since 1970, row of the topic, message."""
     drive = RosDrive(dataset)
     topics = topics_of(drive)
-    return topics, [(drive.stamp(time_ns), k, make()) for time_ns, k, make in ros2.merged(topics)]
+    return topics, [(drive.stamp(time_ns), k, make()) for time_ns, k, make in ros2.merge_messages(topics)]
 
 
 def write_alone(folder: Path, topics: list[Topic], *, messages: Messages, storage: str) -> None:
@@ -72,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     dataset = open_dataset(given.drive)
     topics, messages = in_memory(dataset)
-    volume = sum(len(encoded(message)) for _, _, message in messages)
+    volume = sum(len(encode(message)) for _, _, message in messages)
     points = sum(message.width for _, k, message in messages if topics[k].kind.endswith("PointCloud2"))
     print(f"{len(messages):,} messages, {volume / 1e6:.1f} MB, {points:,} points")
     for storage in ("MCAP", "SQLITE3"):

@@ -23,7 +23,7 @@ import numpy as np
 
 from geoscene.scene import open_scene
 from lidar.options import DriveOptions
-from lidar.sensors.laser.scan import cast, measured
+from lidar.sensors.laser.scan import cast, measure
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.run import Altered, altered_sweep, cloud_truth
@@ -77,7 +77,7 @@ class Side:
             settings=contents.scanner,
         )
         if not contents.stages.at("echoes", scanner.name):
-            measured(sweep)
+            measure(sweep)
             return None
         at = situation_of(self.recording, scanner, frame=frame, world=world)
         return altered_sweep(sweep, contents.stages, at=at)

@@ -145,8 +145,8 @@ def build(
     from geoscene.pipeline.build import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
     from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
     from geoscene.scene.writer import check_target  # noqa: PLC0415
-    from geoscene.support.cluster import connected  # noqa: PLC0415
-    from geoscene.support.storage import published, shown, url_of  # noqa: PLC0415
+    from geoscene.support.cluster import connect  # noqa: PLC0415
+    from geoscene.support.storage import publish, shown, url_of  # noqa: PLC0415
 
     started = time.perf_counter()
     if workers is not None and not 1 <= workers <= 256:
@@ -158,8 +158,8 @@ def build(
         note_new_folder(out)
     bar = partial(progress_bar, quiet=report.quiet)
     with (
-        connected(scheduler) if scheduler else nullcontext() as cluster,
-        published(out, last=SceneFiles(Path()).manifest.name, replaces=report.overwrite, bar=bar) as folder,
+        connect(scheduler) if scheduler else nullcontext() as cluster,
+        publish(out, last=SceneFiles(Path()).manifest.name, replaces=report.overwrite, bar=bar) as folder,
         bar() as progress,
     ):
         progress("reading the map", 0, total=0)
@@ -245,7 +245,7 @@ def _read_map(source: MapSource) -> Any:
         if not (equals and path):
             raise InputError(f"`source` {text}: give NAME=FILE")
         found = sources.read_source(name, path, bounds=data.bounds if data else source.bbox)
-        data = sources.merged(data, found) if data else found
+        data = sources.merge_sources(data, found) if data else found
     return data
 
 
@@ -470,7 +470,7 @@ def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _guessed(relief: dict[str, Any]) -> dict[str, int]:
+def _count_guessed(relief: dict[str, Any]) -> dict[str, int]:
     """What is guessed besides the openings of facades, by kind."""
     furniture = sum(relief.get("furniture_guessed", {}).values())
     found = relief.get("parts_guessed", {}) | relief.get("roofs_guessed", {}) | {"furniture": furniture}
@@ -501,11 +501,11 @@ def _print_scene(report: dict[str, Any]) -> None:
         else "",
         "roads": f"{counts['road_km']:.1f} km of carriageway in the extent; {counts['road_edges']} edges by"
         f" direction{steep}",
-        "heights": _listed(report["heights"]),
-        "roofs": _listed(report["roofs"]),
+        "heights": _list_counts(report["heights"]),
+        "roofs": _list_counts(report["roofs"]),
         "relief": report["options"].get("relief", "off"),
-        "facades": _listed(report.get("relief", {}).get("facades", {})),
-        "guessed": _listed(_guessed(report.get("relief", {}))),
+        "facades": _list_counts(report.get("relief", {}).get("facades", {})),
+        "guessed": _list_counts(_count_guessed(report.get("relief", {}))),
     }
     for_drives = "area" in report
     if for_drives or report["options"].get("along"):
@@ -525,7 +525,7 @@ def _print_scene(report: dict[str, Any]) -> None:
             print(f"  {title:<10} {text}")
     for action, kinds in report["problems"].items():
         for kind, reasons in kinds.items():
-            print(f"  {action:<10} {kind}: {_listed(reasons)}")
+            print(f"  {action:<10} {kind}: {_list_counts(reasons)}")
     for limit in report.get("limits", []):
         print(f"  {'limit':<10} {with_flags(app, limit['advice'])}")
     print(f"  {report['attribution']}")
@@ -550,7 +550,7 @@ def _steep_roads(counts: dict[str, Any], *, terrain: bool) -> str:
     return f", {steep:.1f} km steeper than 20 %; the terrain model may be too coarse"
 
 
-def _listed(counts: dict[str, int]) -> str:
+def _list_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{name} {n}" for name, n in counts.items())
 
 

@@ -166,13 +166,13 @@ def _lower(_: object, tokens: Sequence[Token]) -> str:
     return tokens[0].value.lower()
 
 
-def _named(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+def _name_of(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
     """Names in lower case, each with parameters as they are: values may be paths."""
     pairs = (text.strip().partition(":") for text in tokens[0].value.split(",") if text.strip())
     return tuple(name.lower() + colon + rest for name, colon, rest in pairs)
 
 
-NAMED = Parameter(converter=_named, n_tokens=1, metavar="NAME,...")
+NAMED = Parameter(converter=_name_of, n_tokens=1, metavar="NAME,...")
 
 
 def _settings(_: object, tokens: Sequence[Token]) -> tuple[tuple[str, str], ...]:
@@ -206,9 +206,9 @@ def chosen_stages(
     weather: Iterable[WeatherSetting], attacks: Iterable[NamedStage], *, stages: Iterable[NamedStage]
 ) -> tuple[NamedStage, ...]:
     """All stages in the order in which they act: weather, attacks, others."""
-    from lidar.signal.registry import numbered, read_stage  # noqa: PLC0415
+    from lidar.signal.registry import number_stages, read_stage  # noqa: PLC0415
 
-    return numbered([*(read_stage(setting.table()) for setting in weather), *attacks, *stages])
+    return number_stages([*(read_stage(setting.table()) for setting in weather), *attacks, *stages])
 
 
 def with_stage_settings(
@@ -481,14 +481,16 @@ class DriveOptions:
         route, side = self.route or "random", self.side_in(scene)
         traffic = None if self.traffic is None else asdict(replace(self.traffic, side=side))
         resolved: dict[str, Any] = {
-            "route": _digested(route) if isinstance(route, str | Path) else [list(point) for point in route],
-            "survey": _digested(self.survey),
+            "route": _add_digest(route)
+            if isinstance(route, str | Path)
+            else [list(point) for point in route],
+            "survey": _add_digest(self.survey),
             "rig": f"{self.rig} ({rig_digest(self.rig)})",
-            "vehicle": _digested(self.vehicle or load_rig(self.rig).vehicle),
+            "vehicle": _add_digest(self.vehicle or load_rig(self.rig).vehicle),
             "start": self.start.isoformat() if self.start else None,
             "side": side,
             "traffic": traffic
-            and {k: _digested(v) if isinstance(v, Path) else v for k, v in traffic.items()},
+            and {k: _add_digest(v) if isinstance(v, Path) else v for k, v in traffic.items()},
         }
         recipe = {"scene": scene.manifest.get("fingerprint", scene.path.name)}
         names = [f.name for f in fields(self) if f.name not in _NOT_IN_RECIPE]
@@ -1162,7 +1164,7 @@ def classes_of(names: Iterable[str], *, option: str = "without") -> list[int]:
     return [int(code) for name in names for code in known[name]]
 
 
-def _digested(name: str | Path) -> str:
+def _add_digest(name: str | Path) -> str:
     """A name; for a file with a digest of its contents, so that a changed file changes the recipe."""
     path = Path(name)
     if not str(name) or not path.is_file():

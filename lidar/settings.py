@@ -82,7 +82,7 @@ def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> DriveSet
             raise InputError(f"`settings` {name}: unknown{hint} lidar settings lists all {len(known)}")
         for group, values in zip(chosen, changed, strict=True):
             if hasattr(group, name):
-                values.update(_parsed(name, text, former=getattr(group, name)))
+                values.update(_parse(name, text, former=getattr(group, name)))
     return DriveSettings(*(replace(group, **values) for group, values in zip(chosen, changed, strict=True)))
 
 
@@ -122,7 +122,7 @@ def text_of(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _parsed(name: str, text: str, *, former: object) -> dict[str, Any]:
+def _parse(name: str, text: str, *, former: object) -> dict[str, Any]:
     """A setting by its name, its text read as the type of its former value."""
     kind: type = type(former)
     if kind is bool:

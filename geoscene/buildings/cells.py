@@ -108,10 +108,10 @@ def outlines(xy: Float, face: Ints, *, body: Ints, count: int) -> list[Polygons 
     ends = np.stack([ids[open_], ids[3 * row + (k + 1) % 3]], axis=1)
     points, face = xy[row, k], face[row]
     spans = pairwise([0, *_ends(body[row], count).tolist()])
-    return [_joined(ends[a:b], points[a:b], face=face[a:b]) for a, b in spans]
+    return [_join(ends[a:b], points[a:b], face=face[a:b]) for a, b in spans]
 
 
-def _joined(ends: Ints, points: Float, *, face: Ints) -> Polygons | None:
+def _join(ends: Ints, points: Float, *, face: Ints) -> Polygons | None:
     """Polygons of edges between vertices (n, 2), each with its first point and face; None if invalid."""
     onward = {start: (stop, edge) for edge, (start, stop) in enumerate(ends.tolist())}
     if len(onward) < len(ends):
@@ -139,7 +139,7 @@ def _joined(ends: Ints, points: Float, *, face: Ints) -> Polygons | None:
     return shapely.orient_polygons(shells) if shapely.is_valid(shells).all() else None
 
 
-def filled(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:
+def fill(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:
     """The triangles (k, 3, 2) of polygons of each body and the polygon of each; None for bodies without."""
     sizes = [0 if polygons is None else len(polygons) for polygons in found]
     first = np.cumsum([0, *sizes])
@@ -151,14 +151,14 @@ def filled(found: list[Polygons | None]) -> list[tuple[Float, Ints] | None]:
     ]
 
 
-def merged(cells: RoofCells, body: Ints, *, count: int) -> list[RoofCells]:
+def merge(cells: RoofCells, body: Ints, *, count: int) -> list[RoofCells]:
     """The cells of each body, each face triangulated again, which removes the slivers that many cuts leave.
 
     body : (m,) the body of each triangle, ascending
     """
     found = outlines(cells.xy, cells.face, body=body, count=count)
     out, spans = [], pairwise([0, *_ends(body, count).tolist()])
-    for (a, b), polygons, made in zip(spans, found, filled(found), strict=True):
+    for (a, b), polygons, made in zip(spans, found, fill(found), strict=True):
         own = cells.take(slice(a, b))
         if polygons is not None and made is not None and len(np.unique(made[1])) == len(polygons):
             xy, owner = made
@@ -193,7 +193,7 @@ def skeleton_cells(skeleton: Skeleton) -> RoofCells:
     # nodes at the same grid point take the same height
     _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
     time = skeleton.time[first][same.ravel()]
-    rings = _unpinched(xy, [_distinct(face, same.ravel()) for face in skeleton.faces])
+    rings = _remove_pinches(xy, [_distinct(face, same.ravel()) for face in skeleton.faces])
     polygons = polygons_of(xy, [r for r in rings if len(r) > 2])
     polygons = polygons[shapely.area(polygons) > 0]
     triangles, owner = triangulate(polygons)
@@ -206,7 +206,7 @@ def skeleton_cells(skeleton: Skeleton) -> RoofCells:
     return RoofCells(triangles, _values_at(triangles, xy, values=time), owner)
 
 
-def _unpinched(xy: Float, rings: list[list[int]]) -> list[list[int]]:
+def _remove_pinches(xy: Float, rings: list[list[int]]) -> list[list[int]]:
     """Rings (node numbers) without narrow parts that cross themselves or invert when rounded to the grid.
 
     If a node of a ring lies within 2 mm of another arc of the same ring, the node is inserted into that arc,

@@ -15,7 +15,7 @@ _MOVES = np.array([move for move in itertools.product((-1, 0, 1), repeat=3) if a
 """Grid steps by which a vertex can move at once."""
 
 
-def parted(corners: Float) -> Float:
+def part(corners: Float) -> Float:
     """Triangles (m, 3, 3) of a closed surface with some vertices moved, so that fewer faces are close.
 
     Each move is by a grid step, or a diagonal of one, and leaves fewer pairs of close faces.

@@ -20,7 +20,7 @@ from geoscene.buildings.stacks import with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags
-from geoscene.support.report import Problem, described, make_without_failures, unexpected
+from geoscene.support.report import Problem, describe_unexpected, described, make_without_failures
 from geoscene.tags import first_value
 from geoscene.typing import Ints
 
@@ -78,7 +78,9 @@ def _read_rows(
     made = make_without_failures(
         lambda some: _rows([chosen[k] for k in some.tolist()], frame, parts=parts, options=options),
         np.arange(len(chosen)),
-        failed=lambda k, error: problems.append(unexpected(chosen[k].osm_id, error, kind="building")),
+        failed=lambda k, error: problems.append(
+            describe_unexpected(chosen[k].osm_id, error, kind="building")
+        ),
     )
     for _, found in made:
         problems += found

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.geometry.frames import wrapped
+from geoscene.geometry.frames import wrap_longitude
 from geoscene.support.columns import Columns
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
@@ -99,7 +99,7 @@ def region_at(lon: float, lat: float) -> str:
     """Name of the region of ``palettes.toml`` at a place in degrees, by its time zone."""
     from tzfpy import get_tz  # noqa: PLC0415  (reads the zones' outlines)
 
-    zone = get_tz(wrapped(lon), lat)
+    zone = get_tz(wrap_longitude(lon), lat)
     if zone == "Europe/Paris" and lat < _SOUTH_OF_FRANCE:
         return "mediterranean"
     starts: list[tuple[int, str]] = [

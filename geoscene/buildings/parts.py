@@ -12,7 +12,7 @@ from shapely.errors import GEOSException
 from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
 from geoscene.sources.data import Relation
-from geoscene.support.report import Problem, unexpected
+from geoscene.support.report import Problem, describe_unexpected
 from geoscene.typing import Bools, Float, Ints
 
 Rows = Ints
@@ -24,17 +24,17 @@ _LEAST_SHOWN = 0.01
 def overlapping(a: Polygons, b: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
     """Pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
     of_b, of_a = shapely.STRtree(a).query(b, predicate="intersects")
-    return _shared(a, b, rows=(of_a.astype(np.int64), of_b.astype(np.int64)), least=least)
+    return _share(a, b, rows=(of_a.astype(np.int64), of_b.astype(np.int64)), least=least)
 
 
 def overlapping_pairs(polygons: Polygons, *, least: float = 1e-4) -> tuple[Rows, Rows, Float]:
     """Pairs of rows, the lesser first, that share more than ``least`` square metres, and the shared areas."""
     second, first = shapely.STRtree(polygons).query(polygons, predicate="intersects").astype(np.int64)
     once = first < second
-    return _shared(polygons, polygons, rows=(first[once], second[once]), least=least)
+    return _share(polygons, polygons, rows=(first[once], second[once]), least=least)
 
 
-def _shared(a: Polygons, b: Polygons, *, rows: tuple[Rows, Rows], least: float) -> tuple[Rows, Rows, Float]:
+def _share(a: Polygons, b: Polygons, *, rows: tuple[Rows, Rows], least: float) -> tuple[Rows, Rows, Float]:
     """The pairs of rows of a and b that share more than ``least`` square metres, and the shared areas."""
     i, j = rows
     # most pairs only touch; this test is cheaper than their intersection
@@ -180,7 +180,7 @@ def cut_overlaps(
             out[row] = subtract(out[row], shapely.union_all(cutters, grid_size=GRID))
         except GEOSException as error:
             out[row] = shapely.Polygon()
-            problems.append(unexpected(osm_id[row], error, kind="building"))
+            problems.append(describe_unexpected(osm_id[row], error, kind="building"))
             continue
         winners = ", ".join(sorted({osm_id[w] for w in winner[mine]}))
         lost = area[row] - shapely.area(out[row])  # under 0 where rounding to the grid adds more

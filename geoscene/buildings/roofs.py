@@ -13,8 +13,8 @@ import shapely
 from geoscene.buildings.cells import (
     RoofCells,
     cut,
-    filled,
-    merged,
+    fill,
+    merge,
     outlines,
     raise_gables,
     skeleton_cells,
@@ -138,15 +138,15 @@ def roof_shells(polygons: Polygons, specs: Sequence[RoofSpec]) -> tuple[ShellTri
             notes[k] = f"{spec.shape} roof made {fallback}" if fallback else ""
     for shape in sorted({specs[k].shape for k in ridged}):
         own = [k for k in ridged if specs[k].shape == shape]
-        fields |= zip(own, _ridged(polygons[own], [specs[k] for k in own]), strict=True)
+        fields |= zip(own, _extrude_ridges(polygons[own], [specs[k] for k in own]), strict=True)
     tops = {k: _rings(polygons[k], specs[k]) for k in radial} | {
-        k: _raised(cells, specs[k]) for k, cells in fields.items()
+        k: _raise_roof(cells, specs[k]) for k, cells in fields.items()
     }
     flat = np.array([k for k in range(len(specs)) if k not in tops], np.int64)
     low, high = (np.array([(s.low, s.high) for s in specs]).reshape(-1, 2)[flat]).T
     made = [
         prisms(polygons[flat], flat, low=low, high=high),
-        _closed(polygons, tops, fields=fields, specs=specs),
+        _close(polygons, tops, fields=fields, specs=specs),
     ]
     shells = ShellTriangles.concatenate(made)
     return shells.take(np.argsort(shells.piece, kind="stable")), notes
@@ -208,7 +208,7 @@ def _skillion(polygon: Any, spec: RoofSpec) -> RoofCells:
     return replace(cells, field=(cells.field - low) / (high - low))
 
 
-def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[RoofCells]:
+def _extrude_ridges(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[RoofCells]:
     """Cross-sections of one shape extruded along ridges; the fields are shares of the roofs' heights."""
     up = np.array([_slope(polygon, spec) for polygon, spec in zip(polygons, specs, strict=True)])
     shape, count = specs[0].shape, len(specs)
@@ -228,11 +228,11 @@ def _ridged(polygons: Polygons, specs: Sequence[RoofSpec]) -> list[RoofCells]:
         hipped = [
             _hipped_ends(part, up[k], low=float(low[k]), span=float(span[k])) for k, part in enumerate(parts)
         ]
-        return [merged(part, np.zeros(len(part), np.int64), count=1)[0] for part in hipped]
+        return [merge(part, np.zeros(len(part), np.int64), count=1)[0] for part in hipped]
     cells = cells.take(np.argsort(cells.face >> cuts, kind="stable"))
     body = cells.face >> cuts
     raised = replace(cells, field=_profile(cells.field, span[body, None], profile=profile))
-    return merged(raised, body, count=count)
+    return merge(raised, body, count=count)
 
 
 def _hipped_ends(cells: RoofCells, up: Float, *, low: float, span: float) -> RoofCells:
@@ -271,11 +271,11 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[RoofCells | None, bool]:
     for share, _ in profile[1:-1]:
         cells = cut(cells, share * span)
     if len(profile) > 2:
-        (cells,) = merged(cells, np.zeros(len(cells), np.int64), count=1)
+        (cells,) = merge(cells, np.zeros(len(cells), np.int64), count=1)
     return replace(cells, field=_profile(cells.field, span, profile=profile)), len(skeleton.xy) > corners
 
 
-def _raised(cells: RoofCells, spec: RoofSpec) -> Float:
+def _raise_roof(cells: RoofCells, spec: RoofSpec) -> Float:
     """Triangles (m, 3, 3) of a roof above cells whose field is the share of its height."""
     # the highest point has the tagged height even if the footprint excludes the ridge
     share = cells.field / cells.field.max()
@@ -284,7 +284,7 @@ def _raised(cells: RoofCells, spec: RoofSpec) -> Float:
     )
 
 
-def _closed(
+def _close(
     polygons: Polygons, tops: dict[int, Float], *, fields: dict[int, RoofCells], specs: Sequence[RoofSpec]
 ) -> ShellTriangles:
     """The shells of roof triangles (m, 3, 3) by piece.
@@ -300,9 +300,7 @@ def _closed(
     found: list[Polygons | None] = [
         rim if k in fields else polygons[[k]] for k, rim in zip(pieces, rims, strict=True)
     ]
-    floors = [
-        fields[k].xy if made is None else made[0] for k, made in zip(pieces, filled(found), strict=True)
-    ]
+    floors = [fields[k].xy if made is None else made[0] for k, made in zip(pieces, fill(found), strict=True)]
     bottom = to_grid(np.array([specs[k].low for k in pieces], float))
     of = np.repeat(np.arange(len(pieces)), [len(floor) for floor in floors])
     xy = np.concatenate([np.empty((0, 3, 2)), *floors])

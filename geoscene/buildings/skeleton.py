@@ -268,11 +268,11 @@ def straight_skeleton(polygon: Any) -> Skeleton | None:
         xy[: len(corners)] = corners
         found = replace(found, xy=xy + centre)
         if _fills(found, polygon):
-            return _merged(found)
+            return _merge(found)
     return None
 
 
-def _merged(skeleton: Skeleton) -> Skeleton:
+def _merge(skeleton: Skeleton) -> Skeleton:
     """The skeleton with nodes merged that are connected by an arc shorter than a millimetre.
 
     Rounding to the grid would make clusters of nodes, as in the centre of a regular polygon, invert faces.

@@ -97,11 +97,11 @@ def build_solids(
                 continue
             pieces = replace(pieces, parapet=np.zeros(len(pieces.row)))
         if attempt == "aligned-parts":
-            pieces = _aligned(pieces)
+            pieces = _align(pieces)
         elif attempt in ("flat-roof", "cleaned-footprint"):
             pieces = replace(pieces, flat=np.ones(len(pieces.row), np.bool_))
         if attempt == "cleaned-footprint":
-            pieces = _simplified(pieces)
+            pieces = _simplify(pieces)
         tried = _overlapping(pieces) if attempt == "overlapping-roofs" else pieces
         shells, failed, notes = _bodies(buildings, tried)
         problems += notes
@@ -138,7 +138,7 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
     underside = base[building] + low
     grounded = low <= 0
     underside[grounded] = np.minimum(underside, foot[building])[grounded]
-    polygon = _straightened(polygon, building)
+    polygon = _straighten(polygon, building)
     return _Pieces(
         polygon, row, building, base[building], underside, base[building] + high, flat, np.zeros(len(row))
     )
@@ -153,7 +153,7 @@ def _parapets(pieces: _Pieces, parapet: Float) -> Float:
     return rise
 
 
-def _straightened(polygons: Polygons, building: Ints) -> Polygons:
+def _straighten(polygons: Polygons, building: Ints) -> Polygons:
     """Polygons (n,) without corners in straight walls, unless another piece of the building has them."""
     simple = shapely.simplify(polygons, _STRAIGHT)
     longer = np.isin(
@@ -180,7 +180,7 @@ def _mean_heights(buildings: Buildings) -> Float:
     return np.divide(sums, total, out=buildings.height.copy(), where=total > 0)
 
 
-def _aligned(pieces: _Pieces) -> _Pieces:
+def _align(pieces: _Pieces) -> _Pieces:
     """The pieces of each building on a common grid of 2 cm in plan and 1 cm in height.
 
     Corners and edges of different pieces then coincide or are at least 1 cm apart (snap rounding).
@@ -211,7 +211,7 @@ def _overlapping(pieces: _Pieces) -> _Pieces:
     return _cut(pieces, shapely.buffer(pieces.polygon, _OVERLAP * rank, join_style="mitre"))
 
 
-def _simplified(pieces: _Pieces) -> _Pieces:
+def _simplify(pieces: _Pieces) -> _Pieces:
     """The pieces with footprints opened by 5 mm and rounded to 1 cm, which removes thin necks and spikes.
 
     Pieces of a divided building also lose 1 cm all around, so that those side by side do not touch.
@@ -294,7 +294,7 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[ShellTriangles, list
 
     given: list[tuple[ShellTriangles, dict[int, str]]] = []
     given += make_without_failures(
-        lambda rows: _roofed(buildings, pieces, rows=rows), np.flatnonzero(~pieces.flat), failed=failed
+        lambda rows: _roof(buildings, pieces, rows=rows), np.flatnonzero(~pieces.flat), failed=failed
     )
     made += [shells for shells, _ in given]
     for _, replaced in given:
@@ -305,7 +305,7 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[ShellTriangles, list
     return ShellTriangles.concatenate(made), notes
 
 
-def _roofed(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[ShellTriangles, dict[int, str]]:
+def _roof(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[ShellTriangles, dict[int, str]]:
     """The closed shells of pieces (rows) with their roofs, and what was replaced of them, by piece."""
     of = pieces.row[rows]
     columns = (

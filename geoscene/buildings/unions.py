@@ -10,7 +10,7 @@ import manifold3d as m3
 import numpy as np
 import shapely
 
-from geoscene.buildings.clearance import parted
+from geoscene.buildings.clearance import part
 from geoscene.buildings.footprints import to_grid
 from geoscene.buildings.shells import ShellTriangles
 from geoscene.geometry.intersections import intersecting_faces, plan_axes
@@ -52,7 +52,7 @@ def unite(
     corners = np.concatenate([np.empty((0, 3, 3)), *(corners for _, corners, _ in drafts)])
     fine = check_solids(corners, owner, n=len(drafts)).ok
     made = (
-        (union.result(corners, run), "") if ok else _mended(union)
+        (union.result(corners, run), "") if ok else _mend(union)
         for (union, corners, run), ok in zip(drafts, fine, strict=True)
     )
     return [None if union is None else next(made) for union in unions]
@@ -143,7 +143,7 @@ def _without_slivers(corners: Float, run: Ints) -> tuple[Float, Ints]:
     return corners[thick], run[thick]
 
 
-def _mended(union: _Union) -> tuple[ShellTriangles, str] | None:
+def _mend(union: _Union) -> tuple[ShellTriangles, str] | None:
     """A union with a fault, its faces parted, simplified, or with beads where it touches itself.
 
     None if that does not help.
@@ -175,7 +175,7 @@ def _without_faults(corners: Float) -> Float | None:
     owner = np.zeros(len(corners), np.int64)
     found = check_solids(corners, owner, n=1)
     if found.valid[0] and not found.ok[0]:
-        corners = parted(corners)
+        corners = part(corners)
         found = check_solids(corners, owner, n=1)
     return corners if found.ok[0] else None
 

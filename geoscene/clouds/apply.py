@@ -119,11 +119,11 @@ def _with_buildings(
     about = {
         **dict(sorted(counts.items())),
         "shapes": dict(sorted(Counter(roof.shape for roof in roofs if roof.shape).items())),
-        "sigma_m_median": _rounded(sigma, 50),
-        "sigma_m_95": _rounded(sigma, 95),
+        "sigma_m_median": _round_size(sigma, 50),
+        "sigma_m_95": _round_size(sigma, 95),
         "tagged_compared": len(differences),
-        "cloud_minus_tag_m_median": _rounded(differences, 50),
-        "cloud_minus_tag_m_abs_95": _rounded(np.abs(differences).tolist(), 95),
+        "cloud_minus_tag_m_median": _round_size(differences, 50),
+        "cloud_minus_tag_m_abs_95": _round_size(np.abs(differences).tolist(), 95),
     }
     return replace(osm, areas=areas + added), about, problems
 
@@ -184,7 +184,7 @@ def _with_trees(
     mapped = [k for k, point in enumerate(osm.points) if point.tags.get("natural") == "tree"]
     lonlat = np.array([(osm.points[k].lon, osm.points[k].lat) for k in mapped]).reshape(-1, 2)
     xy = np.column_stack(frame.from_geographic(*lonlat.T)).reshape(-1, 2)
-    of_found = _matched(xy, found.xy, crown=found.crown)
+    of_found = _match(xy, found.xy, crown=found.crown)
     points = list(osm.points)
     for k, row in zip(mapped, of_found.tolist(), strict=True):
         if row >= 0:
@@ -216,7 +216,7 @@ def _sizes(height: float, crown: float) -> Tags:
     return {"height": f"{height:.2f}", "diameter_crown": f"{crown:.2f}", CLOUD_TREE: "yes"}
 
 
-def _matched(xy: Float, found: Float, *, crown: Float) -> Ints:
+def _match(xy: Float, found: Float, *, crown: Float) -> Ints:
     """The found tree (n,) of each mapped one, -1 for none: pairs one to one, the nearest first."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - slow to import
 
@@ -263,5 +263,5 @@ def _in_rows(osm: OsmData, frame: Frame, *, xy: Float) -> Any:
     return inside
 
 
-def _rounded(values: list[float], percent: float) -> float | None:
+def _round_size(values: list[float], percent: float) -> float | None:
     return round(float(np.percentile(values, percent)), 3) if len(values) else None

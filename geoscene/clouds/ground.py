@@ -88,7 +88,7 @@ def ground_heights(points: SurveyPoints, grid: CloudGrid, *, classified: bool, b
         )
     east, north = grid.centres()
     if (count > 0).any():
-        along_y, along_x = np.gradient(bridged(z), grid.cell)
+        along_y, along_x = np.gradient(bridge(z), grid.cell)
         z -= np.clip(along_x, -1.0, 1.0) * (x - east) + np.clip(along_y, -1.0, 1.0) * (y - north)
     return np.asarray(z, float)
 
@@ -111,13 +111,13 @@ def ground_returns(points: SurveyPoints, grid: CloudGrid, *, built: Bools) -> Bo
     if np.isnan(low).all():
         return np.zeros(len(points), np.bool_)
     objects = _low_outliers(low, grid.cell)
-    surface = bridged(np.where(objects, np.nan, low))
+    surface = bridge(np.where(objects, np.nan, low))
     earlier = surface
     for radius in range(1, int(np.ceil(WINDOW / grid.cell)) + 1):
         opened = grey_opening(earlier, size=(2 * radius + 1, 2 * radius + 1), mode="nearest")
         objects |= earlier - opened > _SLOPE * radius * grid.cell
         earlier = opened
-    ground = bridged(np.where(objects, np.nan, surface))
+    ground = bridge(np.where(objects, np.nan, surface))
     steep = np.hypot(*np.gradient(ground, grid.cell))
     cell = grid.cells(points.xyz[:, :2])
     reach = _OFF[0] + _OFF[1] * np.minimum(steep, 2.0) * grid.cell / 2
@@ -135,12 +135,12 @@ def bridged_by_blocks(heights: Float) -> Float:
             block = out[row : row + _BLOCK, column : column + _BLOCK]
             if np.isnan(block).any():
                 first = row - low[0], column - low[1]
-                filled = bridged(around.astype(float), beyond=False)
+                filled = bridge(around.astype(float), beyond=False)
                 block[:] = filled[first[0] : first[0] + block.shape[0], first[1] : first[1] + block.shape[1]]
     return out
 
 
-def bridged(heights: Float, *, beyond: bool = True) -> Float:
+def bridge(heights: Float, *, beyond: bool = True) -> Float:
     """Heights with NaN cells by linear interpolation between the cells around.
 
     beyond : cells that are not between others take the nearest height, else they stay NaN
@@ -156,13 +156,13 @@ def bridged(heights: Float, *, beyond: bool = True) -> Float:
         filled = np.asarray(heights[row, column], float)
     rim = np.column_stack(np.nonzero(binary_dilation(gap, iterations=2) & ~gap))
     if len(rim) > 3 and np.ptp(rim, axis=0).all():
-        linear = _interpolated(heights, rim)
+        linear = _interpolate(heights, rim)
         between = gap & np.isfinite(linear)
         filled[between] = linear[between]
     return filled
 
 
-def _interpolated(heights: Float, places: NDArray[np.int64]) -> Float:
+def _interpolate(heights: Float, places: NDArray[np.int64]) -> Float:
     """Heights (rows, columns) on the Delaunay triangles over some cells (n, 2); NaN beside all triangles.
 
     The triangles are burnt into the raster: SciPy's interpolator solves equations for each of them in threads
@@ -197,6 +197,6 @@ def _low_outliers(low: Float, cell: float) -> Bools:
     """Cells whose lowest return is far below all around: echoes from below the ground."""
     from scipy.ndimage import grey_closing  # noqa: PLC0415 - slow to import
 
-    surface = bridged(low)
+    surface = bridge(low)
     closed = grey_closing(surface, size=(3, 3), mode="nearest")
     return np.asarray(closed - surface > 5.0 * _SLOPE * cell + 0.5, np.bool_)

@@ -82,7 +82,7 @@ class CloudMeasurements:
     trees: canopy.DetectedTrees
 
 
-def classified(spool: Spool) -> bool:
+def is_classified(spool: Spool) -> bool:
     """Whether the ground is told by class: of at least one point in a hundred."""
     return 100 * spool.ground >= spool.read - spool.outside
 
@@ -161,7 +161,7 @@ def _ground_of(work: Work, square: Square) -> GroundOf:
     if not len(points):
         return GroundOf(square, np.full((grid.rows - 2 * around,) * 2, np.nan), none, 0)
     built = burnt(work.footprints, grid, buffer=0.5)
-    heights = ground_heights(points, grid, classified=classified(work.spool), built=built)
+    heights = ground_heights(points, grid, classified=is_classified(work.spool), built=built)
     score = none
     if np.isfinite(heights).any() and built.any():
         fine = grid_of(square, shifts.CELL, margin=shifts.MARGIN)

@@ -90,7 +90,7 @@ def fit_roof(polygon: Any, xyz: Float, *, seed: str) -> Roof | None:
             field = _height_field(polygon, spec, xy=xyz[:, :2])
             if field is None:
                 continue
-            fitted = _pitched(field, z, spec=spec, rng=rng)
+            fitted = _fit_pitched(field, z, spec=spec, rng=rng)
             if fitted is None or fitted[0].height > _STEEPEST * radius:
                 continue
             roof, error = fitted
@@ -187,11 +187,11 @@ def _height_field(polygon: Any, spec: RoofSpec, *, xy: Float) -> Float | None:
         if note:
             return None
         corners = triangles.corners[triangles.surface == ROOF]
-        out = np.fmax(out, _interpolated(corners, xy))
+        out = np.fmax(out, _interpolate(corners, xy))
     return out if np.nanmax(out, initial=0.0) > 0 else None
 
 
-def _interpolated(corners: Float, xy: Float) -> Float:
+def _interpolate(corners: Float, xy: Float) -> Float:
     """Heights (n,) of triangles (m, 3, 3) at places (n, 2), NaN beside all."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     u, v = (b - a)[:, :2], (c - a)[:, :2]
@@ -209,7 +209,7 @@ def _interpolated(corners: Float, xy: Float) -> Float:
     return out
 
 
-def _pitched(
+def _fit_pitched(
     field: Float, z: Float, *, spec: RoofSpec, rng: np.random.Generator
 ) -> tuple[Roof, Float] | None:
     """The roof of a shape with the least truncated squares, and the errors (n,) of all points."""

@@ -14,12 +14,12 @@ import numpy as np
 from geoscene.buildings import read_buildings
 from geoscene.clouds.apply import with_measurements
 from geoscene.clouds.ground import MARGIN, CloudGrid, bridged_by_blocks
-from geoscene.clouds.measure import GroundOf, Work, burnt, classified, grounds_of, measure
+from geoscene.clouds.measure import GroundOf, Work, burnt, grounds_of, is_classified, measure
 from geoscene.clouds.read import SurveyFile, open_cloud
 from geoscene.clouds.shift import best_shift
 from geoscene.clouds.spool import SIDE, Spool, spool_clouds
 from geoscene.errors import InputError
-from geoscene.geometry.frames import Frame, extent_of, wrapped
+from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.sources.data import Credit, OsmData
@@ -58,7 +58,7 @@ def with_clouds(
     files = [open_cloud(Path(p), crs=cloud.cloud_crs, unit=cloud.cloud_unit) for p in cloud.cloud]
     _check_datums(files)
     west, south, east, north = osm.bounds
-    frame = Frame.at(wrapped((west + east) / 2), (south + north) / 2, crs=options.crs)
+    frame = Frame.at(wrap_longitude((west + east) / 2), (south + north) / 2, crs=options.crs)
     buildings, _ = read_buildings(osm, frame)
     footprints = buildings.footprint[: buildings.count]
     extent = extent_of(frame, osm.bounds, footprints=footprints)
@@ -109,7 +109,7 @@ def with_clouds(
         "shift_m": {"east": round(east_m, 3), "north": round(north_m, 3), "applied": bool(moved),
                     "gain": round(gain, 4)},
         "ground": {
-            "from": "class ground" if classified(spool) else "filter",
+            "from": "class ground" if is_classified(spool) else "filter",
             "cell_m": work.cell,
             "cells": known,
             "cells_bridged": bridged,

@@ -57,7 +57,7 @@ def find_trees(xyz: Float, above: Float, *, grid: CloudGrid, excluded: Bools) ->
     top = np.zeros(grid.rows * grid.columns)
     np.maximum.at(top, cell[free], above[free])
     top = top.reshape(grid.shape)
-    smooth = gaussian_filter(_closed(top), 0.6 / grid.cell)
+    smooth = gaussian_filter(_close(top), 0.6 / grid.cell)
     peaks, crown = _crowns(smooth, top, cell=grid.cell)
     if not len(peaks):
         return DetectedTrees(np.empty((0, 2)), np.empty(0), np.empty(0))
@@ -86,7 +86,7 @@ def find_trees(xyz: Float, above: Float, *, grid: CloudGrid, excluded: Bools) ->
     return DetectedTrees(centre[keep], height[keep], diameter[keep])
 
 
-def _closed(top: Float) -> Float:
+def _close(top: Float) -> Float:
     """The canopy with single cells that no point has hit taken from around."""
     from scipy.ndimage import grey_closing  # noqa: PLC0415 - slow to import
 

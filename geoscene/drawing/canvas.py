@@ -168,15 +168,15 @@ def _svg(mark: _Line | _Area | _Dot | _Picture | _Text) -> str:
     match mark:
         case _Line():
             stroke = f'fill="none" stroke="{_hex(mark.color)}" stroke-width="{mark.width:g}"'
-            return f'<polyline{_named(mark.name)} points="{_pairs(mark.points)}" {stroke}/>'
+            return f'<polyline{_name_of(mark.name)} points="{_pairs(mark.points)}" {stroke}/>'
         case _Area():
             fill = f'fill="{_hex(mark.color)}" fill-opacity="{mark.opacity:g}"'
-            return f'<polygon{_named(mark.name)} points="{_pairs(mark.points)}" {fill}/>'
+            return f'<polygon{_name_of(mark.name)} points="{_pairs(mark.points)}" {fill}/>'
         case _Dot():
             u, v = mark.place
             fill = "#fff" if mark.hollow else _hex(mark.color)
             return (
-                f'<circle{_named(mark.name)} cx="{u:.2f}" cy="{v:.2f}" r="{mark.radius:g}" fill="{fill}"'
+                f'<circle{_name_of(mark.name)} cx="{u:.2f}" cy="{v:.2f}" r="{mark.radius:g}" fill="{fill}"'
                 f' stroke="{_hex(mark.color)}" stroke-width="2"/>'
             )
         case _Picture():
@@ -185,7 +185,7 @@ def _svg(mark: _Line | _Area | _Dot | _Picture | _Text) -> str:
             Image.fromarray(mark.pixels).save(file, "PNG")
             data = base64.b64encode(file.getvalue()).decode()
             return (
-                f'<image{_named(mark.name)} x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}"'
+                f'<image{_name_of(mark.name)} x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}"'
                 f' height="{bottom - top:.2f}" preserveAspectRatio="none" style="image-rendering:pixelated"'
                 f' href="data:image/png;base64,{data}"/>'
             )
@@ -203,7 +203,7 @@ def _hex(color: Color) -> str:
     return "#" + "".join(f"{c:02x}" for c in color)
 
 
-def _named(name: str) -> str:
+def _name_of(name: str) -> str:
     return f' data-name="{html.escape(name)}"' if name else ""
 
 

@@ -32,12 +32,14 @@ class Globe:
         matrix[:3, 0] = -np.sin(lon), np.cos(lon), 0
         matrix[:3, 1] = -np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)
         matrix[:3, 2] = np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)
-        matrix[:3, 3] = earth_centred(frame, np.array([[x, y, 0.0]]), lift=lift)[0]
+        matrix[:3, 3] = to_earth_centred(frame, np.array([[x, y, 0.0]]), lift=lift)[0]
         return cls(frame, lift, matrix)
 
     def local(self, points: Float) -> Float:
         """East, north, up (n, 3) of points in scene metres."""
-        return (earth_centred(self.frame, points, lift=self.lift) - self.matrix[:3, 3]) @ self.matrix[:3, :3]
+        return (to_earth_centred(self.frame, points, lift=self.lift) - self.matrix[:3, 3]) @ self.matrix[
+            :3, :3
+        ]
 
     def jacobian(self, points: Float) -> Float:
         """(n, 3, 3) derivatives of east, north, up by scene x, y, z at points in scene metres."""
@@ -46,7 +48,7 @@ class Globe:
         return ((around[:, :3] - around[:, 3:]) / 2).transpose(0, 2, 1)
 
 
-def earth_centred(frame: Frame, points: Float, *, lift: float = 0.0) -> Float:
+def to_earth_centred(frame: Frame, points: Float, *, lift: float = 0.0) -> Float:
     """WGS 84 Earth-centred coordinates (n, 3), EPSG:4978, of points in scene metres."""
     lon, lat = frame.to_geographic(points[:, 0], points[:, 1])
     change = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)

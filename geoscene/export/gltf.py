@@ -171,7 +171,7 @@ class GlbWriter:
         origin    : (3,) position of the node, to which translations are relative
         rows      : (k,) row of each instance's feature in the property table
         """
-        shift, turn, size = _decomposed(transform)
+        shift, turn, size = _decompose(transform)
         attributes = {
             "TRANSLATION": self.accessor("copies", y_up(shift - origin).astype("<f4"), bounds=True),
             "ROTATION": self.accessor("copies", turn.astype("<f4")),
@@ -191,7 +191,7 @@ class GlbWriter:
         """Add a table of attributes, one row per feature (EXT_structural_metadata); returns its number."""
         properties, described = {}, {}
         for column, values in columns.items():
-            description, arrays = _encoded(np.asarray(values))
+            description, arrays = _encode(np.asarray(values))
             described[column] = description
             if arrays["values"]:  # a column without any text is left out: no view may be empty
                 properties[column] = {role: self._column(data) for role, data in arrays.items()}
@@ -349,7 +349,7 @@ def _material(code: int, color: Sequence[int]) -> dict[str, Any]:
     }
 
 
-def _decomposed(transform: Float) -> tuple[Float, Float, Float]:
+def _decompose(transform: Float) -> tuple[Float, Float, Float]:
     """Translation (k, 3), and rotation (k, 4: x, y, z, w) and scale (k, 3) in glTF's axes."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
 
@@ -365,7 +365,7 @@ _NUMBERS = {"f8": "FLOAT64", "f4": "FLOAT32", "i8": "INT64", "i4": "INT32", "i2"
 _NO_NUMBER = -9999.0
 
 
-def _encoded(values: NDArray[Any]) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _encode(values: NDArray[Any]) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Description of a column for EXT_structural_metadata, and its buffers."""
     if values.dtype == np.bool_:
         return {"type": "BOOLEAN"}, {"values": np.packbits(values, bitorder="little").tobytes()}

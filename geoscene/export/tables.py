@@ -70,7 +70,7 @@ def rows(scene: Scene, layer: str, *, crs: CRS) -> Iterator[Layer]:
     several = geometry_type(scene, layer, crs=crs) != scene.schema(layer).geometry_type
     for first in range(0, scene.table_length(layer), ROWS):
         some = scene.features(layer, geometry="projected", rows=range(first, first + ROWS))
-        geometry = some.geometry if same else _transformed(scene, some.geometry, crs=crs)
+        geometry = some.geometry if same else _transform(scene, some.geometry, crs=crs)
         if crs.is_geographic:
             geometry = cut_at_antimeridian(geometry)
         yield Layer(layer, as_multi(geometry) if several else geometry, some.columns)
@@ -93,18 +93,18 @@ def cut_at_antimeridian(geometry: NDArray[np.object_]) -> NDArray[np.object_]:
     west, _, east, _ = shapely.bounds(geometry).T
     out = geometry.copy()
     for row in np.flatnonzero(east - west > _HALF_TURN).tolist():
-        turned = _turned(geometry[row : row + 1], 2 * _HALF_TURN, where=lambda lon: lon < 0)
+        turned = _turn_longitudes(geometry[row : row + 1], 2 * _HALF_TURN, where=lambda lon: lon < 0)
         near, far = (
             shapely.get_parts(shapely.intersection(turned, shapely.box(x, -90, x + _HALF_TURN, 90)))
             for x in (0.0, _HALF_TURN)
         )
-        parts = np.concatenate([near, _turned(far, -2 * _HALF_TURN, where=np.isfinite)])
+        parts = np.concatenate([near, _turn_longitudes(far, -2 * _HALF_TURN, where=np.isfinite)])
         parts = parts[shapely.get_dimensions(parts) == shapely.get_dimensions(turned[0])]
         out[row] = as_multi(parts, owner=np.zeros(len(parts), np.int64))[0]
     return out
 
 
-def _turned(
+def _turn_longitudes(
     geometry: NDArray[np.object_], degrees: float, *, where: Callable[[Float], NDArray[np.bool_]]
 ) -> NDArray[np.object_]:
     """Geometries with an angle added to the longitudes that fulfil a condition."""
@@ -127,7 +127,7 @@ def as_multi(
     return gathered
 
 
-def _transformed(scene: Scene, geometry: NDArray[np.object_], *, crs: CRS) -> NDArray[np.object_]:
+def _transform(scene: Scene, geometry: NDArray[np.object_], *, crs: CRS) -> NDArray[np.object_]:
     """Geometries transformed to a CRS from the frame's projected coordinates."""
     flat = shapely.get_coordinates(geometry, include_z=True)
     east, north = scene.frame.origin

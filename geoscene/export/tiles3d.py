@@ -103,11 +103,11 @@ def _quadtree(nodes: dict[tuple[int, int], _Node]) -> _Node:
         groups: dict[tuple[int, int], list[_Node]] = {}
         for (i, j), node in level.items():
             groups.setdefault((i >> 1, j >> 1), []).append(node)
-        level = {index: _joined(children) for index, children in groups.items()}
+        level = {index: _join(children) for index, children in groups.items()}
     return next(iter(level.values()))
 
 
-def _joined(children: list[_Node]) -> _Node:
+def _join(children: list[_Node]) -> _Node:
     if len(children) == 1:
         return children[0]
     low = np.min([c.low for c in children], axis=0)

@@ -73,10 +73,10 @@ def write_gpkg(
             table = solids(scene)
             append(table, None, None)
             count, faces = len(table), int(table.columns["faces"].sum())
-    return Summary.of(path, "gpkg", objects=objects + count, solids=count, faces=faces, crs=_named(target))
+    return Summary.of(path, "gpkg", objects=objects + count, solids=count, faces=faces, crs=_name_of(target))
 
 
-def _named(crs: CRS) -> str:
+def _name_of(crs: CRS) -> str:
     code = crs.to_authority()
     return ":".join(code) if code else str(crs.name)
 
@@ -167,7 +167,7 @@ def write_geoparquet(
             count += n
         geo = _geoparquet_metadata(target, sorted(types), bounds=bounds if count else None)
         writer.add_key_value_metadata({"geo": json.dumps(geo)})
-    return Summary.of(path, "geoparquet", objects=count, crs=_named(target))
+    return Summary.of(path, "geoparquet", objects=count, crs=_name_of(target))
 
 
 def _column_name(layer: str, column: str) -> str:

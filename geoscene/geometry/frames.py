@@ -59,7 +59,7 @@ def utm_crs(lon_deg: float, lat_deg: float) -> str:
     return f"EPSG:{32600 + zone if lat_deg >= 0 else 32700 + zone}"
 
 
-def wrapped(lon_deg: float) -> float:
+def wrap_longitude(lon_deg: float) -> float:
     """The longitude within ±180°."""
     return lon_deg if -180 <= lon_deg <= 180 else (lon_deg + 180) % 360 - 180
 

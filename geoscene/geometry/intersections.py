@@ -194,7 +194,7 @@ def _meeting(a: int, b: int, corners: Ints, faces: Ints, planes: Float, same: Bo
         for j in range(3):
             same[i, j] = turned[j, i] = faces[a, i] == faces[b, j]
             shared += same[i, j]
-    if _separated(planes[a], two, same) or _separated(planes[b], one, turned):
+    if _is_separated(planes[a], two, same) or _is_separated(planes[b], one, turned):
         return _APART
     if _intersect(one, two, same, turned, shared):
         return _CROSSING
@@ -219,7 +219,7 @@ def _find_planes(corner: Ints, planes: Float) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _separated(planes: Float, other: Ints, same: Bools) -> bool:
+def _is_separated(planes: Float, other: Ints, same: Bools) -> bool:
     """Whether a plane of a triangle clearly has another triangle on one side, except for common corners.
 
     That is the triangle's own plane, or one through an edge, which it lies outside of; there only the ends
@@ -320,7 +320,7 @@ def _intersect(first: Ints, second: Ints, same: Bools, turned: Bools, shared: in
     if _one_side(own, same) or _one_side(others, turned):
         return False
     if shared == 2:
-        return _folded(first, second, same)
+        return _is_folded(first, second, same)
     return _edges_pierce(first, second, own, same) or _edges_pierce(second, first, others, turned)
 
 
@@ -426,7 +426,7 @@ def _meet_in_plane(p: Ints, q: Ints, triangle: Ints) -> bool:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _folded(first: Ints, second: Ints, same: Bools) -> bool:
+def _is_folded(first: Ints, second: Ints, same: Bools) -> bool:
     """Whether coplanar triangles with a common edge lie on the same side of it."""
     tip = other = 0
     for k in range(3):

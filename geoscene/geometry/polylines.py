@@ -65,7 +65,7 @@ def parts(line: Float, cuts: Float) -> NDArray[np.object_]:
     return found
 
 
-def summed(steps: Float, first: Ints) -> Float:
+def add_up(steps: Float, first: Ints) -> Float:
     """Sums (n,) of steps (n,) after given earlier ones (n,): stations of points of many lines in one array.
 
     In whole nanometres, so that they do not depend on the lines before.
@@ -82,7 +82,7 @@ def heads(lines: NDArray[np.object_], end: Float) -> NDArray[np.object_]:
     first = np.flatnonzero(np.diff(of, prepend=-1))
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[first] = 0.0
-    along = summed(step, first[of])
+    along = add_up(step, first[of])
     last = np.append(first[1:], len(of)) - 1
     end = np.minimum(end, along[last])
     # The cut is in the segment that ends in the first vertex beyond it.

@@ -11,7 +11,7 @@ from geoscene.ground.drape import drape as drape
 from geoscene.ground.drape import ground_tile as ground_tile
 from geoscene.ground.drape import water_levels as water_levels
 from geoscene.ground.joining import ground_tiles as ground_tiles
-from geoscene.ground.joining import joined as joined
+from geoscene.ground.joining import join_tiles as join_tiles
 from geoscene.ground.landcover import landcover as landcover
 from geoscene.ground.layers import Layers as Layers
 from geoscene.ground.layers import building_pads as building_pads

@@ -38,7 +38,7 @@ def sea(
     lines: list[Any] = [shapely.LineString(coastlines[k]) for k in inside]
     for k, point in _loose_ends([coastlines[k] for k in inside], box):
         border = shapely.shortest_line(shapely.Point(point), box.exterior)
-        lines.append(_extended(border))
+        lines.append(_extend(border))
         detail = f"led {border.length:.1f} m on to the edge of the scene"
         problems.append(Problem(names[inside[k]], "coastline", "repaired", "open-end", detail))
     faces = shapely.get_parts(shapely.polygonize([shapely.union_all([*lines, box.exterior])]))
@@ -60,7 +60,7 @@ def _loose_ends(coastlines: Sequence[Float], box: Any) -> list[tuple[int, Float]
     return [(int(e) // 2, ends[e]) for e in np.flatnonzero(loose)]
 
 
-def _extended(line: Any) -> Any:
+def _extend(line: Any) -> Any:
     """The line (two points) extended slightly past its end, so that it crosses what it touches."""
     (x0, y0), (x1, y1) = line.coords
     length = max(line.length, _ASIDE)

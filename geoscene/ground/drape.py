@@ -115,7 +115,7 @@ def drape(
     if plan.raised is not None:
         z += plan.raised.height(triangles.points)
     if levels is not None and wet and beside is not None:
-        z = _flooded(plan, triangles.points, z=z, levels=levels, beside=beside)
+        z = _flood(plan, triangles.points, z=z, levels=levels, beside=beside)
     color = np.zeros((256, 3), np.uint8)
     for material in materials().values():
         color[material.code] = material.color
@@ -198,7 +198,7 @@ def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Flo
     return np.concatenate(stations), np.concatenate(heights), tuple(turned)
 
 
-def _flooded(plan: GroundPlan, points: Float, *, z: Float, levels: WaterLevels, beside: Beside) -> Float:
+def _flood(plan: GroundPlan, points: Float, *, z: Float, levels: WaterLevels, beside: Beside) -> Float:
     """Heights (n,) of points (n, 2); those that water touches take its level."""
     vertex, row, _ = beside
     on_water = values_at(plan.layers.body, row, base="") != ""

@@ -21,7 +21,7 @@ _MOST_LINES = 100
 """The same for lines of the terrain, where the ground follows no relief."""
 
 
-def joined(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPlan:
+def join_tiles(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPlan:
     """The plan with squares on which nothing lies joined to tiles of 2, 4, 8 ... squares along a side.
 
     Such a square has no outline, none of the ``occupied`` squares' features, no forest (whose trees are

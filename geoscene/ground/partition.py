@@ -75,7 +75,7 @@ class GroundPlan:
     order, offset : segments by square, (k,) int32 and (t + 1,) int64: those of square (i, j) are
                 ``order[offset[k]:offset[k + 1]]``, k its place in `tiles`
     tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
-                `geoscene.ground.joined` has joined it to others
+                `geoscene.ground.join_tiles` has joined it to others
     span      : (t,) int64, squares along a side of the tile that each square is part of: 1, or a power of two
     kerbs     : by which sidewalks are raised above carriageways, None for level ones
     raised    : what stands above the planned height, None for nothing
@@ -147,7 +147,7 @@ def plan_ground(
              that the ground can follow a terrain (still water is not cut); 0 for none
     ruled  : tiles that have such lines; all by default
     coarse : spacing of the lines in other tiles, 0 for none
-    relief : heights that tiles follow, instead of lines, that `geoscene.ground.joined` makes of several
+    relief : heights that tiles follow, instead of lines, that `geoscene.ground.join_tiles` makes of several
     base   : class and material where no polygon lies
     kerbs  : by which sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
     raised : what stands above; its parts must be layers of their own (`geoscene.roadgraph.camber`)

@@ -76,11 +76,11 @@ def lattice(
     z = relief.height(*(axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")))
     height = np.round(z.reshape(len(x), len(y)) / _GRAIN) * _GRAIN
     error = np.zeros_like(height)
-    for step in _doubled(1, k):
+    for step in _double_until(1, k):
         _add_level(error, height, x=x, y=y, step=step, odd=odd and 2 * step == k)
     x, y, height, error = x[k:-k], y[k:-k], height[k:-k, k:-k], error[k:-k, k:-k]
     error[:: span * k, ::k] = error[::k, :: span * k] = np.inf
-    for step in _doubled(k, span * k):
+    for step in _double_until(k, span * k):
         _add_level(error, height, x=x, y=y, step=step, odd=False)
     return Lattice(x, y, error > relief.tolerance)
 
@@ -90,7 +90,7 @@ def relief_corners(vertices: Lattice, outline: shapely.Polygon) -> Float:
 
     outline : the tile's box, with all vertices that its sides have
     """
-    number = _halved(vertices.kept)
+    number = _halve(vertices.kept)
     corners = np.stack([vertices.x[number[..., 0]], vertices.y[number[..., 1]]], axis=-1)
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     corners = corners[u[:, 0] * v[:, 1] != u[:, 1] * v[:, 0]]  # beyond the extent they are lines
@@ -102,7 +102,7 @@ def relief_corners(vertices: Lattice, outline: shapely.Polygon) -> Float:
     return corners
 
 
-def _doubled(first: int, stop: int) -> list[int]:
+def _double_until(first: int, stop: int) -> list[int]:
     """Powers of two from ``first`` to below ``stop``."""
     return [2**n for n in range(first.bit_length() - 1, stop.bit_length() - 1)]
 
@@ -170,7 +170,7 @@ def _share(x: Float, step: int) -> Float:
     return share
 
 
-def _halved(kept: Bools) -> Ints:
+def _halve(kept: Bools) -> Ints:
     """Columns and rows (m, 3, 2) of the corners of triangles, counter-clockwise."""
     n = len(kept) - 1
     todo = np.array([[[n, n], [0, 0], [n, 0]], [[0, 0], [n, n], [0, n]]])

@@ -409,7 +409,7 @@ def _read(group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]) ->
         values, spikes=spikes, known=known, names=[r.path.name for r in group], metres=spacing
     )
     values[spikes] = np.nan
-    grid = ElevationGrid(first.crs.to_wkt(), origin, first.step, _filled(values, known), known)
+    grid = ElevationGrid(first.crs.to_wkt(), origin, first.step, _fill_gaps(values, known), known)
     return _Found(grid, spacing, posts, voids, problems)
 
 
@@ -467,7 +467,7 @@ def _repairs(
     return tuple(problems)
 
 
-def _filled(values: Float, known: Bools) -> Float:
+def _fill_gaps(values: Float, known: Bools) -> Float:
     """Values without gaps: voids by inverse distances, posts outside all rasters by the nearest."""
     from rasterio.fill import fillnodata  # noqa: PLC0415 - slow to import
     from scipy.ndimage import distance_transform_edt  # noqa: PLC0415 - slow to import

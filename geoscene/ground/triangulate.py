@@ -43,7 +43,7 @@ def triangulate(partition: Partition) -> PlaneTriangles:
     """
     found = shapely.constrained_delaunay_triangles(partition.polygon)
     rings, cell = shapely.get_coordinates(found, return_index=True)
-    return _checked(partition, rings.reshape(-1, 4, 2)[:, :3], cell=cell[::4])
+    return _check(partition, rings.reshape(-1, 4, 2)[:, :3], cell=cell[::4])
 
 
 def triangulate_relief(partition: Partition, vertices: Lattice) -> PlaneTriangles:
@@ -52,10 +52,10 @@ def triangulate_relief(partition: Partition, vertices: Lattice) -> PlaneTriangle
     Raises GeosceneError if the triangles do not add up to its area.
     """
     corners = relief_corners(vertices, partition.polygon[0])
-    return _checked(partition, corners, cell=np.zeros(len(corners), np.int64))
+    return _check(partition, corners, cell=np.zeros(len(corners), np.int64))
 
 
-def _checked(partition: Partition, corners: Float, *, cell: Ints) -> PlaneTriangles:
+def _check(partition: Partition, corners: Float, *, cell: Ints) -> PlaneTriangles:
     """Triangles with these corners (m, 3, 2), if they add up to the area of their cells (m,)."""
     points, number = distinct(corners.reshape(-1, 2))
     faces = number.reshape(-1, 3)

@@ -164,12 +164,12 @@ def _crown(name: str, habit: Habit, *, nth: int) -> Mesh:
     else:
         leaves, limbs = _clusters(habit, draw)
     material = "conifer" if habit.form == "needleleaved" else "foliage"
-    parts = [solid(body, klass=Class.TREE_CROWN, material=material) for body in _fitted(leaves)]
+    parts = [solid(body, klass=Class.TREE_CROWN, material=material) for body in _fit(leaves)]
     parts += [solid(_limb(tip), klass=Class.TRUNK, material="bark") for tip in limbs[: habit.branches]]
     return concatenate(parts)
 
 
-def _fitted(bodies: Sequence[Body]) -> list[Body]:
+def _fit(bodies: Sequence[Body]) -> list[Body]:
     """The bodies, stretched together to reach from z = 0 (or where they begin) to 1 and to x, y = +-0.5."""
     every = np.concatenate([points for points, _ in bodies])
     across = 0.5 / np.hypot(every[:, 0], every[:, 1]).max()

@@ -81,7 +81,7 @@ def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tup
     xy, draw, face = _places(floor, forests, box=box)
     feature = floor.feature[face].astype(np.int64)
     share, widest = _needle_shares(forests, feature), 1.2 * _spacing(forests)
-    trees = _sampled(xy, draw, feature=feature, share=share, widest=widest, relief=forests.relief)
+    trees = _sample(xy, draw, feature=feature, share=share, widest=widest, relief=forests.relief)
     return trees, _heights(floor.vertices[floor.faces[face]], xy)
 
 
@@ -155,7 +155,7 @@ def _needle_shares(forests: Forests, feature: Ints) -> Float:
     return np.where(known[place] == feature, share[place], 0.0)
 
 
-def _sampled(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float, relief: bool) -> Trees:
+def _sample(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float, relief: bool) -> Trees:
     """Trees at places (n, 2) with size and form by random numbers (4, n)."""
     n, needled = len(xy), draw[3] < share
     height = np.where(needled, HEIGHT["needleleaved"], HEIGHT["broadleaved"]) * (0.8 + 0.4 * draw[2])

@@ -15,7 +15,7 @@ from geoscene.geometry.mesh import ShapeInstances
 from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import GroundPlan
 from geoscene.objects.shapes import place, shapes
-from geoscene.objects.signs import directed, sign_face, sign_shape
+from geoscene.objects.signs import select_direction, sign_face, sign_shape
 from geoscene.objects.siting import Sites
 from geoscene.objects.street import stands as bicycle_stands
 from geoscene.objects.street import street_shape
@@ -168,7 +168,9 @@ def mapped_furniture(
     """The nodes within an extent that are street furniture, with their shapes, and their places (n, 2)."""
     points = osm.points
     if relief != "off":
-        points = [replace(p, tags=tags) if (tags := directed(p.tags)) is not p.tags else p for p in points]
+        points = [
+            replace(p, tags=tags) if (tags := select_direction(p.tags)) is not p.tags else p for p in points
+        ]
     chosen = [
         (point, shape)
         for point in points

@@ -28,7 +28,7 @@ def roof_shapes() -> dict[str, Mesh]:
                 _of(prism(rectangle(0.6, 0.6), 0.0, top=0.93), material="brick"),
                 _of(prism(rectangle(0.7, 0.7), 0.93, top=0.97), material="concrete"),
                 *(
-                    _of(_shifted(prism(circle(0.2, 6), 0.97, top=1.0), y=y), material="brick")
+                    _of(_shift(prism(circle(0.2, 6), 0.97, top=1.0), y=y), material="brick")
                     for y in (-0.14, 0.14)
                 ),
             ]
@@ -52,7 +52,7 @@ def roof_shapes() -> dict[str, Mesh]:
                 *(_of(box((0.1, 1.1), (-0.05, 0.25), at=(x, 0.0)), material="metal") for x in (-0.6, 0.6)),
                 _of(box((1.7, 1.2), (0.25, 1.25)), material="metal"),
                 *(
-                    _of(_shifted(prism(circle(0.75), 1.25, top=1.36), x=x), material="metal")
+                    _of(_shift(prism(circle(0.75), 1.25, top=1.36), x=x), material="metal")
                     for x in (-0.42, 0.42)
                 ),
             ]
@@ -65,10 +65,7 @@ def roof_shapes() -> dict[str, Mesh]:
                 ),
                 _of(box((4.0, 2.2), (0.35, 2.0), at=(-0.55, 0.0)), material="metal"),
                 _of(box((1.1, 1.0), (0.5, 1.5), at=(2.0, 0.0)), material="metal"),
-                *(
-                    _of(_shifted(prism(circle(1.1), 2.0, top=2.2), x=x), material="metal")
-                    for x in (-1.7, -0.1)
-                ),
+                *(_of(_shift(prism(circle(1.1), 2.0, top=2.2), x=x), material="metal") for x in (-1.7, -0.1)),
             ]
         ),
         "vent": concatenate(
@@ -111,7 +108,7 @@ def _of(body: Body, *, material: str, klass: Class = Class.BUILDING) -> Mesh:
     return solid(body, klass=klass, material=material)
 
 
-def _shifted(body: Body, *, x: float = 0.0, y: float = 0.0) -> Body:
+def _shift(body: Body, *, x: float = 0.0, y: float = 0.0) -> Body:
     return body[0] + np.array([x, y, 0.0]), body[1]
 
 

@@ -41,16 +41,16 @@ def sign_face(tags: Tags) -> str:
     country, colon, rest = value.partition(":")
     if not colon:
         name, _, words = value.partition("[")
-        return _filled(sign_codes()["names"].get(name.lower(), ""), words.rstrip("]"), tags=tags)
+        return _fill(sign_codes()["names"].get(name.lower(), ""), words.rstrip("]"), tags=tags)
     found = _CODE.match(rest.strip())
     codes = sign_codes().get(country.upper())
     if not found or not codes:
         return ""
     code, words = found["code"], found["words"] or ""
     if code in codes:
-        return _filled(codes[code], words, tags=tags)
+        return _fill(codes[code], words, tags=tags)
     stem, _, number = code.rpartition("-")
-    return _filled(codes.get(stem, ""), words or number, tags=tags)
+    return _fill(codes.get(stem, ""), words or number, tags=tags)
 
 
 def sign_shape(face: str) -> str:
@@ -58,7 +58,7 @@ def sign_shape(face: str) -> str:
     return _FORMS.get(face.partition(" ")[0], "sign_rectangle")
 
 
-def directed(tags: Tags) -> Tags:
+def select_direction(tags: Tags) -> Tags:
     """Tags with ``traffic_sign`` for the direction that ``traffic_sign:forward`` or ``:backward`` states."""
     stated = [way for way in ("forward", "backward") if tags.get(f"traffic_sign:{way}", "no") != "no"]
     if "traffic_sign" in tags or len(stated) != 1:
@@ -73,7 +73,7 @@ def directed(tags: Tags) -> Tags:
     }
 
 
-def _filled(face: str, words: str, *, tags: Tags) -> str:
+def _fill(face: str, words: str, *, tags: Tags) -> str:
     """A face with its words, or those of other tags, in place of ``{}``."""
     if "{}" not in face:
         return face

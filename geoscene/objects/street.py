@@ -260,7 +260,7 @@ def site_guesses(guesses: FurnitureGuesses, sites: Sites, *, taken: Taken) -> tu
     along the front, where 1.2 m stay free before them. What comes within `_APART` of
     a mapped object, a tree or a barrier is left out, and so is the kind that is mapped within `_KNOWN`.
     """
-    rows = _unmapped(guesses, taken)
+    rows = _select_unmapped(guesses, taken)
     at_table = ~guesses.toward[rows].any(axis=1)
     beside = _at_kerbs(guesses, sites, rows=rows[~at_table])
     seated = _at_fronts(guesses, sites, rows=rows[at_table])
@@ -273,7 +273,7 @@ def site_guesses(guesses: FurnitureGuesses, sites: Sites, *, taken: Taken) -> tu
     return row[order], xy[order], heading[order]
 
 
-def _unmapped(guesses: FurnitureGuesses, taken: Taken) -> Ints:
+def _select_unmapped(guesses: FurnitureGuesses, taken: Taken) -> Ints:
     """Rows of the guesses without a mapped object of their kind near them."""
     near = np.zeros(len(guesses), np.bool_)
     for shape in np.unique(taken.shape):

@@ -50,7 +50,7 @@ def build(
     The bytes depend neither on ``workers`` or ``cluster`` nor on earlier builds.
 
     workers : processes that build tiles
-    cluster : whose workers build the tiles instead, see `geoscene.support.cluster.connected`
+    cluster : whose workers build the tiles instead, see `geoscene.support.cluster.connect`
 
     needed : chooses the area to build, once the roads and buildings of the map are known
     former : another scene whose unchanged tiles are reused

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from geoscene import __version__
-from geoscene.geometry.frames import wrapped
+from geoscene.geometry.frames import wrap_longitude
 from geoscene.ground import tile_span
 from geoscene.ground.kerbs import count_covers, count_kerbs
 from geoscene.objects.shapes import leaf_area_density
@@ -50,7 +50,7 @@ def scene_manifest(
         "attribution": "; ".join(dict.fromkeys(s["attribution"] for s in sources if "attribution" in s)),
         "fingerprint": fingerprint,
         "sources": sources,
-        "geographic_bounds": [west, south, wrapped(east), north],
+        "geographic_bounds": [west, south, wrap_longitude(east), north],
         "bounds": [xmin, ymin, xmax, ymax],
         "tile_size": options["tile_size"],
         "tiles": sorted((r.i, r.j, tile_span(plan.ground, r.i, j=r.j)) for r in reports),

@@ -14,13 +14,13 @@ from geoscene.buildings import Buildings, read_buildings
 from geoscene.buildings.facades import FacadeSetting, read_setting
 from geoscene.buildings.tops import with_measured_tops
 from geoscene.errors import InputError
-from geoscene.geometry.frames import Frame, extent_of, wrapped
+from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground import (
     GroundPlan,
     Layers,
     WaterLevels,
     building_pads,
-    joined,
+    join_tiles,
     landcover,
     plan_ground,
     tile_span,
@@ -316,7 +316,7 @@ def _checked_centre(osm: OsmData) -> tuple[float, float]:
             f"{osm.source}: {area:,.0f} km2, more than the maximum of {LARGEST_KM2:,.0f} km2 for a scene;"
             " select a part of it with `bbox`"
         )
-    return wrapped((west + east) / 2), (south + north) / 2
+    return wrap_longitude((west + east) / 2), (south + north) / 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -497,7 +497,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     )
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
-        for name, table in _sited(
+        for name, table in _site(
             osm, frame, ground=ground, found=found, side=roads.side, relief=options.relief, problems=problems
         )
     )
@@ -521,7 +521,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             shapely.bounds(wires.lines).reshape(-1, 4),
         ]
     )
-    ground = joined(ground, {*rows["buildings"], *rows["parts"], *_squares(boxes, options.tile_size)})
+    ground = join_tiles(ground, {*rows["buildings"], *rows["parts"], *_squares(boxes, options.tile_size)})
 
     chosen = all_tiles(ground, rows)
     if reach is not None:
@@ -663,7 +663,7 @@ def _no_rows(table: Any) -> Any:
     return None if table is None else table.take(np.empty(0, np.int64))
 
 
-def _sited(
+def _site(
     osm: OsmData,
     frame: Frame,
     *,

@@ -37,7 +37,7 @@ from geoscene.structures import StructureOptions, built_structures
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.files import digest_of, naming, write_atomically
 from geoscene.support.processes import run_tasks
-from geoscene.support.report import Problem, described, make_without_failures, unexpected
+from geoscene.support.report import Problem, describe_unexpected, described, make_without_failures
 from geoscene.typing import Bools, Ints
 
 T = TypeVar("T")
@@ -157,7 +157,7 @@ def make_ground(plan: BuildPlan, tile: tuple[int, int]) -> TileSurroundings:
 
     def made(table: Any, kind: str, *, make: Callable[[Ints], T]) -> list[T]:
         def failed(row: int, error: Exception) -> None:
-            problems.append(unexpected(str(table.osm_id[row]), error, kind=_SINGULAR[kind]))
+            problems.append(describe_unexpected(str(table.osm_id[row]), error, kind=_SINGULAR[kind]))
 
         return make_without_failures(make, plan.of_tile(kind, i, j=j), failed=failed)
 
@@ -269,7 +269,7 @@ def _facades(plan: BuildPlan, setting: FacadeSetting, *, solids: Mesh, problems:
     """The relief of the walls of a tile's buildings and what stands out of them, scene metres."""
 
     def failed(row: int, error: Exception) -> None:
-        problems.append(unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
+        problems.append(describe_unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
         bad.append(row)
 
     def made(rows: Ints) -> Layout:
@@ -296,7 +296,7 @@ def _roof_objects(
     rooftops = plan.rooftops
 
     def failed(row: int, error: Exception) -> None:
-        problems.append(unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
+        problems.append(describe_unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
 
     made = make_without_failures(
         lambda rows: roof_objects(solids.take(np.isin(solids.feature, rows)), rooftops),

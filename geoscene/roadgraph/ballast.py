@@ -44,7 +44,7 @@ def read_beds(osm: OsmData, frame: Frame, *, cover: Layers, others: Layers) -> t
     ways, lines = way_lines([way for way in osm.ways if way.tags.get("railway") in _TRACKS], frame)
     on_ground = np.array([_place(way.tags) == 0 for way in ways], np.bool_)
     ends = shapely.get_parts(shapely.boundary(lines[~on_ground]))
-    bedded = on_ground & np.array([_bedded(way.tags) for way in ways], np.bool_)
+    bedded = on_ground & np.array([_embed(way.tags) for way in ways], np.bool_)
     lines, ids = lines[bedded], [way.osm_id for way, b in zip(ways, bedded, strict=True) if b]
     obstacle = _obstacles(cover, others, lines=lines)
     wide = shapely.union_all(shapely.buffer(lines, _TOP + _GAP, cap_style="flat", join_style="mitre"))
@@ -63,7 +63,7 @@ def _place(tags: Tags) -> int:
     return place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags))
 
 
-def _bedded(tags: Tags) -> bool:
+def _embed(tags: Tags) -> bool:
     return surface_material(tags, "ballast")[0] in {"ballast", "gravel"}
 
 

@@ -102,7 +102,7 @@ def camber_of(roads: Carriageways, crowns: Crowns) -> Camber:
     first = np.flatnonzero(np.diff(of, prepend=-1))
     step = np.hypot(*np.diff(xy, axis=0, prepend=xy[:1]).T)
     step[first] = 0.0
-    share = polylines.summed(step, first[of])[:, None] / length[of, None] if len(of) else np.empty((0, 1))
+    share = polylines.add_up(step, first[of])[:, None] / length[of, None] if len(of) else np.empty((0, 1))
     crown = (crowns.crown[of, :1] * (1.0 - share) + crowns.crown[of, 1:] * share)[:, 0]
     return Camber.of(
         xy[on],

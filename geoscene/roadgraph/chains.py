@@ -96,7 +96,7 @@ def link_chains(runs: Runs, cut: Bools) -> list[RoadChain]:
                 break
             used[following[0]] = True
             piece = pieces[following[0]]
-            found.append(piece if piece.node[0] == node else _turned(piece))
+            found.append(piece if piece.node[0] == node else _turn(piece))
             node = int(found[-1].node[-1])
         return found
 
@@ -106,8 +106,8 @@ def link_chains(runs: Runs, cut: Bools) -> list[RoadChain]:
             continue
         used[number] = True
         ahead = follow(int(piece.node[-1]))
-        behind = [_turned(p) for p in reversed(follow(int(piece.node[0])))]
-        chains.append(_joined([*behind, piece, *ahead]) if ahead or behind else piece)
+        behind = [_turn(p) for p in reversed(follow(int(piece.node[0])))]
+        chains.append(_join([*behind, piece, *ahead]) if ahead or behind else piece)
     return chains
 
 
@@ -122,10 +122,10 @@ def _pieces(runs: Runs, cut: Bools) -> list[RoadChain]:
     return pieces
 
 
-def _turned(piece: RoadChain) -> RoadChain:
+def _turn(piece: RoadChain) -> RoadChain:
     return RoadChain(piece.node[::-1], piece.way[::-1])
 
 
-def _joined(pieces: Sequence[RoadChain]) -> RoadChain:
+def _join(pieces: Sequence[RoadChain]) -> RoadChain:
     nodes = [pieces[0].node, *(piece.node[1:] for piece in pieces[1:])]
     return RoadChain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))

@@ -41,13 +41,13 @@ def cover_rows(osm: OsmData, roads: Carriageways, *, frame: Frame, guess: bool) 
     patches along streets of built-up areas: drawn by the ids of the street and of its first node, and by
     the place along it, whatever else there is.
     """
-    parts = [_mapped(osm, roads, frame=frame)]
+    parts = [_find_mapped(osm, roads, frame=frame)]
     if guess:
-        parts += [_guessed(roads, kind) for kind in _EVERY]
+        parts += [_guess_rows(roads, kind) for kind in _EVERY]
     return SurfaceRows.concatenate(parts)
 
 
-def _mapped(osm: OsmData, roads: Carriageways, *, frame: Frame) -> SurfaceRows:
+def _find_mapped(osm: OsmData, roads: Carriageways, *, frame: Frame) -> SurfaceRows:
     points = [point for point in osm.points if _is_manhole(point.tags)]
     x, y = frame.from_geographic([p.lon for p in points], [p.lat for p in points])
     xy = np.column_stack([x, y]) if points else np.empty((0, 2))
@@ -77,7 +77,7 @@ def _is_manhole(tags: Tags) -> bool:
     return mapped and tags.get("indoor", "no") == "no" and tags.get("layer", "0") == "0"
 
 
-def _guessed(roads: Carriageways, kind: str) -> SurfaceRows:
+def _guess_rows(roads: Carriageways, kind: str) -> SurfaceRows:
     """Rows of a kind along all streets of built-up areas."""
     every, length = _EVERY[kind], shapely.length(roads.line)
     street = np.array([s.highway in _STREETS and max(s.speed) <= _BUILT_UP for s in roads.street], np.bool_)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Literal, cast
 
-from geoscene.geometry.frames import wrapped
+from geoscene.geometry.frames import wrap_longitude
 from geoscene.sources.data import OsmData
 
 Side = Literal["left", "right"]
@@ -53,4 +53,4 @@ def driving_side(osm: OsmData) -> tuple[Side, str]:
     if tagged and 2 * tagged.total() >= len(tags):
         return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"
     west, south, east, north = osm.bounds
-    return side_at(wrapped((west + east) / 2), (south + north) / 2), "place"
+    return side_at(wrap_longitude((west + east) / 2), (south + north) / 2), "place"

@@ -160,7 +160,7 @@ def _graded_height(x: Float, y: Float, *, ground: Height, roads: _Pieces, survey
     z = np.asarray(ground(x, y), float)
     places = (roads.square, roads.first, roads.piece, roads.corner, roads.shape, roads.side)
     pieces = (roads.start, roads.end, roads.half, roads.square_ends, roads.batter)
-    road_z, most, near = _weighed(
+    road_z, most, near = _weigh(
         np.ascontiguousarray(x, float), np.ascontiguousarray(y, float), places, pieces
     )
     road_z = np.where(near, road_z, z)
@@ -175,7 +175,7 @@ def _graded_height(x: Float, y: Float, *, ground: Height, roads: _Pieces, survey
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _weighed(
+def _weigh(
     x: Float,
     y: Float,
     places: tuple[Ints, Ints, Ints, Ints, Ints, float],

@@ -161,11 +161,11 @@ def _symbols(
                 yield "turn", travel.laid(arrow(turn, left_hand=left_hand), start, left=left[lane])
     buses = {lane for lane in uses.bus[side] if lane < lanes}
     if buses:
-        for start in _repeated(travel, word("BUS"), kind="bus"):
+        for start in _repeat(travel, word("BUS"), kind="bus"):
             for lane in sorted(buses):
                 yield "busway", travel.laid(word("BUS"), start, left=left[lane])
     if uses.speed and (enters or not uses.zone):
-        for start in _repeated(travel, word(uses.speed), kind="speed"):
+        for start in _repeat(travel, word(uses.speed), kind="speed"):
             for lane in sorted(set(range(lanes)) - buses):
                 yield "maxspeed", travel.laid(word(uses.speed), start, left=left[lane])
     for which, cycle in enumerate(uses.cycle):
@@ -175,7 +175,7 @@ def _symbols(
             continue
         aside = _cycle_offset(cycle, stretch, one_way=street.direction != 0)
         mark = bicycle(chevrons=cycle.kind == "shared")
-        for start in _repeated(travel, mark, kind=cycle.kind):
+        for start in _repeat(travel, mark, kind=cycle.kind):
             yield "cycleway", travel.laid(mark, start, left=aside if on_left else -aside)
 
 
@@ -205,7 +205,7 @@ def _middles(
     return middle
 
 
-def _repeated(travel: _Travel, symbol: Any, *, kind: str) -> Iterator[float]:
+def _repeat(travel: _Travel, symbol: Any, *, kind: str) -> Iterator[float]:
     """Stations of a symbol that is repeated along a stretch; of a limit that is not, the first."""
     size = float(symbol.bounds[2])
     start: float | None = _AFTER[kind]

@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from geoscene.roadgraph.tags import CYCLE_LANE, Street, is_plain, parking_width, sided
+from geoscene.roadgraph.tags import CYCLE_LANE, Street, is_plain, parking_width, tag_of_side
 from geoscene.sources.data import Tags
 from geoscene.tags import parse_length
 
@@ -134,7 +134,7 @@ def _bus_lanes(tags: Tags, street: Street, *, side: int, count: int, left_hand: 
     kept = "left" if left_hand else "right"
     if street.direction == 0:
         own = kept if side == 0 else _other(kept)
-        return (outer,) if sided(tags, "busway", side=own) == "lane" else ()
+        return (outer,) if tag_of_side(tags, "busway", side=own) == "lane" else ()
     if is_plain(tags, "busway"):
         return (outer,) if tags["busway"] == "lane" else ()
     lanes = (0, count - 1) if side == 0 else (count - 1, 0)
@@ -142,7 +142,7 @@ def _bus_lanes(tags: Tags, street: Street, *, side: int, count: int, left_hand: 
         sorted(
             lane
             for lane, name in zip(lanes, ("left", "right"), strict=True)
-            if sided(tags, "busway", side=name) == "lane"
+            if tag_of_side(tags, "busway", side=name) == "lane"
         )
     )
 
@@ -158,7 +158,7 @@ def _cycle_lanes(tags: Tags, street: Street, *, left_hand: bool) -> tuple[CycleL
     plain = street.direction != 0 and is_plain(tags, "cycleway")
     found: list[CycleLane | None] = []
     for side in ("left", "right"):
-        value = sided(tags, "cycleway", side=side)
+        value = tag_of_side(tags, "cycleway", side=side)
         # Plain on a one-way street, a lane is on the side that traffic keeps to, one against it on the other.
         here = not plain or (side == kept) == (value != "opposite_lane")
         found.append(_cycle_lane(tags, street, side=side) if here else None)
@@ -176,7 +176,7 @@ def _at_kerb(lane: CycleLane | None) -> CycleLane | None:
 
 
 def _cycle_lane(tags: Tags, street: Street, *, side: str) -> CycleLane | None:
-    value = sided(tags, "cycleway", side=side)
+    value = tag_of_side(tags, "cycleway", side=side)
     if value not in ("lane", "opposite_lane", "shared_lane"):
         return None
     kind, oneway, width = (

@@ -101,7 +101,7 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     step = np.diff(xy, axis=0, append=xy[-1:])
     step[last] = 0.0
     metres = np.hypot(*step.T)
-    corner = polylines.summed(np.concatenate([[0.0], metres[:-1]]), first[of])
+    corner = polylines.add_up(np.concatenate([[0.0], metres[:-1]]), first[of])
     pieces = np.maximum(np.ceil(metres / spacing), 1).astype(np.int64)
     vertex = np.repeat(np.arange(len(xy)), pieces)
     part = np.arange(len(vertex)) - np.repeat(np.cumsum(pieces) - pieces, pieces)

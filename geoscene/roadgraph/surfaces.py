@@ -195,7 +195,7 @@ def _carriageway_rows(
         (Class.SIDEWALK, SIDEWALKS, walk_material, "walk"),
     ):
         extra = np.where(roads.walk > 0, KERB + (roads.walk if shape == "walk" else 0.0), 0.0)
-        bands_of = _widened(roads, half, extra=extra, rows=chosen)
+        bands_of = _widen(roads, half, extra=extra, rows=chosen)
         corners = (joints.corner_main, joints.corner_number, getattr(joints, shape))
         for rows, number, bands in (*((rows, rows, bands) for rows, bands in bands_of), corners):
             out.append(
@@ -224,7 +224,7 @@ def _carriageway_rows(
     return out, count + len(roads)
 
 
-def _widened(
+def _widen(
     roads: Carriageways, half: Float, *, extra: Float, rows: Ints
 ) -> list[tuple[Ints, NDArray[np.object_]]]:
     """Bands ``extra`` (k, 2) wider than some carriageways on the left and right, with their rows."""

@@ -255,12 +255,12 @@ def _cycle_and_parking_width(tags: Tags) -> float:
     """Metres of the carriageway that mapped cycle lanes and rows of parked cars take up."""
     extra = 0.0
     for side in ("left", "right"):
-        lane = sided(tags, "cycleway", side=side) == "lane" and side in _sides(tags, "cycleway")
+        lane = tag_of_side(tags, "cycleway", side=side) == "lane" and side in _sides(tags, "cycleway")
         extra += (CYCLE_LANE if lane else 0.0) + parking_width(tags, side)
     return extra
 
 
-def sided(tags: Tags, key: str, *, side: str) -> str:
+def tag_of_side(tags: Tags, key: str, *, side: str) -> str:
     """Value of a tag such as ``cycleway`` on a side of the way, "" if there is none."""
     return tags.get(f"{key}:{side}", tags.get(f"{key}:both", tags.get(key, "")))
 

@@ -132,7 +132,7 @@ class SceneWriter:
         manifest : the manifest without frame, layers and codes
         """
         ranges = ranges or number_ranges({layer.name: len(layer) for layer in layers})
-        numbered = [_numbered(layer, ranges[layer.name][0]) for layer in layers]
+        numbered = [_number_features(layer, ranges[layer.name][0]) for layer in layers]
         cut: dict[str, Any] = {}
         if kept is not None:
             beyond = np.setdiff1d(np.arange(len(graph)), kept["roads"])
@@ -141,7 +141,7 @@ class SceneWriter:
             cut = {"nodes": np.intersect1d(onward, graph.node_id).tolist()}
         left_out: dict[str, int] = {}
         if use.tables is not None:
-            left_out, numbered = _left_out(numbered, use), [_needed(layer, use) for layer in numbered]
+            left_out, numbered = _left_out(numbered, use), [_select_needed(layer, use) for layer in numbered]
         write_geopackage(self.files.features, numbered, frame=frame, indexed=use.indexed)
         if len(graph):
             write_graphml(graph, frame, path=self.files.road_graph)
@@ -190,13 +190,13 @@ def number_ranges(counts: Mapping[str, int]) -> dict[str, tuple[int, int]]:
     return {name: (stop - counts[name], stop) for name, stop in zip(counts, stops, strict=True)}
 
 
-def _numbered(layer: Layer, first: int) -> Layer:
+def _number_features(layer: Layer, first: int) -> Layer:
     """The layer with feature numbers, from the first on unless it has its own."""
     rows = np.arange(first, first + len(layer), dtype=np.int32)
     return Layer(layer.name, layer.geometry, {"feature": rows, **layer.columns})
 
 
-def _needed(layer: Layer, use: Use) -> Layer:
+def _select_needed(layer: Layer, use: Use) -> Layer:
     """The rows and columns of a layer that a use needs."""
     needed = Needed() if use.tables is None else use.tables.get(layer.name, Needed((), ()))
     rows: Any = slice(None)
@@ -211,7 +211,7 @@ def _left_out(layers: Sequence[Layer], use: Use) -> dict[str, int]:
     """Number of features that a use does not need, of attributes of the others, and bytes of both."""
     found = {"features": 0, "attributes": 0, "bytes": 0}
     for layer in layers:
-        needed = _needed(layer, use)
+        needed = _select_needed(layer, use)
         found["features"] += len(layer) - len(needed)
         found["attributes"] += len(needed) * (len(layer.columns) - len(needed.columns))
         found["bytes"] += _bytes(layer) - _bytes(needed)

@@ -12,7 +12,7 @@ from geoscene.sources.data import Tags as Tags
 from geoscene.sources.data import Way as Way
 from geoscene.sources.registry import SOURCES as SOURCES
 from geoscene.sources.registry import credits_of as credits_of
-from geoscene.sources.registry import merged as merged
+from geoscene.sources.registry import merge_sources as merge_sources
 from geoscene.sources.registry import read_source as read_source
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import shapely
 
 from geoscene.sources.data import Area, Bounds, Tags
 from geoscene.sources.elements import Elements, Members
-from geoscene.sources.rings import RingMember, assemble, close_cut_ring, polygons_of, tangled
+from geoscene.sources.rings import RingMember, assemble, close_cut_ring, is_tangled, polygons_of
 from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
 from geoscene.support.report import Problem
 from geoscene.typing import Float, Ints
@@ -257,7 +257,7 @@ def way_areas(
         if len(nodes) < 4:
             problems.append(Problem(name, kind, "dropped", "no-area", f"{len(nodes)} nodes"))
             continue
-        if tangled(places.xy[nodes]):
+        if is_tangled(places.xy[nodes]):
             detail = f"{len(nodes)} nodes, over 10,000 crossings"
             problems.append(Problem(name, kind, "dropped", "tangled", detail))
             continue

@@ -9,7 +9,7 @@ from geoscene.errors import SourceNotFoundError
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import Bounds, OsmData, Relation, TaggedNode, Way
 from geoscene.sources.elements import UNITS, Elements
-from geoscene.sources.extent import checked_bounds, located, near_extent
+from geoscene.sources.extent import checked_bounds, locate, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.support.report import Action, Problem
 from geoscene.typing import Bools, Ints
@@ -66,7 +66,7 @@ def _lines(elements: Elements, rows: list[int]) -> tuple[list[Way], list[Problem
     return ways, problems
 
 
-def _uncrowded(ways: list[Way]) -> tuple[list[Way], list[Problem]]:
+def _drop_crowded(ways: list[Way]) -> tuple[list[Way], list[Problem]]:
     """The lines without those beyond the first 32 of a kind in one place, by id, and these as problems.
 
     No place has so many; the time to cut the ground along their borders grows with the square of the number.
@@ -94,7 +94,7 @@ def _uncrowded(ways: list[Way]) -> tuple[list[Way], list[Problem]]:
     return [way for k, way in enumerate(ways) if k not in dropped], sorted(problems)
 
 
-def _selected(data: OsmData, bounds: Bounds) -> OsmData:
+def _select(data: OsmData, bounds: Bounds) -> OsmData:
     """The features that intersect the bounds, not clipped; problems of features outside are left out."""
     box = shapely.box(*bounds)
     shapely.prepare(box)
@@ -136,7 +136,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         raise SourceNotFoundError(
             f"{source}: holds no nodes with coordinates; is it a whole OpenStreetMap extract?"
         )
-    elements, extent, far = located(elements, bounds)
+    elements, extent, far = locate(elements, bounds)
     places = Places.of(elements)
     near = _intersect(elements, bounds)
 
@@ -162,7 +162,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     ]
     ways, found = _lines(elements, lines)
     problems += found
-    ways, found = _uncrowded(ways)
+    ways, found = _drop_crowded(ways)
     problems += found
     data = OsmData(
         bounds=bounds or extent,
@@ -179,7 +179,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         timestamp=elements.timestamp,
     )
     if bounds is not None:
-        data = _selected(data, bounds)
+        data = _select(data, bounds)
         if not (data.ways or data.areas or data.points):
             lonlat = elements.node_xy / UNITS
             covered = (*lonlat.min(axis=0), *lonlat.max(axis=0))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.errors import InputError, NetworkError
-from geoscene.geometry.frames import Frame, beside, rim_of, wrapped
+from geoscene.geometry.frames import Frame, beside, rim_of, wrap_longitude
 from geoscene.options import BuildOptions
 from geoscene.sources.data import Bounds, OsmData
 from geoscene.sources.http import BUSY, RefusedError, cause, open_session
@@ -158,7 +158,7 @@ def _scene_box(osm: OsmData, crs: str) -> Bounds:
     east, north = np.nanmax(boxes[:, 2:], axis=0)
     if max(abs(south), abs(north)) > _LAST_LATITUDE:
         raise InputError(f"elevation tiles end at 85° of latitude; the map spans {south:.2f} to {north:.2f}")
-    middle = wrapped((west + east) / 2)
+    middle = wrap_longitude((west + east) / 2)
     frame = Frame.at(middle, (south + north) / 2, crs=crs)
     side = max(east - west, north - south, 1e-6) / 8
     xy = np.column_stack(frame.from_geographic(*rim_of((west, south, east, north), step=side)))

@@ -66,7 +66,7 @@ def checked_bounds(bounds: Bounds) -> Bounds:
     return west, south, east, north
 
 
-def located(elements: Elements, bounds: Bounds | None) -> tuple[Elements, Bounds, list[Problem]]:
+def locate(elements: Elements, bounds: Bounds | None) -> tuple[Elements, Bounds, list[Problem]]:
     """The elements without nodes far from the map, the map's extent, and what was left out.
 
     Longitudes of a map across 180° become continuous, those east of it over 180. The extent is that of
@@ -75,7 +75,7 @@ def located(elements: Elements, bounds: Bounds | None) -> tuple[Elements, Bounds
     """
     elements = _continuous(elements, bounds)
     lonlat = elements.node_xy / UNITS
-    stated = bounds or _stated(elements)
+    stated = bounds or _stated_bounds(elements)
     inside = np.ones(len(lonlat), np.bool_)
     if stated is not None and _within(lonlat, stated).any():
         inside = _within(lonlat, stated)
@@ -148,7 +148,7 @@ def _continuous(elements: Elements, bounds: Bounds | None) -> Elements:
     return replace(elements, node_xy=node_xy)
 
 
-def _stated(elements: Elements) -> Bounds | None:
+def _stated_bounds(elements: Elements) -> Bounds | None:
     """The bounds that the source states, beside its nodes; None if they circle the globe."""
     if elements.bounds is None:
         return None

@@ -64,7 +64,7 @@ def _host(url: str) -> str:
     return urlsplit(url).netloc or url
 
 
-def _cached(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
+def _cache(cache_dir: Path | None, request: str, *, make: Callable[[], Any]) -> Any:
     """The answer to ``request`` from the cache, else from ``make`` and then cached (atomic write)."""
     if cache_dir is None:
         return make()
@@ -190,7 +190,7 @@ def _fetch(
     collector = Collector(bounds=bounds)
     for part in progress(_parts(bounds, servers.max_query_km2)):
         query = query_for(part, timeout=servers.timeout)
-        answer = _cached(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
+        answer = _cache(cache_dir, query, make=functools.partial(_ask_overpass, query, servers))
         try:
             collect_answer(answer, collector)
         except InputError as error:
@@ -258,7 +258,7 @@ def locate(name: str, *, cache_dir: Path | None = None, servers: Servers | None 
     if not name.strip():
         raise InputError("the place has no name")
 
-    results = _cached(cache_dir, f"{servers.nominatim} {name}", make=lambda: _search(name, servers))
+    results = _cache(cache_dir, f"{servers.nominatim} {name}", make=lambda: _search(name, servers))
     if not results:
         raise SourceNotFoundError(
             f"no place called {name!r} in OpenStreetMap; try another spelling,"

@@ -70,7 +70,7 @@ def read_overture(path: str | Path, *, bounds: Bounds | None = None, progress: P
         geometry, problem = _footprint(name, shape)
         if geometry is not None:
             middle = middle if middle is not None else float(shapely.bounds(geometry)[0])
-            geometry = _turned(geometry, middle)
+            geometry = _turn(geometry, middle)
         if bounds is not None and geometry is not None and not shapely.box(*bounds).intersects(geometry):
             continue
         if problem is not None:
@@ -155,7 +155,7 @@ def _footprint(name: str, shape: Any) -> tuple[Any, Problem | None]:
     return geometry, Problem(name, "building", "repaired", "self-crossing", reason)
 
 
-def _turned(geometry: Any, middle_deg: float) -> Any:
+def _turn(geometry: Any, middle_deg: float) -> Any:
     """The geometry moved by a whole turn of longitude if that brings it nearer to ``middle_deg``."""
     lon = float(shapely.bounds(geometry)[0])
     turn = round(float(beside(lon, middle_deg)) - lon)

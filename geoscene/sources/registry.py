@@ -113,7 +113,7 @@ def credits_of(osm: OsmData) -> tuple[Credit, ...]:
     return (own, *osm.added)
 
 
-def merged(base: OsmData, other: OsmData) -> OsmData:
+def merge_sources(base: OsmData, other: OsmData) -> OsmData:
     """The map ``base`` with all features that the source of ``other`` gives taken from ``other`` instead.
 
     ``other`` should have been read within the bounds of ``base``, which the result keeps.

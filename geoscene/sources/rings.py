@@ -39,7 +39,7 @@ def polygons_of(geometry: Any) -> Any:
     return shapely.orient_polygons(parts[0] if len(parts) == 1 else shapely.multipolygons(parts))
 
 
-def tangled(ring: Float) -> bool:
+def is_tangled(ring: Float) -> bool:
     """Whether a closed ring (n, 2) crosses itself so often that no area can be meant.
 
     The number of crossings is estimated from at most 64 segments; making a ring valid takes time by it.
@@ -101,7 +101,7 @@ def _inside(points: Float, a: Float, *, b: Float) -> Bools:
     return out
 
 
-def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
+def enclose(segments: Ints, xy: Float) -> tuple[Any, bool]:
     """The area that segments enclose by the even-odd rule, and whether any cross or overlap between nodes.
 
     If the boundary is open, dead ends are removed and everything enclosed counts as inside. The area is None
@@ -122,7 +122,7 @@ def enclosed(segments: Ints, xy: Float) -> tuple[Any, bool]:
     return polygons_of(shapely.union_all(faces)), crossing
 
 
-def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
+def _join(chains: Sequence[Ints]) -> list[list[Ints]]:
     """Chains grouped into rings: each closed one alone, open ones with those that share their ends."""
     groups: list[list[Ints]] = []
     owner: dict[int, int] = {}
@@ -147,9 +147,9 @@ def _joined(chains: Sequence[Ints]) -> list[list[Ints]]:
 def _union_of_rings(chains: Sequence[Ints], xy: Float) -> Any:
     """The union of the areas that the rings enclose; empty if there is none."""
     areas = []
-    for group in _joined(chains):
+    for group in _join(chains):
         segments = np.unique(np.concatenate([segments_of(chain) for chain in group]), axis=0)
-        area, _ = enclosed(segments, xy)
+        area, _ = enclose(segments, xy)
         if area is not None:
             areas.append(area)
     return shapely.union_all(areas)
@@ -207,7 +207,7 @@ def assemble(chains: Sequence[RingMember], xy: Float, *, complete: bool = True) 
     reason = next((name for name, found in defects if found), "")
     crossing = False
     if complete and not is_open and not both_roles and len(odd):
-        geometry, crossing = enclosed(odd, xy)
+        geometry, crossing = enclose(odd, xy)
         if not crossing:
             return Assembly(geometry, reason)
         reason = "self-crossing"

@@ -99,7 +99,7 @@ def without_slivers(plan: LayerTriangulation) -> LayerTriangulation:
             if (_twice_areas(merged) > 0).all():
                 break
         else:
-            kept = _unpinched(plan, ~thin, start=start, own=own, other=other)
+            kept = _remove_pinches(plan, ~thin, start=start, own=own, other=other)
             merged = LayerTriangulation(plan.xy, plan.faces[kept])
         plan = merged
 
@@ -123,7 +123,9 @@ def raise_shell(plan: LayerTriangulation, levels: Float, *, solid: Bools) -> She
     """
     n, count = levels.shape
     start, end, own, other = half_edges(plan)
-    solid = np.column_stack([_unpinched(plan, layer, start=start, own=own, other=other) for layer in solid.T])
+    solid = np.column_stack(
+        [_remove_pinches(plan, layer, start=start, own=own, other=other) for layer in solid.T]
+    )
     vertices = np.column_stack([np.tile(plan.xy, (count, 1)), levels.T.reshape(-1)])
     padded = np.pad(solid, ((0, 0), (1, 1)))
     faces, level, up, triangle = [], [], [], []
@@ -149,7 +151,7 @@ def raise_shell(plan: LayerTriangulation, levels: Float, *, solid: Bools) -> She
     )
 
 
-def _unpinched(plan: LayerTriangulation, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
+def _remove_pinches(plan: LayerTriangulation, solid: Bools, *, start: Ints, own: Ints, other: Ints) -> Bools:
     """The layer (m,) reduced so that the solid around each vertex is connected."""
     area = np.repeat(_twice_areas(plan), 3)
     solid = solid.copy()

@@ -93,7 +93,7 @@ def _with_passages(
     for k in np.unique(of).tolist():
         there = np.flatnonzero(of == k)
         levels = np.unique(clear[there])[::-1]
-        cuts = [(_closed(corridor[there][clear[there] >= level]), float(level)) for level in levels]
+        cuts = [(_close_gaps(corridor[there][clear[there] >= level]), float(level)) for level in levels]
         mine = np.flatnonzero(buildings.drawn & (buildings.outline == k))
         gone = [
             shapely.union_all([p for p, top in cuts if top >= height]) for height in buildings.height[mine]
@@ -108,7 +108,7 @@ def _with_passages(
     return replace(buildings, passages=passages), problems
 
 
-def _closed(corridors: NDArray[np.object_]) -> shapely.Geometry:
+def _close_gaps(corridors: NDArray[np.object_]) -> shapely.Geometry:
     """The union of corridors on the grid of buildings, without the gaps that rounding leaves between them."""
     wide = shapely.buffer(
         shapely.union_all(shapely.buffer(corridors, _GAP, join_style="mitre")), -_GAP, join_style="mitre"

@@ -139,7 +139,7 @@ def path_members(
     net = _network(lines, [way.nodes for way in ways], slope=np.where(track, _TRACK_SLOPE, _SLOPE))
     foot_only = ~track & np.array([(raised.klass[r] != Class.ROAD).all() for r in rows], np.bool_)
     sunk = tunnel & _is_below_ground(osm, ways)
-    joined = _joined(osm, ways)
+    joined = _find_joined(osm, ways)
     ends = _ends(net, sunk, joined=joined)
     free = np.where(foot_only, options.passage, options.headroom)
     depth = _depths(net, sunk, joined=joined, full=free + options.roof + _COVER)
@@ -237,7 +237,7 @@ def _is_below_ground(osm: OsmData, ways: list[Way]) -> Bools:
     return out
 
 
-def _joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
+def _find_joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
     """Other ways at the start and end (n, 2) of ways: 0 none, 1 underground only, 2 on the surface."""
     own = {way.osm_id for way in ways}
     kind: dict[int, int] = {}

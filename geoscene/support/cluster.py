@@ -23,7 +23,7 @@ Result = TypeVar("Result")
 
 
 class DaskCluster:
-    """A connection to a Dask scheduler; `connected` makes it."""
+    """A connection to a Dask scheduler; `connect` makes it."""
 
     def __init__(self, client: Any, *, address: str) -> None:
         self._client, self._address = client, address
@@ -93,7 +93,7 @@ class DaskCluster:
 
 
 @contextmanager
-def connected(address: str) -> Iterator[DaskCluster]:
+def connect(address: str) -> Iterator[DaskCluster]:
     """Yield a connection to the Dask scheduler at ``address``, such as ``tcp://HOST:8786``.
 
     Raises InputError if none answers or it has no workers, and MissingExtraError without Dask.

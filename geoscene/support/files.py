@@ -161,7 +161,7 @@ def exclusive(path: Path) -> Iterator[None]:
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("ab") as file:
         if (
-            not _locked(file)
+            not _try_lock(file)
             or not lock.exists()
             or not os.path.samestat(lock.stat(), os.fstat(file.fileno()))
         ):
@@ -226,7 +226,7 @@ def _runs(process: int) -> bool:
     return True
 
 
-def _locked(file: IO[bytes]) -> bool:
+def _try_lock(file: IO[bytes]) -> bool:
     """Lock a file; whether that succeeded. Systems without such locks count as success."""
     if fcntl is None:
         return True

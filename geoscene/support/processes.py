@@ -65,7 +65,7 @@ def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers:
     try:
         for _ in range(min(workers, len(waiting))):
             _add_worker(team, work, context=context)
-        while busy := _assigned(team, waiting):
+        while busy := _assign(team, waiting):
             for connection in cast("list[Connection]", wait(busy)):
                 worker = team[connection]
                 try:
@@ -139,7 +139,7 @@ def _add_worker(
     theirs.close()
 
 
-def _assigned(team: dict[Any, _Worker[Task]], waiting: deque[Task]) -> list[Any]:
+def _assign(team: dict[Any, _Worker[Task]], waiting: deque[Task]) -> list[Any]:
     """Give each idle worker a task; returns the connections of the busy ones."""
     for connection, worker in team.items():
         if worker.task is None and waiting:

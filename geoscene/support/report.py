@@ -64,7 +64,7 @@ def described(error: Exception) -> str:
     return ": ".join(filter(None, (type(error).__name__, " ".join(str(error).split()))))
 
 
-def unexpected(osm_id: str, error: Exception, *, kind: str) -> Problem:
+def describe_unexpected(osm_id: str, error: Exception, *, kind: str) -> Problem:
     """The problem of a feature that is dropped because of an unforeseen exception."""
     return Problem(osm_id, kind, "dropped", "unexpected-error", described(error))
 

@@ -228,7 +228,7 @@ class StoredFolder:
 
 
 @contextmanager
-def published(
+def publish(
     out: Path,
     *,
     last: str,

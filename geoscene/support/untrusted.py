@@ -45,11 +45,11 @@ def array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any
     """Shape, whether it is stored by columns, and type of the array in a member of an .npz file."""
     version = np.lib.format.read_magic(member)
     size = member.read(2 if version == (1, 0) else 4)
-    return _parsed(version, size + member.read(min(int.from_bytes(size, "little"), _LONGEST)))
+    return _parse(version, size + member.read(min(int.from_bytes(size, "little"), _LONGEST)))
 
 
 @functools.lru_cache(maxsize=4096)  # columns of one table have one header
-def _parsed(version: tuple[int, int], header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _parse(version: tuple[int, int], header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     with _PARSING:
         shape, by_columns, kind = read(BytesIO(header))

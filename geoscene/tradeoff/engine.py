@@ -115,7 +115,7 @@ def tradeoff(
         for turn in range(repetitions):  # in turn, so that a busy machine troubles all alike
             for k, variant in enumerate(builds):
                 progress("builds", turn * len(builds) + k, total=repetitions * len(builds))
-                costs[k].append(_measured(read, variant, folder=folder / str(k)))
+                costs[k].append(_measure(read, variant, folder=folder / str(k)))
         scene = open_scene(folder / "0" / "scene")
         xmin, ymin, xmax, ymax = scene.bounds
         cell = max(resolution, float(np.sqrt((xmax - xmin) * (ymax - ymin) / MOST_CELLS)))
@@ -129,7 +129,7 @@ def tradeoff(
     return BuildTradeoff(scene.manifest["name"] or scene.manifest["sources"][0]["from"], cell, tuple(rows))
 
 
-def _measured(read: Callable[[], OsmData], variant: BuildVariant, *, folder: Path) -> BuildCost:
+def _measure(read: Callable[[], OsmData], variant: BuildVariant, *, folder: Path) -> BuildCost:
     """The cost of a build into a folder, made in a process of its own."""
     folder.mkdir(exist_ok=True)
     options = variant.options

@@ -43,7 +43,7 @@ def script_text(text: str) -> str:
     return text.replace("<", "\\u003c")
 
 
-def linked(text: str) -> str:
+def link_credits(text: str) -> str:
     """Text as HTML with a link to OpenStreetMap's copyright page."""
     link = f'<a href="{_COPYRIGHT}" target="_blank" rel="noopener">openstreetmap.org/copyright</a>'
     return re.sub(re.escape(_COPYRIGHT), link, html.escape(text)).replace("(c)", "©")

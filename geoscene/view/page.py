@@ -17,7 +17,7 @@ from geoscene.scene import Scene
 from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
-from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
+from geoscene.view.assembly import check_page, link_credits, part, script_text, write_blob, write_page
 from geoscene.view.contents import PageContents, tiles_within
 from geoscene.view.lonlat import ACCURACY
 from geoscene.view.streamed import MARK, NAMES, write_streamed
@@ -112,7 +112,7 @@ def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[byte
     """Write the page: the template with its placeholders filled in and the bytes of the scene."""
     words = {
         "title": html.escape(str(head["name"])),
-        "credit": linked(attribution(scene)),
+        "credit": link_credits(attribution(scene)),
         "style": part("page.css"),
         "sources": "'unsafe-inline'" if load == "whole.js" else "'unsafe-inline' 'self' file:",
         "scene": script_text(compact_json(head).decode()),

@@ -138,7 +138,7 @@ def _upright(transform: Float, step: float) -> Ints | None:
     """Quantised columns (6, k) of upright transforms (k, 3, 4), or None if any is not upright."""
     along, lift = np.hypot(transform[:, 0, 0], transform[:, 1, 0]), transform[:, 2, 2]
     turn = np.arctan2(transform[:, 1, 0], transform[:, 0, 0])
-    linear = _turned(along, lift, turn=turn)
+    linear = _turn(along, lift, turn=turn)
     if not np.allclose(linear, transform[:, :, :3], rtol=0, atol=1e-5) or (lift <= 0).any():
         return None
     steps = np.rint(transform[:, :, 3].T / step).astype(np.int64)
@@ -147,7 +147,7 @@ def _upright(transform: Float, step: float) -> Ints | None:
     return None if whole.max(initial=0) > 65_535 else whole.astype(np.int64)
 
 
-def _turned(along: Float, lift: Float, *, turn: Float) -> Float:
+def _turn(along: Float, lift: Float, *, turn: Float) -> Float:
     """Matrices (k, 3, 3) that scale horizontally and vertically and rotate about the vertical."""
     matrix = np.zeros((len(turn), 3, 3))
     matrix[:, 0, 0] = matrix[:, 1, 1] = along * np.cos(turn)

@@ -79,10 +79,10 @@ def drive(
         or write them to FILE.rrd for it.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
-    from geoscene.support.storage import published, shown, url_of  # noqa: PLC0415
+    from geoscene.support.storage import publish, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
-    from lidar.tools.tradeoff.accuracy import driven, picked  # noqa: PLC0415
+    from lidar.tools.tradeoff.accuracy import driven, pick_settings  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()
@@ -100,11 +100,11 @@ def drive(
         _print_built(found)
     with (
         using(found.scene, known=LidarError) as opened,
-        published(out, last="dataset.json", replaces=True, bar=bar) as folder,
+        publish(out, last="dataset.json", replaces=True, bar=bar) as folder,
     ):
         with bar() as progress:
             begun = None if report.overwrite else folder
-            pick = picked(opened, options, wanted=wanted, out=begun, progress=progress)
+            pick = pick_settings(opened, options, wanted=wanted, out=begun, progress=progress)
         if pick and not report.json:
             print(pick.to_text(options.workers), flush=True)
         with bar() as progress, shows as shown_live:

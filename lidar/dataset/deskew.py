@@ -13,7 +13,7 @@ MOMENTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Moments of a frame to which points can be de-skewed, as fractions of its period."""
 
 
-def deskewed(placed: Float, trajectory: Trajectory, *, mount: Mount, time_ns: int) -> NDArray[np.float32]:
+def deskew(placed: Float, trajectory: Trajectory, *, mount: Mount, time_ns: int) -> NDArray[np.float32]:
     """Points (n, 3) in the frame that the sensor has at ``time_ns``, from the true poses.
 
     placed : (n, 3) scene metres: each point at its own time

@@ -34,12 +34,12 @@ def dataset_png(dataset: Dataset) -> bytes:
     name = next(iter(dataset.sensors("lidar")), None)
     clouds = None if name is None else labelled_clouds(dataset, name)
     if clouds is not None:
-        plan.points(*_sampled(clouds, trajectory))
+        plan.points(*_sample(clouds, trajectory))
     plan.line(way, _WAY)
     return plan.png()
 
 
-def _sampled(clouds: Stream, trajectory: Trajectory) -> tuple[Float, np.ndarray]:
+def _sample(clouds: Stream, trajectory: Trajectory) -> tuple[Float, np.ndarray]:
     """Points (n, 3) of some clouds in the scene, and their colours."""
     rows = np.unique(np.linspace(0, len(clouds.files) - 1, _CLOUDS).astype(int)).tolist()
     places, labels = [], []

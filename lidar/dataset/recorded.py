@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Ints
-from lidar.dataset.deskew import deskewed
+from lidar.dataset.deskew import deskew
 from lidar.dataset.formats import FORMATS, Format, format_of, read_table
 from lidar.dataset.formats.table import PointLabels, Table, placed_returns
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
@@ -194,7 +194,7 @@ def still_points(clouds: Stream, trajectory: Trajectory, *, row: int) -> Table:
     """
     table, start_ns, mount = cloud_points(clouds.files[row]), int(clouds.time_ns[row]), clouds.mount
     placed, _ = placed_returns(table, trajectory, start_ns=start_ns, vehicle_from_sensor=mount.matrix)
-    still = deskewed(placed, trajectory, mount=mount, time_ns=start_ns)
+    still = deskew(placed, trajectory, mount=mount, time_ns=start_ns)
     return table | dict(zip("xyz", still.T, strict=True))
 
 

@@ -74,7 +74,7 @@ class Georeference:
         if not len(xyz):
             return xyz.copy()
         if not self.exact and not self._is_scene and (fit := self._affine(xyz)) is not None:
-            moved: Float = _moved(xyz, *fit)
+            moved: Float = _move(xyz, *fit)
             return moved
         project = self.frame.to_projected if self._is_scene else self._project
         return np.column_stack([*project(xyz[:, 0], xyz[:, 1]), xyz[:, 2]])
@@ -114,7 +114,7 @@ def _bounds(xyz: Any) -> Any:
 
 
 @njit(cache=True, nogil=True)
-def _moved(xyz: Any, origin: Any, matrix: Any, shift: Any) -> Any:
+def _move(xyz: Any, origin: Any, matrix: Any, shift: Any) -> Any:
     """Points mapped by (xy - origin) @ matrix + shift; heights are unchanged."""
     out = np.empty((len(xyz), 3))
     for i in range(len(xyz)):

@@ -58,7 +58,7 @@ def fill(out: NDArray[Any], values: NDArray[Any]) -> None:
         release(out, values)
 
 
-def joined(count: int, tables: Iterable[Table]) -> Table:
+def join(count: int, tables: Iterable[Table]) -> Table:
     """All ``count`` rows of one or more tables that come in order; the tables may be blocks of rows."""
     columns: dict[str, NDArray[Any]] = {}
     first = 0
@@ -71,7 +71,7 @@ def joined(count: int, tables: Iterable[Table]) -> Table:
     return replace(table, **columns)
 
 
-def gathered(blocks: Iterable[Float]) -> Float:
+def gather(blocks: Iterable[Float]) -> Float:
     """The rows (n, c) of blocks of rows, in a file if there are several."""
     with tempfile.TemporaryFile() as file:
         for block in blocks:
@@ -114,7 +114,7 @@ def lowest_ahead(column: Float) -> Float:
     return out
 
 
-def interpolated(at: Float, s: Float, *, column: Float) -> Float:
+def interpolate(at: Float, s: Float, *, column: Float) -> Float:
     """Values (k,) at rising places (k,) of a column (n,) known at rising places s (n,)."""
 
     def near(part: Float) -> Float:
@@ -125,7 +125,7 @@ def interpolated(at: Float, s: Float, *, column: Float) -> Float:
     return rowwise(near, at, looked_up=(s, column))
 
 
-def smoothed(column: Float, sigma: float, *, mode: str = "reflect") -> Float:
+def smooth(column: Float, sigma: float, *, mode: str = "reflect") -> Float:
     """A column (n,) after a Gaussian filter; parameters as of ``scipy.ndimage.gaussian_filter1d``."""
     from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415  (slow to import)
 
@@ -133,7 +133,7 @@ def smoothed(column: Float, sigma: float, *, mode: str = "reflect") -> Float:
     return rowwise(lambda part: gaussian_filter1d(part, sigma, mode=mode), column, reach=reach)
 
 
-def extended(column: Float, spare: int) -> Float:
+def extend(column: Float, spare: int) -> Float:
     """A column (n,) with ``spare`` more rows at both ends, mirrored at the first and the last value."""
     if len(column) <= max(2 * spare, poses.BLOCK_POSES):
         return np.pad(column, spare, mode="reflect", reflect_type="odd")

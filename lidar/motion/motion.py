@@ -15,7 +15,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.poses import Trajectory, blocks_of, release, room
-from lidar.motion.blockwise import fill, rowwise, smoothed
+from lidar.motion.blockwise import fill, rowwise, smooth
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
 
@@ -117,7 +117,7 @@ def ended_at_rest(motion: Motion) -> Motion:
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     """Speed (n,) in m/s that speed limits, bends, crests and steering rate allow along a path."""
-    change, crest = _along(path, path.curvature), _along(path, _softened(path, vehicle))
+    change, crest = _along(path, path.curvature), _along(path, _soften(path, vehicle))
 
     def allowed(curvature: Float, *changes: Float) -> Float:
         bend, wheel, crest = (np.abs(column) for column in (curvature, *changes))
@@ -140,13 +140,13 @@ def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     )
 
 
-def _softened(path: Path, vehicle: Vehicle) -> Float:
+def _soften(path: Path, vehicle: Vehicle) -> Float:
     """Slopes (n,) smoothed over the wheelbase: shorter bumps do not raise the body."""
     out = room((len(path),))
     over = vehicle.turning_radius if vehicle.kind == "air" else max(vehicle.wheelbase, 1.0)
     for first, last in legs_of(path):
         gap = (path.s[last - 1] - path.s[first]) / max(last - first - 1, 1)
-        soft = smoothed(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
+        soft = smooth(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
         fill(out[first:last], soft)
     return out
 
@@ -245,7 +245,7 @@ def _time_law(
         excess = speed / np.interp(far, s, limit)
         if excess.max() <= 1.0:
             return far, speed
-        lowered = _lowered(lowered, s, far=far, excess=excess, reach=speed * (half * dt))
+        lowered = _lower_limits(lowered, s, far=far, excess=excess, reach=speed * (half * dt))
     # stretch time by the remaining excess, so that all limits hold
     old = np.arange(len(far))
     moment = np.linspace(0.0, old[-1], math.ceil(old[-1] * excess.max()) + 1)
@@ -274,7 +274,7 @@ def _smooth_profile(
         for still, edge in zip(rest, raw[[0, -1]], strict=True)
     )
     pad = np.concatenate([before, raw, behind])
-    speed = np.maximum(_averaged(_averaged(pad, windows[0]), windows[1]), 0.0)
+    speed = np.maximum(_average(_average(pad, windows[0]), windows[1]), 0.0)
     for still, end in zip(rest, (0, -1), strict=True):
         if still:
             speed[end] = 0.0
@@ -286,14 +286,14 @@ def _smooth_profile(
     return far * stretch, speed * stretch
 
 
-def _averaged(values: Float, window: int) -> Float:
+def _average(values: Float, window: int) -> Float:
     """Running means (n - window + 1,) of values (n,)."""
     total = np.concatenate([[0.0], np.cumsum(values)])
     mean: Float = (total[window:] - total[:-window]) / window
     return mean
 
 
-def _lowered(lowered: Float, s: Float, *, far: Float, excess: Float, reach: Float) -> Float:
+def _lower_limits(lowered: Float, s: Float, *, far: Float, excess: Float, reach: Float) -> Float:
     """Limits lowered where a profile exceeded them, within ``reach`` metres of each place."""
     over = np.flatnonzero(excess > 1.0)
     out = lowered.copy()

@@ -25,10 +25,10 @@ from geoscene.support.columns import Columns, row_blocks
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
 from lidar.geometry.poses import blocks_of, release, room
-from lidar.motion.blockwise import extended, fill, headings, joined, rowwise, smoothed, sums
+from lidar.motion.blockwise import extend, fill, headings, join, rowwise, smooth, sums
 from lidar.motion.clearance import ASIDE, PathParameters, RouteLine, pushes, turning_manoeuvre, turns_at
 from lidar.motion.route import Route
-from lidar.motion.steering import Pose, SteeredTrack, follow, relaxed
+from lidar.motion.steering import Pose, SteeredTrack, follow, relax
 from lidar.motion.vehicle import Vehicle
 
 Ground = Callable[[Float, Float], Float]
@@ -120,7 +120,7 @@ def plan_path(
     # aircraft have no lane, and larger turning radii
     step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
     setting = PathParameters(vehicle, frame, obstacles, margin, step, route.side)
-    line = _resampled(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
+    line = _resample(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
     cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
     legs: list[SteeredTrack] = []
     lines: list[RouteLine] = []
@@ -129,17 +129,17 @@ def plan_path(
         part = line.take(slice(first, last))
         turns_back = last < len(line.edge)
         if turns_back:
-            part = _shortened(part, vehicle)
+            part = _shorten(part, vehicle)
         tracks = [_clear_track(part, setting, pose=pose)]
         if turns_back:
             tracks += turning_manoeuvre(tracks[-1].end, part, setting=setting)
         pose = tracks[-1].end
         legs += tracks
         lines += [part] * len(tracks)
-    return _joined(legs, lines, setting=setting, ground=ground)
+    return _join(legs, lines, setting=setting, ground=ground)
 
 
-def _resampled(route: Route, spacing: float) -> RouteLine:
+def _resample(route: Route, spacing: float) -> RouteLine:
     """The route's line with points about ``spacing`` apart; its turning points stay points."""
     stretches = []
     ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
@@ -165,10 +165,10 @@ def _resampled(route: Route, spacing: float) -> RouteLine:
                 new = polylines.points_at(xyz, at, along=s)
                 yield RouteLine(new, route.edge[index], route.limit[index], route.free[index], turn)
 
-    return joined(sum(count for *_, count in stretches), parts())
+    return join(sum(count for *_, count in stretches), parts())
 
 
-def _shortened(line: RouteLine, vehicle: Vehicle) -> RouteLine:
+def _shorten(line: RouteLine, vehicle: Vehicle) -> RouteLine:
     """The line without its last metres, so that the front of the body stops at its end."""
     spare = min(round(vehicle.front / line.gap), len(line.edge) - 5)
     return line.take(slice(0, len(line.edge) - max(spare, 0)))
@@ -187,13 +187,13 @@ def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None)
     middle = line.xyz[len(line.xyz) // 2]
     scale = float(setting.frame.scale_at(middle[0], middle[1]))
     base, gap = line.xyz[:, :2], line.gap
-    heading = smoothed(headings(base), 2.0 / gap, mode="nearest")
+    heading = smooth(headings(base), 2.0 / gap, mode="nearest")
     left = rowwise(lambda part: np.stack([-np.sin(part), np.cos(part)], axis=1), heading)
     shift = rowwise(np.zeros_like, heading)
     wide = 2 * math.ceil(_PUSH / gap) + 1
     for _ in range(_REPAIRS):
         pushed = rowwise(lambda xy, by, to: xy + by[:, None] * to, base, shift, left)
-        xy = relaxed(pushed, cap / scale, reach=reach)
+        xy = relax(pushed, cap / scale, reach=reach)
         track = follow(xy, vehicle, scale=scale, pose=pose, step=setting.step)
         departure = _departure(track, line, xy=pushed, vehicle=vehicle)
         if len(departure):
@@ -213,7 +213,7 @@ def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None)
             bump = np.zeros(len(base))
             np.maximum.at(bump, at, np.maximum(sign * push, 0.0))
             bumps = rowwise(lambda part: maximum_filter1d(part, wide), bump, reach=wide)
-            bumps = smoothed(bumps, 0.5 * _PUSH / gap, mode="nearest")
+            bumps = smooth(bumps, 0.5 * _PUSH / gap, mode="nearest")
             shift = rowwise(lambda old, part, sign=sign: old + sign * part, shift, bumps)
         shift = rowwise(lambda part: np.clip(part, -ASIDE, ASIDE), shift)
     stuck = np.isnan(push)
@@ -246,11 +246,11 @@ def _departure(track: SteeredTrack, line: RouteLine, *, xy: Float, vehicle: Vehi
     return track.row[-1:] if off[-1] > _FINISH else track.row[:0]
 
 
-def _joined(
+def _join(
     legs: list[SteeredTrack], lines: list[RouteLine], *, setting: PathParameters, ground: Surface | None
 ) -> Path:
     """One path of all legs, with heights."""
-    whole = joined(sum(len(leg.row) for leg in legs), _leg_paths(legs, lines, setting=setting, ground=ground))
+    whole = join(sum(len(leg.row) for leg in legs), _leg_paths(legs, lines, setting=setting, ground=ground))
     # headings of consecutive legs may differ by whole turns
     turns = sums(rowwise(_whole_turns, whole.heading, reach=1))
     return replace(whole, heading=rowwise(np.subtract, whole.heading, turns))
@@ -330,8 +330,8 @@ def _heights(
     width = (over if ground is None else _SPRING) / legs[0].step
     # extrapolate the road at both ends with its gradient
     spare, wide = math.ceil(4 * over / legs[0].step) + 1, over / legs[0].step
-    far = extended(z, spare)
-    near, soft = (smoothed(far, w)[spare : spare + len(z)] for w in (width, wide))
+    far = extend(z, spare)
+    near, soft = (smooth(far, w)[spare : spare + len(z)] for w in (width, wide))
     if ground is not None:  # a step, as at the joint of a bridge, becomes a ramp
         reach = 2 * math.ceil(wide) + 1
 
@@ -340,12 +340,12 @@ def _heights(
             return np.asarray(np.abs(rise - usual) > _JOINT / 2, float)
 
         steps = rowwise(step, rowwise(np.gradient, z, reach=1), reach=reach)
-        share = smoothed(rowwise(lambda part: maximum_filter1d(part, reach), steps, reach=reach), wide / 2)
+        share = smooth(rowwise(lambda part: maximum_filter1d(part, reach), steps, reach=reach), wide / 2)
         near, tilt = (
             rowwise(lambda part, other, share: part + share * (other - part), column, softer, share)
-            for column, softer in ((near, soft), (tilt, smoothed(tilt, wide, mode="mirror")))
+            for column, softer in ((near, soft), (tilt, smooth(tilt, wide, mode="mirror")))
         )
-    tilt, bank = (smoothed(column, width, mode="mirror") for column in (tilt, bank))
+    tilt, bank = (smooth(column, width, mode="mirror") for column in (tilt, bank))
     stands = ground is not None and body.wheelbase >= _AXLES
     for leg, start in zip(legs, starts.tolist(), strict=True):
         height, ahead, across = (c[start : start + len(leg.row)] for c in (near, tilt, bank))

@@ -51,7 +51,7 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
     if names[0] == "time_ns":
         found = read_trajectory(path)
         _check_speed(path, found.time_ns, position=found.position)
-        return found if recorded == frame else _moved(found, recorded, frame=frame)
+        return found if recorded == frame else _move(found, recorded, frame=frame)
     if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
         raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
     return _from_poses(path, recorded, frame=frame)
@@ -138,7 +138,7 @@ def _turn(recorded: Frame, frame: Frame, *, lon: Float, lat: Float) -> Rotation:
     return Rotation.from_rotvec(angle)
 
 
-def _moved(old: Trajectory, recorded: Frame, *, frame: Frame) -> Trajectory:
+def _move(old: Trajectory, recorded: Frame, *, frame: Frame) -> Trajectory:
     """A trajectory in another frame."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415
 

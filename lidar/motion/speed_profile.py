@@ -19,7 +19,7 @@ from geoscene.support.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import BLOCK_POSES, release, room
-from lidar.motion.blockwise import even, fill, interpolated, lowest_ahead, rowwise
+from lidar.motion.blockwise import even, fill, interpolate, lowest_ahead, rowwise
 from lidar.motion.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
@@ -89,7 +89,7 @@ def motion_within(
         bounds = np.interp(begin + t - late, time_s, allowed)
         still = (not rolls, not at_speed or until < total - begin)
         knots = _best(s, limit[first:last], vehicle=vehicle, allowed=bounds, rest=still)
-        s, v = _sampled(knots, end - origin, dt=dt)
+        s, v = _sample(knots, end - origin, dt=dt)
         driven = s[-1] > end - origin - 2 * _NEAR
         if driven and last < len(path):
             rest = round(DWELL_S / dt)
@@ -98,7 +98,7 @@ def motion_within(
         begin += len(s) * dt
         if not driven:
             break
-    return _joined(parts, path, rate_hz=rate_hz)
+    return _join(parts, path, rate_hz=rate_hz)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ class _Part:
     v: Float
 
 
-def _joined(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
+def _join(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
     """The profile of all legs."""
     n, kinds = sum(len(part.s) for part in parts), (np.int64, float, float, float, np.int64)
     time_ns, s, v, acceleration, row = columns = [room((n,), kind) for kind in kinds]
@@ -140,7 +140,7 @@ def desired_speed(path: Path, vehicle: Vehicle) -> Float:
     out = room((len(limit),))
     for first, last in legs_of(path):
         limit[last - 1] = 0.0
-        fill(out[first:last], _braked(path.s[first:last], limit[first:last], vehicle=vehicle))
+        fill(out[first:last], _limit_braking(path.s[first:last], limit[first:last], vehicle=vehicle))
     return out
 
 
@@ -150,7 +150,7 @@ def _seconds(s: Float, limit: Float) -> Float:
     return time
 
 
-def _braked(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
+def _limit_braking(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     """Speed limits (n,) at distances (n,), lowered for comfortable braking before lower ones."""
     by = 2 * _COMFORT * vehicle.deceleration
     lowest = lowest_ahead(rowwise(lambda s, limit: limit**2 + by * s, s, limit))
@@ -185,10 +185,10 @@ def _limits(s: Float, limit: Float, *, vehicle: Vehicle) -> _Limits:
     from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
     place = even(math.ceil((s[-1] + _GAP) / _GAP), _GAP)
-    strict = interpolated(place, s, column=limit)
+    strict = interpolate(place, s, column=limit)
     around = 2 * round(_AROUND / _GAP) + 1
     least = rowwise(lambda part: minimum_filter1d(part, around), strict, reach=around)
-    return _Limits(strict, _braked(place, least, vehicle=vehicle))
+    return _Limits(strict, _limit_braking(place, least, vehicle=vehicle))
 
 
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
@@ -240,7 +240,7 @@ def _in_window(
         allowed = near
     cap = limits.at(near)
     for _ in range(_AGAIN):
-        s, v, a = _solved(vehicle, allowed, cap=cap, start=start, rests=rests)
+        s, v, a = _solve(vehicle, allowed, cap=cap, start=start, rests=rests)
         excess = limits.excess(s[:counts], v=v[:counts])
         if excess <= 1.0 + _SLACK:
             break
@@ -269,7 +269,7 @@ def _reachable(allowed: Float, limits: _Limits, *, vehicle: Vehicle, start: tupl
     return out
 
 
-def _solved(
+def _solve(
     vehicle: Vehicle, allowed: Float, *, cap: Float, start: tuple[float, ...], rests: bool
 ) -> list[Float]:
     """The linear programme: greatest sum of distances under those allowed and caps (k,) on speed.
@@ -318,7 +318,7 @@ def _solved(
     return [s, np.maximum(v, 0.0), a]
 
 
-def _sampled(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
+def _sample(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     """Distance and speed at every ``dt`` until the knots end, or the vehicle rests at the end of its leg."""
     last = len(knots.s) - 1
     resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < _AT_REST))

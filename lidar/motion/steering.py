@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from geoscene.support.columns import row_blocks
 from geoscene.typing import Float
 from lidar.geometry.poses import release, room
-from lidar.motion.blockwise import curvatures, gathered, headings, mean_gap, rowwise, smoothed
+from lidar.motion.blockwise import curvatures, gather, headings, mean_gap, rowwise, smooth
 from lidar.motion.vehicle import Vehicle
 
 Pose = tuple[float, float, float]
@@ -48,7 +48,7 @@ class SteeredTrack:
         return float(self.xy[-1, 0]), float(self.xy[-1, 1]), float(self.heading[-1])
 
 
-def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
+def relax(xy: Float, cap: float, *, reach: float) -> Float:
     """Points (n, 2) near the given ones whose curvature stays below ``cap`` (1/m) where that is possible.
 
     Minimises the sum of w |p - xy|^2 + reach^4 |p''|^2; w starts at 1 and falls where the line still bends
@@ -66,7 +66,7 @@ def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
         return np.where(maximum_filter1d(bad, wide) > 0, old * 0.6, old)
 
     for _ in range(25):
-        out = _smoothed(xy, weight, stiffness=(reach / gap) ** 4)
+        out = _smooth(xy, weight, stiffness=(reach / gap) ** 4)
         loose = rowwise(lambda moved, line: np.hypot(*(moved - line).T) > 1.5 / cap, out, xy)
         bad = rowwise(
             lambda bend, loose: ((np.abs(bend) > cap) & ~loose).astype(np.uint8), curvatures(out), loose
@@ -77,11 +77,11 @@ def relaxed(xy: Float, cap: float, *, reach: float) -> Float:
     return out
 
 
-def _smoothed(xy: Float, weight: Float, *, stiffness: float) -> Float:
+def _smooth(xy: Float, weight: Float, *, stiffness: float) -> Float:
     """The points p (n, 2) that minimise the sum of w |p - xy|^2 + stiffness |p''|^2.
 
     Long lines are solved in windows. Half of their overlap is left out on each side: the influence of a row
-    falls below 1e-12 in some hundred rows, and below 1e-9 even with the smallest weights of `relaxed`.
+    falls below 1e-12 in some hundred rows, and below 1e-9 even with the smallest weights of `relax`.
     """
     from scipy.sparse import diags_array  # noqa: PLC0415
     from scipy.sparse.linalg import spsolve  # noqa: PLC0415
@@ -119,12 +119,12 @@ def follow(
 
     If the vehicle cannot reach the end, the track ends at the last row of the line that it reached.
     """
-    rows = gathered(_followed(xy, vehicle, scale=scale, step=step, pose=pose))
+    rows = gather(_follow_blocks(xy, vehicle, scale=scale, step=step, pose=pose))
     row = rowwise(lambda part: part[:, 4].astype(np.int64), rows)
     return SteeredTrack(rows[:, :2], rows[:, 2], rows[:, 3], row, 1, step)
 
 
-def _followed(
+def _follow_blocks(
     xy: Float, vehicle: Vehicle, *, scale: float, step: float, pose: Pose | None
 ) -> Iterator[Float]:
     """Blocks of rows (k, 5) of the track of `follow`: x, y, heading, curvature, row of the line."""
@@ -132,7 +132,7 @@ def _followed(
     gap = mean_gap(xy)
     # steering starts half the steering time ahead of the bend
     early = max(0.5 * most / rate / gap, 0.5)
-    bend = smoothed(rowwise(lambda part: part * scale, curvatures(xy)), early, mode="nearest")
+    bend = smooth(rowwise(lambda part: part * scale, curvatures(xy)), early, mode="nearest")
     length = 1.2 * most / rate
     near, turn_in = 1.0 / length**2, 2.0 / length
     columns: list[Any] = [rowwise(lambda part, k=k: part[:, k].copy(), xy) for k in (0, 1)]

@@ -96,7 +96,7 @@ def load_vehicle(name: str | Path) -> Vehicle:
         file = resources.files("lidar.motion").joinpath("vehicles", f"{name}.toml")
     else:
         raise InputError(f"unknown vehicle {name}; give a .toml file or one of {', '.join(vehicle_names())}")
-    return _checked(read_table(file).data, str(name))
+    return _check(read_table(file).data, str(name))
 
 
 def _is_numbers(value: object, count: int) -> TypeGuard[list[float]]:
@@ -108,7 +108,7 @@ def _is_numbers(value: object, count: int) -> TypeGuard[list[float]]:
     )
 
 
-def _checked(table: dict[str, object], name: str) -> Vehicle:
+def _check(table: dict[str, object], name: str) -> Vehicle:
     """A vehicle from a table of keys; raises one InputError for all faults."""
     known = {f.name: f for f in fields(Vehicle)}
     faults = [

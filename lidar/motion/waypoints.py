@@ -139,7 +139,7 @@ def match_track(
     way driven between two points is about as long as the straight line. Raises RouteError naming the points
     that have no street within ``tolerance``, or where the streets do not connect.
     """
-    xy = _thinned(track.xyz[:, :2], 2.5 * SIGMA_M)
+    xy = _thin(track.xyz[:, :2], 2.5 * SIGMA_M)
     tree = street_tree(graph)
     candidates: list[list[Place]] = []
     costs: list[Float] = []
@@ -180,7 +180,7 @@ def match_track(
     return best
 
 
-def _thinned(xy: Float, gap: float) -> Float:
+def _thin(xy: Float, gap: float) -> Float:
     """Points of a track at least ``gap`` apart, with the first and the last."""
     keep, last = [0], xy[0]
     for k in range(1, len(xy)):

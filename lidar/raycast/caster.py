@@ -18,10 +18,10 @@ from lidar.raycast.columns import RayColumns
 from lidar.raycast.device import CPU
 from lidar.raycast.device import device as warp_device
 from lidar.raycast.embree import EmbreeScene
-from lidar.raycast.geometry import ALL, Geometry, MeshInstances, checked, middle, split
+from lidar.raycast.geometry import ALL, Geometry, MeshInstances, check_mesh, middle, split
 from lidar.raycast.hits import Hits
 from lidar.raycast.library import library
-from lidar.raycast.rays import EXACTLY, beyond, free_rays, limited, posed_rays, taken
+from lidar.raycast.rays import EXACTLY, beyond, free_rays, limit_rays, posed_rays, taken
 from lidar.raycast.refine import Refiner
 from lidar.raycast.scene import Float64Scene
 
@@ -97,7 +97,7 @@ class Caster:
         backend: str = "auto",
         device: str = CPU,
     ) -> None:
-        v, f = checked(vertices, faces)
+        v, f = check_mesh(vertices, faces)
         self.origin: Float = middle(v) if origin is None else np.array(origin, np.float64)
         self.scene = _scene(self.origin, backend=backend, device=device, dynamic=dynamic)
         self.instances: tuple[MeshInstances, ...] = ()
@@ -176,7 +176,7 @@ class Caster:
         Raises InputError for rays that are not finite or have a direction of length zero.
         """
         rays = free_rays(origins, directions)
-        rays = limited(
+        rays = limit_rays(
             rays,
             near=near,
             far=far,
@@ -218,7 +218,7 @@ class Caster:
         ``near`` and ``far`` are true metres from the start of the beam; other parameters as for `cast`.
         """
         rays = posed_rays(poses, pose_index, directions=directions, offsets=offsets)
-        rays = limited(
+        rays = limit_rays(
             rays,
             near=near,
             far=far,
@@ -254,7 +254,7 @@ class Caster:
         a ray counts as occluded.
         """
         rays = free_rays(origins, directions)
-        rays = limited(rays, near=near, far=far, mask=mask, time=time, retrace=retrace)
+        rays = limit_rays(rays, near=near, far=far, mask=mask, time=time, retrace=retrace)
         return self._any_hit(rays, on, threads=threads)
 
     def _first_hits(

@@ -75,7 +75,7 @@ class Packed(NamedTuple):
     words: NDArray[np.int64]
 
 
-def packed(target: RayTarget) -> Packed:
+def pack_target(target: RayTarget) -> Packed:
     """A target for kernels, of which the caller keeps the columns."""
     columns = target[4:]
     words = [target.scene, target.packet, target.single]
@@ -85,8 +85,8 @@ def packed(target: RayTarget) -> Packed:
 
 
 @njit(nogil=True)
-def unpacked(given: Packed) -> Any:
-    """The target of `packed`."""
+def unpack_target(given: Packed) -> Any:
+    """The target of `pack_target`."""
     w = given.words
     return RayTarget(
         w[0],

@@ -14,7 +14,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import kernels
 from lidar.raycast import library as rtc
-from lidar.raycast.columns import COPIES, RayColumns, packed
+from lidar.raycast.columns import COPIES, RayColumns, pack_target
 from lidar.raycast.geometry import Geometry, MeshInstances
 from lidar.raycast.rays import share
 from lidar.raycast.scene import Float64Scene
@@ -136,10 +136,10 @@ class EmbreeScene(Float64Scene):
             starts=np.cumsum([0, *(len(copied) for copied in self._copies)], dtype=np.int64),
             numbers=np.concatenate([np.empty(0, np.int32), *self._copies]).astype(np.int32),
         )
-        self.packed = packed(self.target)
+        self.packed = pack_target(self.target)
 
     def occluded(self, rays: RayColumns, *, threads: int) -> NDArray[np.bool_]:
         """Whether each ray hits anything."""
         out, target = np.empty(len(rays.directions), np.bool_), self.packed
-        share(lambda lo, hi: int(kernels.occluded(target, rays, lo, hi, out)), rays, threads=threads)
+        share(lambda lo, hi: int(kernels.find_occluded(target, rays, lo, hi, out)), rays, threads=threads)
         return out

@@ -8,7 +8,15 @@ import numpy as np
 
 from lidar.raycast.columns import RayTarget
 from lidar.raycast.lanes import GRAZING, START
-from lidar.raycast.memory import called, float32_at, float64_at, inlined, int32_at, int64_at, vector
+from lidar.raycast.memory import (
+    compile_out_of_line,
+    float32_at,
+    float64_at,
+    inline,
+    int32_at,
+    int64_at,
+    vector,
+)
 from lidar.raycast.planes import PLANE, beside, transform_of
 from lidar.raycast.rows import CORNERS, COUNT, MASK, NODES, ORDER, PART, PLANES, VERTICES
 from lidar.raycast.tree import DEPTH, FIRST, LEAF, NODE, RIGHT
@@ -17,7 +25,7 @@ STACK = 2 * DEPTH
 """Numbers of the array ``stack`` that `first_hit` needs."""
 
 
-@inlined
+@inline
 def _slopes(ray: Any) -> Any:
     """A ray's origin and the inverse of its direction, huge where that is zero."""
     ox, oy, oz, dx, dy, dz = ray
@@ -31,7 +39,7 @@ def _slopes(ray: Any) -> Any:
     )
 
 
-@inlined
+@inline
 def _enters(node: int, slopes: Any, near: float, far: float) -> float:
     """The ray parameter at which a ray enters the box of a node; inf if it does not."""
     ox, oy, oz, ix, iy, iz = slopes
@@ -44,7 +52,7 @@ def _enters(node: int, slopes: Any, near: float, far: float) -> float:
     return near if near <= far else np.inf
 
 
-@called
+@compile_out_of_line
 def _next_leaf(nodes: int, slopes: Any, near: float, far: float, stack: Any, bottom: int, top: int) -> Any:
     """The first item of the next leaf that a ray enters before ``far``, or -1, and the stack's new top."""
     while top > bottom:
@@ -67,7 +75,7 @@ def _next_leaf(nodes: int, slopes: Any, near: float, far: float, stack: Any, bot
     return np.int64(-1), top
 
 
-@called
+@compile_out_of_line
 def _within(target: RayTarget, instance: int, ray: Any, time: float) -> Any:
     """A ray in the frame of an instance."""
     ox, oy, oz, dx, dy, dz = ray
@@ -88,14 +96,14 @@ def _within(target: RayTarget, instance: int, ray: Any, time: float) -> Any:
     )
 
 
-@inlined
+@inline
 def _relative(part: int, corner: int, ray: Any) -> Any:
     """A corner of a part's faces, relative to the origin of a ray."""
     x, y, z = vector(int64_at(part, VERTICES), np.int64(int32_at(int64_at(part, CORNERS), corner)))
     return x - ray[0], y - ray[1], z - ray[2]
 
 
-@called
+@compile_out_of_line
 def _range(part: int, prim: int, ray: Any, near: float, far: float) -> Any:
     """The ray parameter at which a ray hits a face after near, not at its start, and before far; else inf."""
     ox, oy, oz, dx, dy, dz = ray
@@ -126,7 +134,7 @@ def _range(part: int, prim: int, ray: Any, near: float, far: float) -> Any:
     return t
 
 
-@called
+@compile_out_of_line
 def _first_of_part(part: int, ray: Any, slopes: Any, near: float, far: float, stack: Any) -> Any:
     """The first face of a part that a ray hits before ``far``, or -1, and its ray parameter.
 
@@ -148,7 +156,7 @@ def _first_of_part(part: int, ray: Any, slopes: Any, near: float, far: float, st
                 best, far = prim, t
 
 
-@called
+@compile_out_of_line
 def first_hit(
     target: RayTarget, near: float, far: float, mask: int, ray: Any, time: float, stack: Any
 ) -> Any:

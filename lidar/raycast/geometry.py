@@ -59,7 +59,7 @@ def middle(vertices: Float) -> Float:
     return np.round((vertices.min(axis=0) + vertices.max(axis=0)) / 2) if len(vertices) else np.zeros(3)
 
 
-def checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Float, NDArray[np.int32]]:
+def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Float, NDArray[np.int32]]:
     """Vertices (n, 3) float64 and faces (m, 3) int32, contiguous.
 
     Raises InputError for vertices that are not finite and for vertex numbers out of range.
@@ -83,14 +83,14 @@ def planes(vertices: Float, faces: NDArray[np.int32]) -> Float:
     out = np.zeros((len(faces), 5))
     np.divide(normal, length, out=out[:, :3], where=length > 0)
     out[:, 3] = np.einsum("ij,ij->i", out[:, :3], a)
-    longest = np.maximum(np.maximum(_squared(b - a), _squared(c - b)), _squared(a - c))
+    longest = np.maximum(np.maximum(_square(b - a), _square(c - b)), _square(a - c))
     out[:, 4] = np.divide(
         np.sqrt(longest), length[:, 0], out=np.full(len(faces), np.inf), where=length[:, 0] > 0
     )
     return out
 
 
-def _squared(vectors: Float) -> Float:
+def _square(vectors: Float) -> Float:
     out: Float = np.einsum("ij,ij->i", vectors, vectors)
     return out
 
@@ -124,7 +124,7 @@ def _geometry(
     vertices: Float, faces: NDArray[np.int32], whole: Float, *, margins: Float, moved: Float, mask: int
 ) -> Geometry:
     """The geometry of faces with planes (m, 5) for margins of 1 m, and of displacements (n, 3) in margins."""
-    length = np.sqrt(_squared(moved))
+    length = np.sqrt(_square(moved))
     # Rounding shifts an edge by one margin at most, in addition to its ends' displacements.
     share = whole[:, 4] * (margins * (1 + length))[faces].max(axis=1, initial=0.0)
     places = vertices + margins[:, None] * moved

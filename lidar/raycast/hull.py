@@ -68,7 +68,7 @@ def _normals(
     for f in range(len(faces)):
         for k in range(3):
             v = faces[f, k]
-            balance[v] += _scrambled(faces[f, (k + 1) % 3]) - _scrambled(faces[f, (k + 2) % 3])
+            balance[v] += _scramble(faces[f, (k + 1) % 3]) - _scramble(faces[f, (k + 2) % 3])
             for c in range(3):
                 mean[v, c] += planes[f, c]
     for v in range(len(mean)):
@@ -181,7 +181,7 @@ def _correct(out: Float, faces: NDArray[np.int32], planes: Float, lacking: NDArr
 
 
 @njit(nogil=True, cache=True)
-def _scrambled(number: int) -> np.uint64:
+def _scramble(number: int) -> np.uint64:
     """A hash of a vertex number: the sum over the edges around an inner vertex is zero."""
     x = np.uint64(number) * np.uint64(0x9E3779B97F4A7C15)
     return (x ^ (x >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, RayColumns, RayTarget, unpacked
+from lidar.raycast.columns import CHUNK, EXACT, FLOAT32, Packed, RayColumns, RayTarget, unpack_target
 from lidar.raycast.exact import STACK, first_hit
 from lidar.raycast.hull import LONG, REACH, ROUNDING
 from lidar.raycast.lanes import (
@@ -37,9 +37,18 @@ from lidar.raycast.lanes import (
     sole,
     unit,
 )
-from lidar.raycast.memory import aligned, called, float64_at, inlined, int32_at, int64_at
+from lidar.raycast.memory import allocate_aligned, compile_out_of_line, float64_at, inline, int32_at, int64_at
 from lidar.raycast.packets import NUDGE, alike, first_bad, gather, trace
-from lidar.raycast.planes import INVALID, PLANE, intersection, numbered, outside, placed, plane_of, ray_of
+from lidar.raycast.planes import (
+    INVALID,
+    PLANE,
+    face_number,
+    instance_row,
+    intersection,
+    outside,
+    plane_of,
+    ray_of,
+)
 from lidar.raycast.rows import (
     COSINE,
     FAR,
@@ -79,7 +88,7 @@ from lidar.raycast.rows import (
 )
 
 
-@inlined
+@inline
 def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
     """Write a normal as a unit vector; zero stays zero."""
     length = np.sqrt(x * x + y * y + z * z)
@@ -87,7 +96,7 @@ def _normal(out: Float, i: int, x: float, y: float, z: float) -> None:
     out[i, 0], out[i, 1], out[i, 2] = scale * x, scale * y, scale * z
 
 
-@inlined
+@inline
 def _identify(target: RayTarget, W: int, u: Any, work: Any, faces: Any, instances: Any) -> None:
     """Write planes, faces and instances of the lanes' hits; what it writes for a miss means nothing."""
     for k in range(W):
@@ -120,19 +129,19 @@ def _identify(target: RayTarget, W: int, u: Any, work: Any, faces: Any, instance
             work[NX * W + k], work[NY * W + k] = float64_at(plane, 0), float64_at(plane, 1)
             work[NZ * W + k], work[OFFSET * W + k] = float64_at(plane, 2), float64_at(plane, 3)
             work[MARGIN * W + k] = float64_at(plane, 4)
-            faces[k], instances[k] = numbered(target, row, prim), -1
+            faces[k], instances[k] = face_number(target, row, prim), -1
         else:
-            row, instance = placed(target, geom, inst, u[HIT_COPY * W + k])
+            row, instance = instance_row(target, geom, inst, u[HIT_COPY * W + k])
             x, y, z, d = plane_of(target, row, prim, instance, work[TIME * W + k])
             work[NX * W + k], work[NY * W + k], work[NZ * W + k], work[OFFSET * W + k] = x, y, z, d
             work[SCALE * W + k] /= np.sqrt(x * x + y * y + z * z)
             work[MARGIN * W + k] = float64_at(
                 int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim, 4
             )
-            faces[k], instances[k] = numbered(target, row, prim), instance
+            faces[k], instances[k] = face_number(target, row, prim), instance
 
 
-@inlined
+@inline
 def _approximate(W: int, near: float, precision: int, work: Any, f: Any) -> bool:
     """Accept Embree's hits, with Embree's ranges for float32; whether all lanes have one that is clear.
 
@@ -149,20 +158,20 @@ def _approximate(W: int, near: float, precision: int, work: Any, f: Any) -> bool
     return clear
 
 
-@inlined
+@inline
 def _margin(ray: Any, t: float) -> float:
     """The margin (`lidar.raycast.hull.margins_of`) of the point at ray parameter t."""
     ox, oy, oz, dx, dy, dz = ray
     return float(ROUNDING * max(REACH, abs(ox + t * dx), abs(oy + t * dy), abs(oz + t * dz)))
 
 
-@inlined
+@inline
 def _starts(t: float, near: float, cosine: float, inverse: float) -> bool:
     """Whether a face lies nearer than near, or within rounding of it."""
     return not (t - near) * abs(cosine) > START * inverse
 
 
-@inlined
+@inline
 def _miss(i: int, columns: Any) -> None:
     """Write a miss of ray i."""
     ranges, faces, instances, cosines, normals = columns
@@ -171,7 +180,7 @@ def _miss(i: int, columns: Any) -> None:
         normals[i, 0], normals[i, 1], normals[i, 2] = 0.0, 0.0, 0.0
 
 
-@called
+@compile_out_of_line
 def _keep(
     target: RayTarget,
     row: int,
@@ -189,12 +198,12 @@ def _keep(
         _miss(i, columns)
         return
     t, cosine, x, y, z = intersection(target, row, prim, instance, ray, inverse, time)
-    ranges[i], cosines[i], faces[i], instances[i] = t, cosine, numbered(target, row, prim), instance
+    ranges[i], cosines[i], faces[i], instances[i] = t, cosine, face_number(target, row, prim), instance
     if normals.size:
         _normal(normals, i, x, y, z)
 
 
-@inlined
+@inline
 def _decide(
     target: RayTarget,
     rays: RayColumns,
@@ -218,7 +227,9 @@ def _decide(
             clear = abs(cosine) >= GRAZING
         if starts or not clear:
             ray, inverse, time = ray_of(W, k, work), work[INVERSE * W + k], work[TIME * W + k]
-            row, copy = placed(target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k])
+            row, copy = instance_row(
+                target, u[HIT_GEOMETRY * W + k], u[HIT_INSTANCE * W + k], u[HIT_COPY * W + k]
+            )
             prim = np.int64(u[HIT_FACE * W + k])
             trusted = cosine >= GRAZING and not starts
             if not work[MARGIN * W + k] < np.inf:
@@ -234,7 +245,7 @@ def _decide(
     return False
 
 
-@inlined
+@inline
 def _again(
     target: RayTarget,
     rays: RayColumns,
@@ -281,13 +292,13 @@ def cast(
 
     No normals are written if ``normals`` is empty. Packets are consecutive from lo.
     """
-    target = unpacked(given)
+    target = unpack_target(given)
     W = len(target.lanes)
-    packet = aligned(4 * PACKET_ROWS * W)
+    packet = allocate_aligned(4 * PACKET_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
-    one, valid = aligned(128).view(np.float32), aligned(4 * W).view(np.int32)
-    work, ids = aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
-    face, instance = aligned(4 * W).view(np.int32), aligned(4 * W).view(np.int32)
+    one, valid = allocate_aligned(128).view(np.float32), allocate_aligned(4 * W).view(np.int32)
+    work, ids = allocate_aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
+    face, instance = allocate_aligned(4 * W).view(np.int32), allocate_aligned(4 * W).view(np.int32)
     stack = np.zeros(STACK, np.int64)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
     columns = ranges, faces, instances, cosines, normals
@@ -377,7 +388,7 @@ def cast_float64(
     normals: Float,
 ) -> Any:
     """The same as `cast`, entirely in float64, without Embree."""
-    target = unpacked(given)
+    target = unpack_target(given)
     work, ids, stack = np.zeros(WORK_ROWS), np.zeros(1, np.int64), np.zeros(STACK, np.int64)
     f = np.zeros(PACKET_ROWS, np.float32)
     for at in range(lo, hi):
@@ -391,13 +402,13 @@ def cast_float64(
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
-def occluded(given: Packed, rays: RayColumns, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
+def find_occluded(given: Packed, rays: RayColumns, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
     """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
-    target = unpacked(given)
+    target = unpack_target(given)
     W = len(target.lanes)
-    packet = aligned(4 * PACKET_RAY_ROWS * W)
+    packet = allocate_aligned(4 * PACKET_RAY_ROWS * W)
     f, u = packet.view(np.float32), packet.view(np.uint32)
-    one, valid = aligned(64).view(np.float32), aligned(4 * W).view(np.int32)
+    one, valid = allocate_aligned(64).view(np.float32), allocate_aligned(4 * W).view(np.int32)
     work, ids = np.zeros(RAY_ROWS * W), np.zeros(W, np.int64)
     for k in range(W):
         u[RAY_MASK * W + k] = rays.mask

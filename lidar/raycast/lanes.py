@@ -143,7 +143,7 @@ class _Rows:
 _PLACE, _NUMBER = types.int64, types.float64
 
 
-def _compiled(returned: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
+def _compile_function(returned: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
     """Make a function for compiled code of one that generates its instructions.
 
     The generator takes the builder, the type of the lanes and the values of the arguments, and returns that
@@ -166,7 +166,7 @@ def _compiled(returned: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]
 
 
 def _row(kind: Any, kept: Any) -> Any:
-    @_compiled(types.void, _PLACE, _PLACE)
+    @_compile_function(types.void, _PLACE, _PLACE)
     def move(builder: Any, lanes: Any, source: Any, target: Any) -> None:
         row = _Rows(builder, lanes, address=source, kind=kind)[0]
         _Rows(builder, lanes, address=target, kind=kept)[0] = row
@@ -186,21 +186,21 @@ def _hit(builder: Any, lanes: Any, geometry: Any) -> Any:
     return builder.icmp_unsigned("!=", row, ir.Constant(row.type, [-1] * lanes.count))
 
 
-@_compiled(types.void, _NUMBER, _PLACE)
+@_compile_function(types.void, _NUMBER, _PLACE)
 def fill(builder: Any, lanes: Any, number: Any, target: Any) -> None:
     """Write one number to all lanes of a row."""
     row = _Rows(builder, lanes, address=target)
     row[0] = row.same(number)
 
 
-@_compiled(types.int64, _PLACE)
+@_compile_function(types.int64, _PLACE)
 def hits(builder: Any, lanes: Any, geometry: Any) -> Any:
     """A bit for each lane that hit a geometry of a row at an address."""
     flags = builder.bitcast(_hit(builder, lanes, geometry), ir.IntType(lanes.count))
     return builder.zext(flags, ir.IntType(64))
 
 
-@_compiled(types.int64, _PLACE)
+@_compile_function(types.int64, _PLACE)
 def sole(builder: Any, lanes: Any, geometry: Any) -> Any:
     """The geometry that all lanes of a row that hit one have hit; -1 if there are several."""
     rows = _Rows(builder, lanes, address=geometry, kind=_INT)
@@ -215,7 +215,7 @@ def sole(builder: Any, lanes: Any, geometry: Any) -> Any:
     return builder.select(found, builder.zext(least, ir.IntType(64)), ir.IntType(64)(-1))
 
 
-@_compiled(types.boolean, _PLACE, _PLACE, _NUMBER, _NUMBER, _NUMBER, _NUMBER)
+@_compile_function(types.boolean, _PLACE, _PLACE, _NUMBER, _NUMBER, _NUMBER, _NUMBER)
 def settle(builder: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: Any, near: Any) -> Any:
     """Make origins relative to a point; write the rays to Embree's packet in float32, with far rounded up.
 
@@ -237,7 +237,7 @@ def settle(builder: Any, lanes: Any, work: Any, packet: Any, x: Any, y: Any, z: 
     return builder.and_(close, straight)
 
 
-@_compiled(types.boolean, _PLACE, _PLACE)
+@_compile_function(types.boolean, _PLACE, _PLACE)
 def shorten(builder: Any, lanes: Any, work: Any, packet: Any) -> Any:
     """Write unit directions to Embree's packet for rays of any length, after `settle`.
 
@@ -259,7 +259,7 @@ def shorten(builder: Any, lanes: Any, work: Any, packet: Any) -> Any:
     return builder.and_(near, finite)
 
 
-@_compiled(types.void, _PLACE, _PLACE, _NUMBER)
+@_compile_function(types.void, _PLACE, _PLACE, _NUMBER)
 def nudge(builder: Any, lanes: Any, work: Any, packet: Any, angle: Any) -> None:
     """Turn the directions of Embree's packet by an angle, radians, and set far again."""
     rows = _Rows(builder, lanes, address=work)
@@ -320,7 +320,7 @@ def _numbers(builder: Any, lanes: Any, column: Any) -> list[Any]:
     return [builder.load(builder.gep(base, [ir.Constant(_INT, k)])) for k in range(lanes.count)]
 
 
-@_compiled(types.void, _PLACE, _PLACE, _PLACE, _PLACE)
+@_compile_function(types.void, _PLACE, _PLACE, _PLACE, _PLACE)
 def spread(builder: Any, lanes: Any, ids: Any, column: Any, stride: Any, target: Any) -> None:
     """Write three rows, at an address, of the vectors of a column with a stride in bytes."""
     vectors = _vectors(builder, column, stride, _numbers(builder, lanes, ids))
@@ -332,7 +332,7 @@ def spread(builder: Any, lanes: Any, ids: Any, column: Any, stride: Any, target:
 def _turning(*, placed: bool) -> Any:
     """`turn` if the places of poses are the first rows of work, else `shift`."""
 
-    @_compiled(types.void, *[_PLACE] * 7)
+    @_compile_function(types.void, *[_PLACE] * 7)
     def turn(
         builder: Any,
         lanes: Any,
@@ -406,7 +406,7 @@ turn, shift = _turning(placed=True), _turning(placed=False)
 """
 
 
-@_compiled(types.void, *[_PLACE] * 5)
+@_compile_function(types.void, *[_PLACE] * 5)
 def look_up(builder: Any, lanes: Any, planes: Any, size: Any, faces: Any, geometry: Any, work: Any) -> None:
     """Write the planes of a row of faces, from a table at an address with a size in bytes of its rows.
 
@@ -431,7 +431,7 @@ def look_up(builder: Any, lanes: Any, planes: Any, size: Any, faces: Any, geomet
     rows[MARGIN] = _Row(builder, margin)
 
 
-@_compiled(types.void, _PLACE)
+@_compile_function(types.void, _PLACE)
 def unit(builder: Any, lanes: Any, work: Any) -> None:
     """Make the normals unit vectors; zero stays zero."""
     rows = _Rows(builder, lanes, address=work)
@@ -442,7 +442,7 @@ def unit(builder: Any, lanes: Any, work: Any) -> None:
     rows[NX], rows[NY], rows[NZ] = scale * x, scale * y, scale * z
 
 
-@_compiled(types.boolean, _PLACE, _PLACE, _NUMBER)
+@_compile_function(types.boolean, _PLACE, _PLACE, _NUMBER)
 def cross(builder: Any, lanes: Any, work: Any, packet: Any, near: Any) -> Any:
     """Compute the ranges and cosines at which rays intersect their planes.
 

@@ -76,14 +76,14 @@ _UNCOUNTED: dict[str, Any] = {"_nrt": False}
 
 
 @njit(nogil=True)
-def aligned(size: int) -> Any:
+def allocate_aligned(size: int) -> Any:
     """Zeroed bytes that start at a multiple of 64."""
     raw = np.zeros(size + 64, np.uint8)
     start = (64 - raw.ctypes.data % 64) % 64
     return raw[start : start + size]
 
 
-def inlined(function: Callable[..., Any]) -> Any:
+def inline(function: Callable[..., Any]) -> Any:
     """The function inlined into its callers, without reference counting of arrays.
 
     The caller holds the arrays; counting references for every ray would take ten times as long as the rest.
@@ -91,12 +91,12 @@ def inlined(function: Callable[..., Any]) -> Any:
     return njit(nogil=True, error_model="numpy", forceinline=True, **_UNCOUNTED)(function)
 
 
-def called(function: Callable[..., Any]) -> Any:
+def compile_out_of_line(function: Callable[..., Any]) -> Any:
     """The function compiled out of line, for rare cases, without reference counting of arrays."""
     return njit(nogil=True, error_model="numpy", **_UNCOUNTED)(function)
 
 
-@inlined
+@inline
 def vector(address: int, row: int) -> Any:
     """Three numbers of a row of an (n, 3) float64 column."""
     place = address + 24 * row

@@ -12,7 +12,7 @@ from lidar.raycast.lanes import HUGE, fill, settle, shift, shorten, spread, turn
 from lidar.raycast.memory import (
     float32_at,
     float64_at,
-    inlined,
+    inline,
     int64_at,
     intersect1,
     intersect4,
@@ -35,7 +35,7 @@ _COHERENT = 0.985  # cosine; packets that fan out over more than 10° are faster
 _SPREAD = 4.0  # metres; likewise packets whose origins lie farther apart
 
 
-@inlined
+@inline
 def first_bad(W: int, ids: Any, work: Any) -> int:
     """The first invalid ray of the lanes, or -1."""
     for k in range(W):
@@ -47,7 +47,7 @@ def first_bad(W: int, ids: Any, work: Any) -> int:
     return -1
 
 
-@inlined
+@inline
 def gather(
     target: RayTarget, rays: RayColumns, at: int, m: int, lanes: Any, ids: Any, work: Any, f: Any
 ) -> bool:
@@ -91,7 +91,7 @@ def gather(
     return bool(shorten(lanes, rows, f.ctypes.data))
 
 
-@inlined
+@inline
 def alike(W: int, work: Any) -> bool:
     """Whether a sample of the lanes is nearly parallel and starts at nearly the same point."""
     same = True
@@ -110,7 +110,7 @@ def alike(W: int, work: Any) -> bool:
     return same
 
 
-@inlined
+@inline
 def trace(target: RayTarget, W: int, rows: int, f: Any, valid: Any, together: bool, one: Any) -> None:  # noqa: FBT001
     """Trace the valid lanes of a packet, all at once or one by one."""
     if together and W > 1:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar.raycast.columns import COPIES, RayTarget
 from lidar.raycast.lanes import GRAZING
-from lidar.raycast.memory import called, float64_at, inlined, int32_at, int64_at, vector
+from lidar.raycast.memory import compile_out_of_line, float64_at, inline, int32_at, int64_at, vector
 from lidar.raycast.rows import CORNERS, DX, DY, DZ, NUMBERS, OX, OY, OZ, PART, START_NUMBER, VERTICES
 
 PLANE = 40
@@ -19,7 +19,7 @@ INVALID = np.uint32(0xFFFFFFFF)
 """Embree's number for no geometry and no instance."""
 
 
-@inlined
+@inline
 def transform_of(target: RayTarget, instance: int, time: float) -> Any:
     """The transform of an instance at a ray time: twelve numbers, row by row."""
     M = target.transforms.ctypes.data + 96 * target.first[instance]
@@ -47,8 +47,8 @@ def transform_of(target: RayTarget, instance: int, time: float) -> Any:
     )
 
 
-@inlined
-def placed(target: RayTarget, geom: Any, inst: Any, place: Any) -> Any:
+@inline
+def instance_row(target: RayTarget, geom: Any, inst: Any, place: Any) -> Any:
     """Row of ``parts`` and instance for Embree's geometry, instance geometry and index within it."""
     if inst == INVALID:
         return np.int64(target.rows[np.int64(geom)]), np.int64(-1)
@@ -56,15 +56,15 @@ def placed(target: RayTarget, geom: Any, inst: Any, place: Any) -> Any:
     return np.int64(target.shape[instance]) + np.int64(geom) - COPIES, instance
 
 
-@inlined
-def numbered(target: RayTarget, row: int, prim: int) -> Any:
+@inline
+def face_number(target: RayTarget, row: int, prim: int) -> Any:
     """The number of a face."""
     part = target.parts.ctypes.data + 8 * PART * row
     numbers = int64_at(part, NUMBERS)
     return int64_at(part, START_NUMBER) + (prim if numbers == 0 else np.int64(int32_at(numbers, prim)))
 
 
-@inlined
+@inline
 def plane_of(target: RayTarget, row: int, prim: int, instance: int, time: float) -> Any:
     """A face's plane in the caster's axes: normal (a unit vector for the own mesh) and offset."""
     plane = int64_at(target.parts.ctypes.data, PART * row) + PLANE * prim
@@ -85,7 +85,7 @@ def plane_of(target: RayTarget, row: int, prim: int, instance: int, time: float)
     return mx, my, mz, offset
 
 
-@inlined
+@inline
 def _corner(target: RayTarget, row: int, corner: int, instance: int, time: float) -> Any:
     """A corner of a face in the caster's axes; corners of face f are 3 f to 3 f + 2."""
     x, y, z = vector(target.parts[row, VERTICES], np.int64(int32_at(target.parts[row, CORNERS], corner)))
@@ -99,7 +99,7 @@ def _corner(target: RayTarget, row: int, corner: int, instance: int, time: float
     return x, y, z
 
 
-@called
+@compile_out_of_line
 def _extent(target: RayTarget, row: int, prim: int, instance: int, ray: Any, time: float) -> Any:
     """Least and greatest ray parameter of a face's corners, measured along the ray."""
     ox, oy, oz, dx, dy, dz = ray
@@ -111,7 +111,7 @@ def _extent(target: RayTarget, row: int, prim: int, instance: int, ray: Any, tim
     return low, high
 
 
-@inlined
+@inline
 def beside(ray: Any, a: Any, b: Any, c: Any) -> float:
     """Metres by which a ray passes outside the edges of a triangle, in float64; 0 if it hits the triangle.
 
@@ -134,7 +134,7 @@ def beside(ray: Any, a: Any, b: Any, c: Any) -> float:
     return max(0.0, min(-low, high))
 
 
-@called
+@compile_out_of_line
 def outside(target: RayTarget, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
     """Metres by which a ray passes outside a face, as in `beside`."""
     ox, oy, oz, _, _, _ = ray
@@ -147,7 +147,7 @@ def outside(target: RayTarget, row: int, prim: int, instance: int, ray: Any, tim
     return passed
 
 
-@inlined
+@inline
 def ray_of(W: int, k: int, work: Any) -> Any:
     """Origin and direction of lane k."""
     return (
@@ -160,7 +160,7 @@ def ray_of(W: int, k: int, work: Any) -> Any:
     )
 
 
-@called
+@compile_out_of_line
 def intersection(
     target: RayTarget, row: int, prim: int, instance: int, ray: Any, inverse: float, time: float
 ) -> Any:

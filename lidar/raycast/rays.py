@@ -97,7 +97,7 @@ def _permutes(order: Any, named: Any) -> Any:
     return len(order) == len(named)
 
 
-def limited(
+def limit_rays(
     rays: RayColumns,
     *,
     near: float,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.errors import BackendError
 from lidar.raycast import kernels
-from lidar.raycast.columns import Packed, RayColumns, RayTarget, packed
+from lidar.raycast.columns import Packed, RayColumns, RayTarget, pack_target
 from lidar.raycast.geometry import ALL, Geometry, MeshInstances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share
@@ -97,7 +97,7 @@ class Float64Scene:
     def commit(self) -> None:
         """Rebuild what changed, and the tables for the kernels."""
         self.target = self.tables()
-        self.packed = packed(self.target)
+        self.packed = pack_target(self.target)
 
     def tables(self) -> RayTarget:
         """The tables for the kernels, without those of Embree."""

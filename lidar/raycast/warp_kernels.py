@@ -108,7 +108,7 @@ class WarpHit:
 
 
 @wp.func
-def _inverted(x: wp.float64) -> wp.float64:
+def _invert(x: wp.float64) -> wp.float64:
     if wp.abs(x) > FLAT:
         return ONE / x
     return STEEP
@@ -119,7 +119,7 @@ def _beam(start: wp.vec3d, way: wp.vec3d) -> WarpBeam:
     beam = WarpBeam()
     beam.start = start
     beam.way = way
-    beam.inverse = wp.vec3d(_inverted(way[0]), _inverted(way[1]), _inverted(way[2]))
+    beam.inverse = wp.vec3d(_invert(way[0]), _invert(way[1]), _invert(way[2]))
     return beam
 
 
@@ -220,7 +220,7 @@ def _within(pose: Pose, beam: WarpBeam) -> WarpBeam:
 
 
 @wp.func
-def _passed(a: wp.vec3d, b: wp.vec3d, way: wp.vec3d, length: wp.float64, size: wp.float64) -> wp.float64:
+def _let_pass(a: wp.vec3d, b: wp.vec3d, way: wp.vec3d, length: wp.float64, size: wp.float64) -> wp.float64:
     """Signed metres by which a ray passes an edge; 0 within rounding."""
     e = b - a
     edge = wp.sqrt(wp.dot(e, e))
@@ -238,14 +238,14 @@ def _beside(beam: WarpBeam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> bool:
     """Whether a ray passes outside the edges of a triangle; corners relative to the ray's origin."""
     length = wp.sqrt(wp.dot(beam.way, beam.way))
     size = wp.abs(beam.start[0]) + wp.abs(beam.start[1]) + wp.abs(beam.start[2])
-    p = _passed(a, b, beam.way, length, size)
-    q = _passed(b, c, beam.way, length, size)
-    r = _passed(c, a, beam.way, length, size)
+    p = _let_pass(a, b, beam.way, length, size)
+    q = _let_pass(b, c, beam.way, length, size)
+    r = _let_pass(c, a, beam.way, length, size)
     return wp.min(-wp.min(p, wp.min(q, r)), wp.max(p, wp.max(q, r))) > ZERO
 
 
 @wp.func
-def _clipped(t: wp.float64, beam: WarpBeam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.float64:
+def _clip(t: wp.float64, beam: WarpBeam, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.float64:
     """A ray parameter, clipped to the extent of corners along the ray; they are relative to its origin."""
     squared = wp.dot(beam.way, beam.way)
     one = wp.dot(a, beam.way) / squared
@@ -276,7 +276,7 @@ def _range(
     if (n[0] == ZERO and n[1] == ZERO and n[2] == ZERO) or _beside(beam, a, b, c):
         return INF
     if grazing:
-        t = _clipped(t, beam, a, b, c)
+        t = _clip(t, beam, a, b, c)
         if not (t < far and (t - near) * wp.abs(along) > START):
             return INF
     return t
@@ -373,7 +373,7 @@ def _first_hit(
 
 
 @wp.func
-def _turned(matrix: wp.array3d[wp.float64], p: wp.int64, v: wp.vec3d) -> wp.vec3d:
+def _turn(matrix: wp.array3d[wp.float64], p: wp.int64, v: wp.vec3d) -> wp.vec3d:
     return wp.vec3d(
         matrix[p, 0, 0] * v[0] + matrix[p, 0, 1] * v[1] + matrix[p, 0, 2] * v[2],
         matrix[p, 1, 0] * v[0] + matrix[p, 1, 1] * v[1] + matrix[p, 1, 2] * v[2],
@@ -394,10 +394,10 @@ def _ray(target: WarpTarget, rays: WarpRays, i: int) -> WarpBeam:
         offset = rays.offsets[i]
     if rays.pose.shape[0] > 0:
         p = rays.pose[i]
-        way = _turned(rays.matrix, p, way)
+        way = _turn(rays.matrix, p, way)
         start = rays.position[p]
         if count > 0:
-            start = start + _turned(rays.matrix, p, offset)
+            start = start + _turn(rays.matrix, p, offset)
     else:
         start = offset
     return _beam(start - target.origin, way)
@@ -497,10 +497,10 @@ def cast(
             b = vertices[named[1]]
             c = vertices[named[2]]
             if found.instance >= 0:
-                a = _moved(pose, a)
-                b = _moved(pose, b)
-                c = _moved(pose, c)
-            t = _clipped(t, beam, a - o, b - o, c - o)
+                a = _move(pose, a)
+                b = _move(pose, b)
+                c = _move(pose, c)
+            t = _clip(t, beam, a - o, b - o, c - o)
             if cosine != cosine:  # noqa: PLR0124
                 cosine = ZERO
         face = found.prim
@@ -522,7 +522,7 @@ def cast(
 
 
 @wp.func
-def _moved(pose: Pose, p: wp.vec3d) -> wp.vec3d:
+def _move(pose: Pose, p: wp.vec3d) -> wp.vec3d:
     return wp.vec3d(
         wp.dot(pose.x, p) + pose.shift[0],
         wp.dot(pose.y, p) + pose.shift[1],
@@ -531,7 +531,9 @@ def _moved(pose: Pose, p: wp.vec3d) -> wp.vec3d:
 
 
 @wp.kernel
-def occluded(target: WarpTarget, rays: WarpRays, out: wp.array[wp.bool], bad: wp.array[wp.int32]) -> None:
+def test_occlusion(
+    target: WarpTarget, rays: WarpRays, out: wp.array[wp.bool], bad: wp.array[wp.int32]
+) -> None:
     """Write whether rays hit anything, and the number of the first invalid ray to ``bad``."""
     i = _number(rays, wp.tid())
     beam = _ray(target, rays, i)

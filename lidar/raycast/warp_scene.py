@@ -85,7 +85,7 @@ class WarpScene(Float64Scene):
     def occluded(self, rays: RayColumns, *, threads: int) -> NDArray[np.bool_]:  # noqa: ARG002
         """Whether each ray hits anything."""
         blocked: NDArray[np.bool_] = self._run(
-            warp_kernels.occluded, rays, [(len(rays.directions), wp.bool)]
+            warp_kernels.test_occlusion, rays, [(len(rays.directions), wp.bool)]
         )[0]
         return blocked
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.physics.echoes import Origin
-from lidar.signal.run import Altered, cloud_truth, unaltered
+from lidar.signal.run import Altered, cloud_truth, trace_unaltered
 
 _OF_RETURNS = ("origin", "source", "hidden")
 """Truth of each recorded return."""
@@ -46,7 +46,7 @@ def past_of(cloud: Cloud, truth: Mapping[str, NDArray[Any]] | None) -> Past:
     Raises ValueError for the truth of another cloud.
     """
     if truth is None:
-        same = unaltered(cloud).cloud
+        same = trace_unaltered(cloud).cloud
         return Past(cloud, same.origin, same.source, same.hidden, cloud, np.arange(len(cloud)), {})
     origin, source, hidden = (truth[name] for name in _OF_RETURNS)
     names = cloud.columns()

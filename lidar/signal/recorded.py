@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, numbered, reported, traced
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, number_echoes, select_reported, trace
 from lidar.sensors.physics.intensity import apparent_of_code, reflectivity_code
-from lidar.sensors.physics.range_error import quantised
+from lidar.sensors.physics.range_error import quantise
 from lidar.sensors.rig.patterns.beams import Firings, T
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.recorded_pulses import recorded_pulses
 from lidar.signal.registry import Stages
-from lidar.signal.run import Altered, altered_cloud, altered_echoes, linked, unaltered
+from lidar.signal.run import Altered, altered_cloud, altered_echoes, link_truth, trace_unaltered
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses
 
@@ -45,7 +45,7 @@ def altered_recording(
     threshold : echoes whose power falls to the detection threshold are lost
     """
     if not stages.at("echoes", at.sensor) or (sent is not None and not len(sent)):
-        return Altered(altered_cloud(unaltered(cloud).cloud, stages, at=at), cloud)
+        return Altered(altered_cloud(trace_unaltered(cloud).cloud, stages, at=at), cloud)
     pulses, echoes = recorded_echoes(cloud, sensor, sent=sent)
     if threshold:
         least = pulses.apparent(np.full(len(echoes), _SEEN), echoes.range)
@@ -56,8 +56,8 @@ def altered_recording(
     if threshold:
         keep &= pulses.received(found) > 1
     found = found.where(keep)
-    power, (number, count) = pulses.received(found), numbered(found)
-    rows = reported(
+    power, (number, count) = pulses.received(found), number_echoes(found)
+    rows = select_reported(
         found, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
     )
     # A pulse without added echoes has passed the return mode already.
@@ -65,7 +65,7 @@ def altered_recording(
     keep[rows] = True
     found, numbers = found.where(keep), (number[keep], count[keep])
     result = _cloud(cloud, found, pulses=pulses, before=echoes, numbers=numbers)
-    linked_cloud = linked(result, found, first=echoes)
+    linked_cloud = link_truth(result, found, first=echoes)
     return Altered(altered_cloud(linked_cloud, stages, at=at), cloud)
 
 
@@ -87,7 +87,7 @@ def _echoes(cloud: Cloud, sensor: Sensor, *, pulse: NDArray[np.int32]) -> Traced
         cloud.true_range - offset,
         np.ones(n, bool),
     )
-    return traced(echoes, Origin.SURFACE, source=np.arange(n))
+    return trace(echoes, Origin.SURFACE, source=np.arange(n))
 
 
 def _cloud(
@@ -109,10 +109,10 @@ def _cloud(
     old = _at(cloud.range, row)
     distance = echoes.range + sensor.pattern.range_offset
     moved = ~is_known | (echoes.range != _at(before.range, row))
-    distance = np.where(moved, _stepped(distance, cloud.range, step=sensor.range_quantum), old)
+    distance = np.where(moved, _step(distance, cloud.range, step=sensor.range_quantum), old)
     xyz += (distance - old)[:, None] * direction
     brighter = ~is_known | (echoes.apparent != _at(before.apparent, row))
-    code = _coded(reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code), cloud.intensity)
+    code = _encode(reflectivity_code(echoes.apparent, diffuse_code=sensor.diffuse_code), cloud.intensity)
     number, count = numbers
     return replace(
         cloud,
@@ -138,15 +138,15 @@ def _at(column: NDArray[T], row: NDArray[np.integer]) -> NDArray[T]:
     return found
 
 
-def _stepped(distance: Float, recorded: Float, *, step: float) -> Float:
+def _step(distance: Float, recorded: Float, *, step: float) -> Float:
     """Ranges (m,), rounded to the sensor's step if recorded ones (n,) are."""
     if not step or not len(recorded):
         return distance
     off = np.abs(recorded / step - np.round(recorded / step))
-    return quantised(distance, step) if np.percentile(off, 99) < _ON_STEP else distance
+    return quantise(distance, step) if np.percentile(off, 99) < _ON_STEP else distance
 
 
-def _coded(intensity: NDArray[np.float32], recorded: NDArray[np.float32]) -> NDArray[np.float32]:
+def _encode(intensity: NDArray[np.float32], recorded: NDArray[np.float32]) -> NDArray[np.float32]:
     """Intensities (m,), each the nearest recorded value if there are few of these, as of whole codes."""
     values = np.unique(recorded)
     if not 0 < len(values) <= min(_CODES, len(recorded) // 2):

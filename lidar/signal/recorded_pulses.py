@@ -32,8 +32,8 @@ def recorded_pulses(
     number = _pulse_numbers(cloud)
     first = np.flatnonzero(np.diff(number, prepend=-1))
     nominal = firings(sensor, 0) if sent is None else sent
-    fired = _fired(nominal, ring=cloud.ring[first], column=cloud.column[first])
-    returned = _returned(cloud, sensor, first=first, nominal=nominal, fired=fired)
+    fired = _find_pulse(nominal, ring=cloud.ring[first], column=cloud.column[first])
+    returned = _select_returned(cloud, sensor, first=first, nominal=nominal, fired=fired)
     if sent is None:
         empty, place = _in_gaps(returned, nominal, start_ns=cloud.start_ns)
         order = np.concatenate([np.arange(len(first)), place])
@@ -58,7 +58,7 @@ def _pulse_numbers(cloud: Cloud) -> Rows:
     return np.cumsum(~same) - 1
 
 
-def _fired(sent: Firings, *, ring: NDArray[Any], column: NDArray[Any]) -> Rows:
+def _find_pulse(sent: Firings, *, ring: NDArray[Any], column: NDArray[Any]) -> Rows:
     """Row (k,) in ``sent`` of the pulses of a ring and a column; -1 for those that are not fired."""
     width, height = (int(part.max(initial=0)) + 1 for part in (sent.column, sent.ring))
     row = np.full((width, height), -1)
@@ -67,7 +67,7 @@ def _fired(sent: Firings, *, ring: NDArray[Any], column: NDArray[Any]) -> Rows:
     return np.where(is_known, row[np.where(is_known, column, 0), np.where(is_known, ring, 0)], -1)
 
 
-def _returned(cloud: Cloud, sensor: Sensor, *, first: Rows, nominal: Firings, fired: Rows) -> Pulses:
+def _select_returned(cloud: Cloud, sensor: Sensor, *, first: Rows, nominal: Firings, fired: Rows) -> Pulses:
     """The pulses with returns, in the order of these.
 
     first : (k,) first return of each
@@ -96,7 +96,7 @@ def _origins(nominal: Firings, *, ring: NDArray[Any], column: NDArray[Any], fire
     width = int(nominal.column.max()) + 1
     inner = np.clip(column, min(1, width - 1), max(width - 2, 0))
     lower = np.minimum(ring, nominal.ring.max())
-    found: Float = nominal.origin[np.where(fired >= 0, fired, _fired(nominal, ring=lower, column=inner))]
+    found: Float = nominal.origin[np.where(fired >= 0, fired, _find_pulse(nominal, ring=lower, column=inner))]
     return found
 
 
@@ -138,7 +138,7 @@ def _in_gaps(returned: Pulses, nominal: Firings, *, start_ns: int) -> tuple[Puls
     on_ring = np.concatenate([ring[of], nominal.ring[bare].astype(np.int64)])
     turned = np.concatenate([azimuth[left][of] + share * gap[of], _azimuth(nominal.direction[bare])])
     column, time_ns = nearest_columns(nominal, (turned + np.pi) % (2 * np.pi) - np.pi)
-    fired = _fired(nominal, ring=on_ring, column=column)
+    fired = _find_pulse(nominal, ring=on_ring, column=column)
     pulses = Pulses(
         returned.sensor,
         start_ns + time_ns,
@@ -209,7 +209,7 @@ def _beside(known: NDArray[np.integer], wanted: NDArray[np.integer]) -> Float:
     return place
 
 
-def completed(cloud: Cloud, sensor: Sensor, *, columns: tuple[str, ...]) -> Cloud:
+def complete(cloud: Cloud, sensor: Sensor, *, columns: tuple[str, ...]) -> Cloud:
     """A cloud with ring, column and time, derived from the points' directions if its format lacks them."""
     if "column" in columns:
         return cloud

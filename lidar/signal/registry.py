@@ -202,7 +202,7 @@ def read_stages(texts: Iterable[str], *, seed: int = 0) -> Stages:
 
     Raises InputError as `read_stage` does, and for a file that cannot be read.
     """
-    return Stages(numbered(_read_all(texts, "stage")), seed)
+    return Stages(number_stages(_read_all(texts, "stage")), seed)
 
 
 def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
@@ -210,15 +210,15 @@ def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
 
     Raises InputError as `read_stages` does, and for a stage that is no attack.
     """
-    return numbered(_read_all(texts, "attack"))
+    return number_stages(_read_all(texts, "attack"))
 
 
 def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
     """Stages from tables as `read_stage` reads them."""
-    return Stages(numbered(map(read_stage, tables)), seed)
+    return Stages(number_stages(map(read_stage, tables)), seed)
 
 
-def numbered(stages: Iterable[NamedStage], *, after: Sequence[str] = ()) -> tuple[NamedStage, ...]:
+def number_stages(stages: Iterable[NamedStage], *, after: Sequence[str] = ()) -> tuple[NamedStage, ...]:
     """Stages in the order in which they act, each with the number of earlier ones of the same name.
 
     after : names of stages that have acted on the data before

@@ -19,7 +19,7 @@ from lidar.geometry.random_streams import generator
 from lidar.sensors.laser.cloud import Cloud, TracedCloud
 from lidar.sensors.laser.scan import Sweep, detect, deviates_of, report
 from lidar.sensors.physics.detector import added_noise
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, mixed, traced
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, mix, trace
 from lidar.signal.effects import row_changes
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation
@@ -51,7 +51,7 @@ class Altered:
         return Altered(cloud, self.original.where(kept))
 
 
-def unaltered(cloud: Cloud) -> Altered:
+def trace_unaltered(cloud: Cloud) -> Altered:
     """A cloud that no stage has changed."""
     n = len(cloud)
     added: list[Any] = [
@@ -66,7 +66,7 @@ def altered_sweep(sweep: Sweep, stages: Stages, *, at: Situation) -> Altered:
     """The point cloud of a sweep after the stages on its echoes and on the cloud."""
     m = len(sweep.echoes)
     noise = _RepeatedNoise(sweep)
-    echoes = traced(sweep.echoes, Origin.SURFACE, source=np.arange(m))
+    echoes = trace(sweep.echoes, Origin.SURFACE, source=np.arange(m))
     first = last = detect(sweep, echoes, deviates=noise.first)
     original = report(sweep, first)
     before = stages.at("echoes", at.sensor)
@@ -76,7 +76,7 @@ def altered_sweep(sweep: Sweep, stages: Stages, *, at: Situation) -> Altered:
         echoes = altered_echoes(pulses, echoes, stages=stages, at=at, extinction=sweep.settings.extinction)
         last = detect(sweep, echoes, deviates=noise.again)
     reported, unaltered = cast("TracedEchoes", last.echoes), cast("TracedEchoes", first.echoes)
-    cloud = linked(report(sweep, last) if before else original, reported, first=unaltered)
+    cloud = link_truth(report(sweep, last) if before else original, reported, first=unaltered)
     return Altered(altered_cloud(cloud, stages, at=at), original)
 
 
@@ -107,10 +107,10 @@ def altered_echoes(
             found = row_changes(before, echoes, unit="echoes", columns=("range", "apparent"))
             at.effects.add(named.label, found)
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
-    return mixed(echoes, is_new, pulses=len(pulses), separation=pulses.sensor.echo_separation)
+    return mix(echoes, is_new, pulses=len(pulses), separation=pulses.sensor.echo_separation)
 
 
-def linked(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:
+def link_truth(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> TracedCloud:
     """A cloud with the truth of its returns against those of the original cloud.
 
     echoes : of the returns of ``cloud``

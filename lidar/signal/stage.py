@@ -14,8 +14,8 @@ from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.sensors.laser.cloud import TracedCloud
-from lidar.sensors.physics.detector import received
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, traced
+from lidar.sensors.physics.detector import receive
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, trace
 from lidar.sensors.physics.link import apparent_of
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor
@@ -152,7 +152,7 @@ class Pulses(Columns):
 
     def received(self, echoes: Echoes) -> Float:
         """Power (m,) of echoes over the detection threshold."""
-        return received(self.sensor, echoes)
+        return receive(self.sensor, echoes)
 
     def apparent(self, power: Float, distance: Float) -> Float:
         """Apparent reflectance (m,) of echoes that arrive with a power over the detection threshold.
@@ -183,14 +183,14 @@ def added_echoes(
     klass: Class = Class.NOISE,
     feature: int = -1,
 ) -> TracedEchoes:
-    """Echoes that a stage adds; join them to others with `lidar.sensors.physics.echoes.joined`.
+    """Echoes that a stage adds; join them to others with `lidar.sensors.physics.echoes.join`.
 
     pulse    : (k,) row of the pulse
     distance : (k,) metres from the beam's start
     apparent : (k,) apparent reflectance, such as from `Pulses.apparent`
     """
     found = artificial_echoes(pulse, distance, apparent=apparent, klass=klass, feature=feature)
-    return traced(found, origin, source=np.full(len(found), -1))
+    return trace(found, origin, source=np.full(len(found), -1))
 
 
 class EchoStage(Protocol):

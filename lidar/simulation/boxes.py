@@ -220,7 +220,7 @@ def merge_box_files(out: Path) -> None:
             in_time = heapq.merge(*streams, key=itemgetter(0, 1))
             for k, group in itertools.groupby(in_time, key=itemgetter(0)):
                 rows = {order: cells for _, order, cells in group}
-                file.writelines(_merged(names, k, rows=rows, scanners=len(scanners)))
+                file.writelines(_merge_rows(names, k, rows=rows, scanners=len(scanners)))
 
 
 def _by_step(
@@ -234,7 +234,7 @@ def _by_step(
             yield k, order, list(group)
 
 
-def _merged(
+def _merge_rows(
     names: list[str], step: int, *, rows: Mapping[int, list[list[str]]], scanners: int
 ) -> Iterator[str]:
     """Lines of the dataset's boxes of a step, from the rows of each scanner; ``names`` of their columns."""

@@ -83,7 +83,7 @@ def record_on_cluster(
     progress("driving", done, total=total)
     write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=plan.jobs[:0])))
     try:
-        for result in cluster.run_tasks(_recorded, tasks):
+        for result in cluster.run_tasks(_record_task, tasks):
             for sensor, frame, points, digests in result.frames:
                 journal.add(sensor, frame, points=points, digests=digests)
             recording.watch.add(result.seconds)
@@ -109,7 +109,7 @@ class _Station(threading.local):
 _station = _Station()
 
 
-def _recorded(task: _Task) -> _Done:
+def _record_task(task: _Task) -> _Done:
     """Record the frames of a task; run by workers."""
     if _station.plan != task.plan:
         plan: DrivePlan = pickle.loads(task.plan.read_bytes())  # noqa: S301 - of the program that gave the task

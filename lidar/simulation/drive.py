@@ -18,7 +18,7 @@ from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
 from geoscene.scene import Scene
-from geoscene.support.cluster import DaskCluster, connected
+from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.files import exclusive, json_bytes, write_json
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.checksums import write_checksums
@@ -104,7 +104,7 @@ def drive(
     began = time.perf_counter()
     with (
         install_listener("numba:compile", _CompilationProgress(progress)),
-        connected(options.scheduler) if options.scheduler else nullcontext() as cluster,
+        connect(options.scheduler) if options.scheduler else nullcontext() as cluster,
     ):
         return _driven(
             scene,
@@ -158,7 +158,7 @@ def _driven(
     recording = plan.recording(out)
     check_attackers(plan, recording)
     with exclusive(out), _begun(out, manifest, overwrite=overwrite):
-        journal = _verified(recording, plan.jobs, progress=progress)
+        journal = _verify(recording, plan.jobs, progress=progress)
         _write_plan(plan, recording)
         pending = _pending(plan, journal)
         resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
@@ -258,7 +258,7 @@ def _write_plan(plan: DrivePlan, recording: Recording) -> None:
     )
 
 
-def _verified(recording: Recording, jobs: Sequence[SensorFrame], *, progress: Progress) -> Journal:
+def _verify(recording: Recording, jobs: Sequence[SensorFrame], *, progress: Progress) -> Journal:
     """The journal of the dataset, with only those of the frames whose files are as they were written."""
     path = Paths(recording.out).journal
     old, journal = read_journal(path), Journal(path)

@@ -59,7 +59,7 @@ def run_jobs(
             for job in chunk:
                 running.append(pool.submit(task, job, worlds))
                 if len(running) >= 2 * workers:
-                    yield from _finished(running, in_order=in_order)
+                    yield from _finish(running, in_order=in_order)
                 if job.start_ns - released_ns > _FORGET_NS:
                     recording.release()
                     released_ns = job.start_ns
@@ -67,7 +67,7 @@ def run_jobs(
                 yield running.popleft().result()
 
 
-def _finished(running: deque[Future[T]], *, in_order: bool) -> Iterator[T]:
+def _finish(running: deque[Future[T]], *, in_order: bool) -> Iterator[T]:
     """Wait for a task, the first in order or any, and take the results that are there."""
     if in_order:
         yield running.popleft().result()
@@ -117,10 +117,10 @@ def recording_chunks(
     """`chunks` whose boxes also cover the places of earlier frames that stages ask for."""
     back_ns = recording.contents.stages.lookback_ns
     for run, box in chunks(jobs, recording.trajectory):
-        yield run, _widened(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
+        yield run, _widen(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
 
 
-def _widened(box: Region, jobs: Sequence[SensorFrame], *, trajectory: Trajectory, back_ns: int) -> Region:
+def _widen(box: Region, jobs: Sequence[SensorFrame], *, trajectory: Trajectory, back_ns: int) -> Region:
     """A box that also covers where the vehicle was within some time before jobs."""
     until, spans = 0, []
     for job in jobs:  # in order of time

@@ -126,7 +126,7 @@ class Simulation:
         recording = plan.recording(Path())
         check_attackers(plan, recording)
         measured = run_jobs(
-            partial(_measured, recording=recording),
+            partial(_measure_frame, recording=recording),
             plan.jobs,
             recording=recording,
             scene=plan.scene,
@@ -165,7 +165,9 @@ def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = silent
     return Simulation(plan)
 
 
-def _measured(job: SensorFrame, worlds: Worlds, *, recording: Recording) -> MeasuredCloud | MeasuredImages:
+def _measure_frame(
+    job: SensorFrame, worlds: Worlds, *, recording: Recording
+) -> MeasuredCloud | MeasuredImages:
     return measure_frame(recording, job.sensor, frame=job.frame, worlds=worlds)
 
 

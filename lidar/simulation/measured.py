@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.dataset.deskew import MOMENTS, deskewed
+from lidar.dataset.deskew import MOMENTS, deskew
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
@@ -89,7 +89,7 @@ class MeasuredCloud(MeasuredFrame):
         if moment not in MOMENTS:
             raise InputError(f"`moment` {moment}: one of {', '.join(MOMENTS)}")
         time_ns = self.time_ns + int(MOMENTS[moment] * self.period_ns)
-        return deskewed(self.placed, self.trajectory, mount=self.mount, time_ns=time_ns)
+        return deskew(self.placed, self.trajectory, mount=self.mount, time_ns=time_ns)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def pose_columns(
     }
 
 
-def _mounted(mount: Mount) -> dict[str, Any]:
+def _mount(mount: Mount) -> dict[str, Any]:
     return {
         "vehicle_from_sensor": mount.matrix.tolist(),
         "translation": list(mount.translation),
@@ -77,7 +77,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
     for kind, specs in (("gnss", rig.gnss), ("imu", rig.imus)):
         for spec in specs:
             rates = {"rate_hz": spec.rate_hz, "time_offset_ns": spec.time_offset_ns}
-            out[spec.name] = {"kind": kind, **rates, **_mounted(spec.mount)}
+            out[spec.name] = {"kind": kind, **rates, **_mount(spec.mount)}
     for sensor in sensors:
         if isinstance(sensor, Scanner):
             s = sensor.sensor
@@ -88,7 +88,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "time_offset_ns": s.start_ns,
                 **{name: getattr(s, name) for name in _SCANNER},
                 **{name: value for name in _SECRETS if (value := getattr(s, name))},
-                **_mounted(sensor.spec.mount),
+                **_mount(sensor.spec.mount),
             }
         else:
             c = sensor.spec
@@ -104,7 +104,7 @@ def calibration(rig: Rig, sensors: Sequence[Scanner | Camera]) -> dict[str, Any]
                 "depth_counts_per_metre": 256,
                 "exposure_ns": c.exposure_ns,
                 "row_ns": c.row_ns,
-                **_mounted(c.mount),
+                **_mount(c.mount),
             }
     return {
         "frames": {

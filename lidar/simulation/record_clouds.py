@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from geoscene.support.csv_tables import write_columns
 from geoscene.typing import Float
-from lidar.dataset.deskew import MOMENTS, deskewed
+from lidar.dataset.deskew import MOMENTS, deskew
 from lidar.dataset.formats.table import FrameInfo, Table, cloud_table, point_labels
 from lidar.errors import LidarError
 from lidar.geometry.random_streams import generator
 from lidar.geometry.time_scales import gps_seconds
 from lidar.sensors.laser.cloud import Cloud, TracedCloud, no_returns
 from lidar.sensors.laser.doppler import radial_velocity, surface_velocity
-from lidar.sensors.laser.scan import Sweep, cast, fired, measured
+from lidar.sensors.laser.scan import Sweep, cast, find_pulse, measure
 from lidar.sensors.rig.devices import Scanner
 from lidar.sensors.rig.patterns.beams import Firings
-from lidar.signal.run import Altered, altered_sweep, cloud_truth, unaltered, write_truth
+from lidar.signal.run import Altered, altered_sweep, cloud_truth, trace_unaltered, write_truth
 from lidar.simulation.boxes import box_rows, count_points
 from lidar.simulation.measured import MeasuredCloud, firing_times, placed_cloud
 from lidar.simulation.recording import Recording
@@ -49,11 +49,11 @@ def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds:
     """Scan one frame."""
     world, truth = worlds.during(*scanner.sensor.window_ns(frame)), dict[str, NDArray[Any]]()
     if recording.has_stages(scanner):
-        altered = _altered(recording, scanner, frame=frame, worlds=worlds)
+        altered = _alter(recording, scanner, frame=frame, worlds=worlds)
         truth = cloud_truth(altered, start_ns=scanner.frame_start_ns(frame))
         cloud: Cloud = altered.cloud
     else:
-        cloud = _scanned(recording, scanner, frame=frame, world=world)
+        cloud = _scan(recording, scanner, frame=frame, world=world)
     boxes: dict[str, NDArray[Any]] = {}
     if recording.actors is not None:
         with recording.watch.stage("boxes"):
@@ -76,25 +76,25 @@ def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds:
     )
 
 
-def _scanned(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Cloud:
+def _scan(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Cloud:
     """What a scanner measures in a frame, during the times at which scanners work."""
     if not _works(recording, scanner, frame=frame):
         return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
-        cloud = measured(_swept(recording, scanner, frame=frame, world=world))
+        cloud = measure(_swept(recording, scanner, frame=frame, world=world))
     return cloud if recording.scanning_ns is None else cloud.where(_while_on(recording, firing_times(cloud)))
 
 
-def _altered(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
+def _alter(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
     """What a scanner measures in a frame, after the stages on it."""
     window = scanner.sensor.window_ns(frame)
     if not _works(recording, scanner, frame=frame):
-        return unaltered(no_returns(window[0]))
+        return trace_unaltered(no_returns(window[0]))
 
     def cloud_of(earlier: int) -> Cloud:
         _check_lookback(recording, scanner, frames=frame - earlier)
         then = worlds.during(*scanner.sensor.window_ns(earlier))
-        cloud = _scanned(recording, scanner, frame=earlier, world=then)
+        cloud = _scan(recording, scanner, frame=earlier, world=then)
         worlds.during(*window)  # this thread's world is again that of the frame
         return cloud
 
@@ -136,7 +136,7 @@ def _works(recording: Recording, scanner: Scanner, *, frame: int) -> bool:
 
 def sent_pulses(recording: Recording, scanner: Scanner, *, frame: int) -> Firings:
     """The pulses of a frame, as far as scanners work during it."""
-    sent = fired(scanner.sensor, frame, settings=recording.contents.scanner)
+    sent = find_pulse(scanner.sensor, frame, settings=recording.contents.scanner)
     return sent if recording.scanning_ns is None else sent.where(_while_on(recording, sent.time_ns))
 
 
@@ -177,7 +177,7 @@ def write_clouds(
         table["velocity"] = velocity
 
     def still_at(time_ns: int) -> Table:
-        still = deskewed(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=time_ns)
+        still = deskew(placed, recording.trajectory, mount=scanner.spec.mount, time_ns=time_ns)
         return table | dict(zip("xyz", still.T, strict=True))
 
     info = None

@@ -58,7 +58,7 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
     pose = _poses(recording, camera, times=times[[first + rows // 2]])
     shown = recording.signals
     lamps = None if shown is None else lamps_at(shown, middle)
-    image = _rendered(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world, lamps=lamps)
+    image = _render(recording, camera, frame=frame, times=times, span_ns=span_ns, world=world, lamps=lamps)
     boxes, truth = dict[str, NDArray[Any]](), dict[str, NDArray[Any]]()
     signals = dict[str, NDArray[Any]]()
     if shown is not None:
@@ -98,7 +98,7 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
     )
 
 
-def _rendered(
+def _render(
     recording: Recording,
     camera: Camera,
     *,

@@ -43,7 +43,7 @@ from lidar.signal.attacks.sight import Seen, check_sight
 from lidar.signal.effects import Counts, Effects
 from lidar.signal.past import Past, truth_since
 from lidar.signal.recorded import altered_recording, recorded_echoes
-from lidar.signal.registry import NamedStage, Stages, dimming, numbered
+from lidar.signal.registry import NamedStage, Stages, dimming, number_stages
 from lidar.signal.run import altered_image, image_past, image_truth, write_truth
 from lidar.signal.situation import Situation
 from lidar.signal.stage import LABELS, POSES
@@ -133,7 +133,7 @@ def _apply_to_dataset(
         rig = rig_of(recipe["rig"])
         acted = acted_stages(dataset)
         names = [str(table["name"]) for table in acted]
-        chosen = Stages(numbered(stages, after=names), int(dataset.manifest["seed"]), dimming(acted))
+        chosen = Stages(number_stages(stages, after=names), int(dataset.manifest["seed"]), dimming(acted))
         columns = {name for form in recipe["formats"] for name in FORMATS[form].columns}
         labelled = dataset.paths.boxes.exists() and {"label", "instance"} <= columns
         chosen.check(sensor_kinds(rig), known=(POSES, LABELS) if labelled else (POSES,))
@@ -175,7 +175,10 @@ def _apply_to_dataset(
         _apply_to_unit(dataset, recording, spec=unit)
     if Paths(out).boxes.exists():
         merge_box_files(out)
-    applied = [*recipe.get("applied_stages", ()), *(listed(s, seed=chosen.seed) for s in chosen.stages)]
+    applied = [
+        *recipe.get("applied_stages", ()),
+        *(describe_stage(s, seed=chosen.seed) for s in chosen.stages),
+    ]
     recipe |= {"applied_stages": applied, "settings": with_stage_settings(recipe["settings"], stages)}
     parents = derived_from(dataset.path, dataset.manifest, by="apply")
     write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe, "points": points} | parents)
@@ -184,7 +187,7 @@ def _apply_to_dataset(
     return ApplySummary(out, len(jobs) + len(units), before, sum(points.values()), effects, sight)
 
 
-def listed(named: NamedStage, *, seed: int) -> dict[str, Any]:
+def describe_stage(named: NamedStage, *, seed: int) -> dict[str, Any]:
     """A stage in the list of those that were applied, with its seed; ``seed`` is the data's."""
     return {"seed": seed} | named.to_json()
 
@@ -339,7 +342,7 @@ def _apply_to_clouds(
             devices[key] = load_sensor(options.sensor or _SENSORS[form.name], name=key[0])
     acted = read_foreign_stages(source)
     names = [str(table["name"]) for table in acted]
-    chosen = Stages(numbered(options.all_stages, after=names), before=dimming(acted))
+    chosen = Stages(number_stages(options.all_stages, after=names), before=dimming(acted))
     kinds = {name: "lidar" for name, _ in devices}
     chosen.check(kinds)
     chosen.check_start(kinds, last=dict.fromkeys(kinds, 0.0))
@@ -366,7 +369,7 @@ def _apply_to_clouds(
         if form is KITTI and (labels := foreign_labels(path)).is_file():
             select_labels(labels, out / labels.relative_to(source), altered=altered)
         before, after = before + len(past.cloud), after + len(altered.cloud)
-    write_foreign_stages(out, [*acted, *(listed(stage, seed=chosen.seed) for stage in chosen.stages)])
+    write_foreign_stages(out, [*acted, *(describe_stage(stage, seed=chosen.seed) for stage in chosen.stages)])
     progress("stages", len(clouds), total=len(clouds))
     has_devices = any(isinstance(named.stage, Attacker) for named in chosen.stages)
     sight = "returns" if has_devices else ""

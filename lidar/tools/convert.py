@@ -151,7 +151,7 @@ def _convert_cloud(
         return
     if source.frame == "world":
         with reading_file(path):
-            table = _as_measured(source.read(path), recording, scanner=scanner, frame=frame)
+            table = _to_scanner_frame(source.read(path), recording, scanner=scanner, frame=frame)
     else:
         table = cloud_points(path)
     velocity = None
@@ -162,7 +162,7 @@ def _convert_cloud(
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=velocity)
 
 
-def _as_measured(table: Table, recording: Recording, *, scanner: Scanner, frame: int) -> Table:
+def _to_scanner_frame(table: Table, recording: Recording, *, scanner: Scanner, frame: int) -> Table:
     """A table of the world frame in that of its scanner, with the times and firing blocks of its pulses.
 
     A return is of the pulse of its ring that is nearest in time; of pulses at the same time, as of a flash,

@@ -17,13 +17,13 @@ from lidar.errors import DatasetError
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.past import Past, past_of
-from lidar.signal.recorded_pulses import completed
+from lidar.signal.recorded_pulses import complete
 from lidar.signal.run import Altered
 
 
 def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
     """A point cloud of KITTI or nuScenes."""
-    return completed(table_cloud(form.read(path)), device, columns=form.columns)
+    return complete(table_cloud(form.read(path)), device, columns=form.columns)
 
 
 def read_foreign_past(path: Path, form: Format, *, source: Path, device: Sensor) -> Past:

@@ -265,7 +265,7 @@ def _points(dataset: Dataset, name: str) -> dict[str, Any]:
     return {"points": int(counts.sum()) if total is None else total, "points_per_frame": per_frame}
 
 
-def _listed(folder: Path) -> Iterator[tuple[str, int]]:
+def _list_files(folder: Path) -> Iterator[tuple[str, int]]:
     """Paths of all files of a directory, relative to it, and their bytes."""
     for name in files_in(folder):
         yield name, os.lstat(folder / name).st_size
@@ -279,7 +279,7 @@ def _sizes(dataset: Dataset, *, folders: Collection[str]) -> _Sizes:
     folders : names of sensors, whose folders hold a folder for each kind of file
     """
     found, stored = _Sizes(), dataset.stored
-    files = _listed(dataset.path)
+    files = _list_files(dataset.path)
     if stored is not None:
         files = ((name, int(about.get("size") or 0)) for name, about in stored.listed().items())
     for name, size in files:
@@ -339,7 +339,7 @@ def _foreign(folder: Path, clouds: Sequence[tuple[Path, Format]]) -> dict[str, A
             row["damaged"].append(path.name)
     known = read_folder_provenance(folder)
     found = _Sizes()
-    for name, size in _listed(folder):
+    for name, size in _list_files(folder):
         count = found.kinds[name.rpartition("/")[0] or "."]
         count[0], count[1] = count[0] + 1, count[1] + size
     return {

@@ -21,7 +21,7 @@ from lidar.options import with_stage_settings
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.settings import RecordingSettings, settings_of
-from lidar.signal.recorded_pulses import completed
+from lidar.signal.recorded_pulses import complete
 from lidar.signal.registry import NO_STAGES, Stages, acts_on
 from lidar.signal.run import Altered, write_truth
 from lidar.simulation.record_clouds import write_clouds
@@ -93,7 +93,7 @@ def recorded_cloud(
     """A cloud of a dataset."""
     path = replace(recording, out=dataset.path).paths(scanner, frame)[form.name]
     cloud = table_cloud(cloud_points(path), start_ns=scanner.frame_start_ns(frame))
-    return completed(cloud, scanner.sensor, columns=form.columns)
+    return complete(cloud, scanner.sensor, columns=form.columns)
 
 
 def write_altered(

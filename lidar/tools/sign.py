@@ -102,7 +102,7 @@ def sign_dataset(
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
         with exclusive(source.resolve()):
             delete_leftovers(source)
-            summary, data = _chained(given, signer, summary=SignSummary(source), progress=progress)
+            summary, data = _chain(given, signer, summary=SignSummary(source), progress=progress)
             known = {chain.relative_to(source).as_posix(): hashlib.sha256(data).digest()}
             add_to_checksums(source, below=given.integrity.name, known=known)
             write_atomically(chain, data)  # last: it marks signed data
@@ -116,15 +116,15 @@ def sign_dataset(
         elif dataset is None:
             summary = _marked_clouds(source, summary, watermark=watermark, progress=progress)
         else:
-            summary = _marked(dataset, summary, watermark=watermark, progress=progress)
-        summary, data = _chained(signable(part), signer, summary=summary, progress=progress)
+            summary = _mark(dataset, summary, watermark=watermark, progress=progress)
+        summary, data = _chain(signable(part), signer, summary=summary, progress=progress)
         if data:
             write_atomically(Paths(part).chain, data)
         write_checksums(part)
     return replace(summary, path=out)
 
 
-def _marked(
+def _mark(
     dataset: Dataset, summary: SignSummary, *, watermark: WatermarkKey, progress: Progress
 ) -> SignSummary:
     """Copy a dataset with a watermark in its clouds, in all their formats."""
@@ -256,7 +256,7 @@ def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
     return blocks_in(path, rate_hz=rate_hz)
 
 
-def _chained(
+def _chain(
     data: Signable, signer: Signer | None, *, summary: SignSummary, progress: Progress
 ) -> tuple[SignSummary, bytes]:
     """Write the hash chain over the files of a directory; the bytes of the signature, empty without a key."""

@@ -22,7 +22,7 @@ from lidar.dataset.truth_files import read_truth
 from lidar.errors import InputError
 from lidar.geometry.time_scales import iso_times
 from lidar.sensors.camera.png import read_png
-from lidar.signal.run import changed_pixels, cloud_truth, unaltered, write_truth
+from lidar.signal.run import changed_pixels, cloud_truth, trace_unaltered, write_truth
 
 TRUTH = "tamper.truth.csv"
 """File of a tampered dataset that tells what was done; not for defences."""
@@ -112,7 +112,7 @@ def tamper(
     dataset = open_dataset(source)
     other = open_dataset(by) if str(by) else dataset
     copies = _copies(dataset, other, replacements=replacements, freeze=freeze)
-    stamps = {name: _shifted(dataset, name, shift_ns=shift) for name, shift in moved.items()}
+    stamps = {name: _shift(dataset, name, shift_ns=shift) for name, shift in moved.items()}
     rows = [("replaced", name, path.as_posix(), 0) for name, path in copies.items()]
     rows += [("shifted", path, "", moved[name]) for name, (path, _) in stamps.items()]
     with complete_folder(out) as part:
@@ -171,7 +171,7 @@ def _truths(
         truth = dataset.paths.truth(sensor, frame)
         columns = read_truth(other.paths.truth(sensor, _number(path)))
         if columns is None and truth.exists():
-            columns = _untouched(path)
+            columns = _truth_unchanged(path)
         if columns is not None:
             yield truth.relative_to(dataset.path), columns
 
@@ -181,15 +181,15 @@ def _number(path: Path) -> int:
     return int(re.split(r"[._]", path.name)[0])
 
 
-def _untouched(path: Path) -> dict[str, NDArray[Any]]:
+def _truth_unchanged(path: Path) -> dict[str, NDArray[Any]]:
     """The truth of a cloud or an image that no stage has changed."""
     if path.suffix == ".png":
         rgb = read_png(path).astype(np.uint8)
         return changed_pixels(rgb, rgb)
-    return cloud_truth(unaltered(table_cloud(read_table(path))), start_ns=0)
+    return cloud_truth(trace_unaltered(table_cloud(read_table(path))), start_ns=0)
 
 
-def _shifted(dataset: Dataset, name: str, *, shift_ns: int) -> tuple[str, Mapping[str, list[str]]]:
+def _shift(dataset: Dataset, name: str, *, shift_ns: int) -> tuple[str, Mapping[str, list[str]]]:
     """Path and columns of the table of a sensor's times, with later time stamps."""
     sensors = dataset.sensors("lidar", "camera", "imu")
     if name not in sensors:

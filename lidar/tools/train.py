@@ -19,7 +19,7 @@ from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds
 from lidar.errors import DatasetError, InputError
-from lidar.tools.detection.clusters import PLAIN, clustered
+from lidar.tools.detection.clusters import PLAIN, find_clusters
 from lidar.tools.detection.detector import KINDS
 from lidar.tools.detection.features import FEATURES, features
 from lidar.tools.detection.forest import Forest, forest_of
@@ -206,7 +206,9 @@ class _Cloud(NamedTuple):
 
 def examples_of(table: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float32], Ints]:
     """Measures of the clusters of a labelled cloud, and rows of `CLASSES` that they are."""
-    scan = clustered(_Cloud(np.column_stack([table[axis] for axis in "xyz"]).astype(float)), settings=PLAIN)
+    scan = find_clusters(
+        _Cloud(np.column_stack([table[axis] for axis in "xyz"]).astype(float)), settings=PLAIN
+    )
     label, instance = table["label"][scan.row], table["instance"][scan.row]
     of_class = np.zeros(256, np.int64)
     for code, name in KINDS.items():

@@ -473,11 +473,11 @@ def _files_found(
             if other is not None and known[got] == 1:
                 yield Finding("replaced", name, f"holds frame {other}", **where)
                 continue
-            yield _changed(path, name, digests=digests, rate_hz=rate_hz, where=where)
+            yield _change(path, name, digests=digests, rate_hz=rate_hz, where=where)
     progress(f"verify {sensor}", len(signed), total=len(signed))
 
 
-def _changed(
+def _change(
     path: Path, name: str, *, digests: FrameDigests, rate_hz: float, where: dict[str, Any]
 ) -> Finding:
     """What differs in a file of a frame."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.motion.blockwise import even, interpolated, rowwise
+from lidar.motion.blockwise import even, interpolate, rowwise
 from lidar.motion.path import Path
 from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.speed_profile import desired_speed
@@ -61,9 +61,9 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     # `s` repeats where the vehicle turns round
     s = rowwise(np.add, path.s, even(len(path), 1e-9))
     scale = float(path.scale.mean())
-    heading = interpolated(at, s, column=path.heading)
+    heading = interpolate(at, s, column=path.heading)
     ahead = scale * (vehicle.length / 2 - vehicle.rear_overhang)
-    axle = [interpolated(at, s, column=path.position[:, c]) for c in range(3)]
+    axle = [interpolate(at, s, column=path.position[:, c]) for c in range(3)]
     shift = rowwise(lambda angle: ahead * np.column_stack([np.cos(angle), np.sin(angle)]), heading)
     xy = rowwise(lambda by, *axle: np.column_stack(axle) + by, shift, *axle[:2])
     row = rowwise(lambda at: np.searchsorted(s, at, side="right").clip(1, len(s)) - 1, at, looked_up=(s,))
@@ -83,7 +83,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
     driver = replace(driver, hard=driver_on(driver, road).hard)
-    desired = interpolated(at, s, column=desired_speed(path, vehicle))
+    desired = interpolate(at, s, column=desired_speed(path, vehicle))
     if not at_speed:
         desired = rowwise(lambda v, at: np.minimum(v, np.sqrt(2 * acceleration * (at + 0.2))), desired, at)
     path.release()

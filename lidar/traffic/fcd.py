@@ -185,7 +185,7 @@ def _class_of(kind: str) -> str:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
+def _open_file(path: Path) -> Iterator[IO[bytes]]:
     """An XML file, gzipped or not; raises FormatError if it cannot be read."""
     try:
         with path.open("rb") as raw, gzip.open(raw) as unpacked:
@@ -202,7 +202,7 @@ def _opened(path: Path) -> Iterator[IO[bytes]]:
 
 def _sumo_options(path: Path) -> dict[str, str]:
     """SUMO's options in the comment at the file's start."""
-    with _opened(path) as file:
+    with _open_file(path) as file:
         head = file.read(_HEAD).decode("utf-8", "replace")
     head, _, _ = head.partition("<fcd-export")
     return dict(_OPTION.findall(head))
@@ -233,7 +233,7 @@ def _rows(path: Path) -> tuple[Float, list[str], list[str]]:
     rows: list[tuple[float, ...]] = []
     numbers: dict[tuple[str, str], int] = {}
     kinds: list[str] = []
-    with _opened(path) as file:
+    with _open_file(path) as file:
         steps = _elements(file, "timestep")
         root = next(steps)
         if root.tag != "fcd-export":
@@ -287,7 +287,7 @@ def network_projection(net: Path) -> NetworkProjection:
     from pyproj import CRS, Transformer  # noqa: PLC0415
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
-    with _opened(net) as file:
+    with _open_file(net) as file:
         places = _elements(file, "location")
         root = next(places)
         place = next(places, None) if root.tag == "net" else None
@@ -319,7 +319,7 @@ def _types(path: Path, sumo_options: dict[str, str]) -> dict[str, tuple[str, flo
         source = _linked_file(path, name.strip())
         if source is None:
             continue
-        with _opened(source) as file:
+        with _open_file(source) as file:
             types = _elements(file, "vType")
             next(types)
             for element in types:

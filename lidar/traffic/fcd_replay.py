@@ -26,7 +26,7 @@ from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import RoadUserTracks, actors_on_ground
 from lidar.traffic.trips import VEHICLE_SHARES, random_shape, random_stretch
 from lidar.world.actor_shapes import ActorShape
-from lidar.world.actors import KNOTS, Actors, existing_actors, first_feature, joined, states
+from lidar.world.actors import KNOTS, Actors, existing_actors, first_feature, join_actors, states
 
 _KINDS: dict[str, tuple[str, ...]] = {
     "passenger": ("sedan", "hatchback", "suv"),
@@ -98,9 +98,15 @@ def replay_fcd(
     setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
     moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
     parked = parked_vehicles(
-        scene, ego, vehicle=vehicle, setup=setup, swept=[_covered(moving)], seed=seed, share=options.parked
+        scene,
+        ego,
+        vehicle=vehicle,
+        setup=setup,
+        swept=[_bounding_boxes(moving)],
+        seed=seed,
+        share=options.parked,
     )
-    return joined([moving, parked], first_feature=first_feature(scene))
+    return join_actors([moving, parked], first_feature=first_feature(scene))
 
 
 def _moving(
@@ -128,7 +134,7 @@ def _moving(
         for run in _runs(time, front[rows], speed=fcd.speed[rows], scale=scale):
             yaw = np.unwrap(heading[rows][run])
             middle = front[rows][run] - back * np.column_stack([np.cos(yaw), np.sin(yaw)])
-            track = _sampled(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
+            track = _sample(time[run], middle, yaw=yaw, until=ego.duration_ns * 1e-9)
             any_in_scene |= len(track) > 0 and bool(_inside(track[:, 1:3], scene.bounds).any())
             for part in _parts_near_ego(track, scene, ego=ego, radius=setup.area.radius * scale):
                 shapes.append(shape)
@@ -153,7 +159,7 @@ def _moving(
         travelled=travelled / scale,
     )
     actors = actors_on_ground(scene, tracks, scale=scale)
-    return _without(actors, _touched(actors, ego, vehicle=vehicle))
+    return _without(actors, _find_touched(actors, ego, vehicle=vehicle))
 
 
 def _no_road_users(fcd: Fcd, begin: float, *, any_in_scene: bool) -> str:
@@ -204,7 +210,7 @@ def _runs(time: Float, front: Float, *, speed: Float, scale: float) -> list[slic
     return [slice(a, b) for a, b in itertools.pairwise(ends) if b - a > 1]
 
 
-def _sampled(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
+def _sample(time: Float, middle: Float, *, yaw: Float, until: float) -> Float:
     """Rows (k, 5) of step, x, y, yaw and scene metres covered, every `STEP_S` of the drive."""
     spread, aside = _changes(time, middle, yaw=yaw)
     chord = np.hypot(*np.diff(spread, axis=0).T)
@@ -302,7 +308,7 @@ def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) 
     return out
 
 
-def _touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
+def _find_touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
     """Rows of the actors whose bounding box the ego's intersects at any time."""
     hit: list[Ints] = []
     scale = actors.scale
@@ -343,7 +349,7 @@ def _without(actors: Actors, rows: Ints) -> Actors:
     )
 
 
-def _covered(actors: Actors) -> NDArray[np.object_]:
+def _bounding_boxes(actors: Actors) -> NDArray[np.object_]:
     """Bounding boxes of actors at every fifth knot, with a margin."""
     owner = np.repeat(np.arange(len(actors)), np.diff(actors.first))[::5]
     size = actors.size[owner] * actors.scale

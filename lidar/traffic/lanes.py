@@ -16,7 +16,7 @@ from geoscene.roadgraph.routing import turn_states
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.motion.route import HEADING_REACH
-from lidar.motion.steering import relaxed
+from lidar.motion.steering import relax
 
 STEP = 0.5
 """True metres between the stations of a path."""
@@ -284,17 +284,19 @@ def path_along_lanes(
     line = polylines.points_at(xyz, at, along=along)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
     edge, lane = edges[row].astype(np.int64), picked[row].astype(np.int64)
-    return rounded(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
+    return round_corners(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
 
 
-def rounded(line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float) -> ActorPath:
+def round_corners(
+    line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float
+) -> ActorPath:
     """The path along a line (n, 3) of evenly spaced points, rounded to a turning radius.
 
     radius            : true metres
     edge, lane, limit : columns of `ActorPath` at the points
     """
     gap = STEP * scale
-    smooth = relaxed(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
+    smooth = relax(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
     # corners that were rounded are shorter: even spacing again
     length = polylines.stations(smooth)
     even = np.arange(0.0, length[-1], gap)

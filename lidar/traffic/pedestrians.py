@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
-from lidar.traffic.lanes import STEP, ActorPath, Lanes, rounded
+from lidar.traffic.lanes import STEP, ActorPath, Lanes, round_corners
 from lidar.traffic.surroundings import TrafficArea
 from lidar.traffic.trips import Drawings, Driver, Trip, TripCourse, random_shape, random_stretch
 
@@ -211,7 +211,7 @@ def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, sca
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
     points = polylines.points_at(line[keep], even, along=along[keep])
     nowhere = np.full(len(even), -1, np.int64)
-    path = rounded(
+    path = round_corners(
         points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.min_radius, scale=scale
     )
     crossed = []

@@ -30,7 +30,7 @@ from lidar.traffic.surroundings import TrafficArea, ego_line, surroundings_of
 from lidar.traffic.sweep import rectangles
 from lidar.traffic.tracks import moving_actors
 from lidar.traffic.trips import Trip, vehicle_trips
-from lidar.world.actors import Actors, first_feature, joined
+from lidar.world.actors import Actors, first_feature, join_actors
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
@@ -188,7 +188,7 @@ def simulated_actors(
         radius=options.radius * setup.scale,
         obeys_signals=obeys_signals,
     )
-    return joined(
+    return join_actors(
         [
             moving_actors(trips, flow, scene=scene, scale=setup.scale),
             parked_vehicles(

@@ -124,11 +124,13 @@ def signal_states(
     rows, feature = rows[np.argsort(feature)], np.sort(feature)
     place = shapely.get_coordinates(layer.geometry[rows], include_z=True)
     heading = np.asarray(layer.columns["heading"], float)[rows]
-    zone, group = heads_served(place, heading, graph=graph, plan=plan)
+    zone, group = find_served_heads(place, heading, graph=graph, plan=plan)
     return SignalStates(SignalHeads(feature, place, heading, zone, group), signals)
 
 
-def heads_served(place: Float, heading: Float, *, graph: RoadGraph, plan: JunctionPlan) -> tuple[Ints, Ints]:
+def find_served_heads(
+    place: Float, heading: Float, *, graph: RoadGraph, plan: JunctionPlan
+) -> tuple[Ints, Ints]:
     """Junction and group (n,) of heads at places (n, 3) that face headings (n,); -1 for none.
 
     The map does not say which junction a head serves. It is matched to the point of the road graph with a
@@ -136,7 +138,7 @@ def heads_served(place: Float, heading: Float, *, graph: RoadGraph, plan: Juncti
     from there on, up to 30 m ahead. A head without such a point serves the nearest junction with signals
     within 30 m.
     """
-    at, toward, ahead, entering = _controlled(graph, plan)
+    at, toward, ahead, entering = _find_controlled(graph, plan)
     traffic = heading + np.pi
     zone, group = np.full(len(place), -1, np.int64), np.full(len(place), -1, np.int64)
     matched = np.zeros(len(place), np.bool_)
@@ -167,7 +169,7 @@ def heads_served(place: Float, heading: Float, *, graph: RoadGraph, plan: Juncti
     return zone, group
 
 
-def _controlled(graph: RoadGraph, plan: JunctionPlan) -> tuple[Float, Float, Ints, Float]:
+def _find_controlled(graph: RoadGraph, plan: JunctionPlan) -> tuple[Float, Float, Ints, Float]:
     """Points (k, 2) of edges where signals control traffic, and its headings (k,) there.
 
     And the junctions (k,) with signals that they serve, -1 for none, and the headings (k,) on entering them.

@@ -151,7 +151,7 @@ class EgoMotion(NamedTuple):
     event_cell: NDArray[np.integer]
 
 
-def unreserved(cells: int) -> NDArray[np.void]:
+def make_unreserved(cells: int) -> NDArray[np.void]:
     """Reservations of cells that nobody has reserved."""
     out = np.zeros(cells, RESERVATION)
     out["owner"] = out["hold"] = NOBODY
@@ -159,7 +159,7 @@ def unreserved(cells: int) -> NDArray[np.void]:
     return out
 
 
-def simulated(
+def simulate_steps(
     movers: Movers,
     ego: EgoMotion,
     *,
@@ -201,7 +201,7 @@ def _run(
     ego_row: int,
     hit_ego: Any,
 ) -> Any:
-    """The time loop of `simulated`: returns its rows and fills ``hit_ego``."""
+    """The time loop of `simulate_steps`: returns its rows and fills ``hit_ego``."""
     log = np.empty((4096, 4))
     rows = 0
     for step in range(steps[0], steps[1]):

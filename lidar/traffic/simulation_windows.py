@@ -28,8 +28,8 @@ from lidar.traffic.simulation_kernel import (
     USER,
     EgoMotion,
     Movers,
-    simulated,
-    unreserved,
+    make_unreserved,
+    simulate_steps,
 )
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import CELL_SIZE, SweptCells, cells_under, sweep
@@ -154,7 +154,7 @@ class TrafficSimulation:
         begins = np.append(begins, np.searchsorted(self._appear[coming], len(self._ego.motion)))
         here, state = np.empty(0, np.int64), np.zeros(0, STATE)
         tables: dict[int, _Tables] = {}
-        carried = np.empty(0, np.int64), unreserved(0)
+        carried = np.empty(0, np.int64), make_unreserved(0)
         for window, first in enumerate(range(0, len(self._ego.motion), _STEPS)):
             last = min(first + _STEPS, len(self._ego.motion))
             rows = np.sort(np.append(here, coming[begins[window] : begins[window + 1]]))
@@ -167,10 +167,10 @@ class TrafficSimulation:
                 for k, row in enumerate(rows.tolist())
             }
             movers, known, used = self._numbered(rows, list(tables.values()), known=known)
-            reservations = _renumbered(carried, rows, used=used)
+            reservations = _renumber(carried, rows, used=used)
             start = movers.user[:-1]
             _shift(state, start, sign=1)
-            log, hit = simulated(
+            log, hit = simulate_steps(
                 movers,
                 known,
                 signals=self._signals,
@@ -186,7 +186,7 @@ class TrafficSimulation:
             _shift(state, start, sign=-1)
             log[:, 0] = rows[log[:, 0].astype(np.int64)]
             yield log, rows[hit]
-            carried = _reserved(reservations, rows, used=used, after_s=last * STEP_S)
+            carried = _reserve(reservations, rows, used=used, after_s=last * STEP_S)
             stay = ~state["departed"] | (rows == self._ego_row)
             here, state = rows[stay], state[stay]
 
@@ -287,7 +287,7 @@ def _shift(state: NDArray[np.void], start: NDArray[np.void], *, sign: int) -> No
     state["block"] += sign * start["block_start"]
 
 
-def _reserved(
+def _reserve(
     reservations: NDArray[np.void], rows: Ints, *, used: Ints, after_s: float
 ) -> tuple[Ints, NDArray[np.void]]:
     """Cells that are reserved after a time, and their reservations, with the numbers of trips as owners."""
@@ -299,10 +299,10 @@ def _reserved(
     return used[kept], out
 
 
-def _renumbered(carried: tuple[Ints, NDArray[np.void]], rows: Ints, *, used: Ints) -> NDArray[np.void]:
+def _renumber(carried: tuple[Ints, NDArray[np.void]], rows: Ints, *, used: Ints) -> NDArray[np.void]:
     """Reservations of the cells of a window: those carried over from the last one, and none of others."""
     cells, kept = carried
-    out = unreserved(len(used))
+    out = make_unreserved(len(used))
     place = np.searchsorted(used, cells)
     found = used[np.minimum(place, len(used) - 1)] == cells if len(used) else np.zeros(len(cells), bool)
     owned = kept["owner"] != NOBODY

@@ -65,12 +65,12 @@ def body_poses(path: ActorPath, axle: float) -> tuple[Float, Float]:
     """Centre (n, 2) and heading (n,) of a body at each station, with both axles on the path."""
     reach = axle / 2 / STEP
     rows = np.arange(len(path), dtype=float)
-    ends = [np.stack([_extended(path.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
+    ends = [np.stack([_extend(path.xyz[:, c], rows + s * reach) for c in (0, 1)], axis=1) for s in (1, -1)]
     d = ends[0] - ends[1]
     return (ends[0] + ends[1]) / 2, np.unwrap(np.arctan2(d[:, 1], d[:, 0]))
 
 
-def _extended(values: Float, rows: Float) -> Float:
+def _extend(values: Float, rows: Float) -> Float:
     """Values at fractional rows, linearly extrapolated beyond the ends."""
     n = len(values)
     low = np.clip(np.floor(rows).astype(int), 0, n - 2)

@@ -235,7 +235,7 @@ def knots_on_ground(scene: Scene, tracks: RoadUserTracks, *, scale: float) -> Kn
         part = slice(ends[k], ends[k + 1])
         course[part] = _course(middle[part], yaw[part])
         for column in (z, pitch, roll):
-            column[part] = _smoothed(column[part], travelled[part])
+            column[part] = _smooth(column[part], travelled[part])
         pitch[part] *= shape.kind not in _UPRIGHT
         roll[part] *= shape.kind not in _UPRIGHT and shape.kind not in _LEANING
         climb[part] = _rate(z[part])
@@ -297,7 +297,7 @@ def _course(middle: Float, yaw: Float) -> Float:
     return np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)
 
 
-def _smoothed(values: Float, travelled: Float) -> Float:
+def _smooth(values: Float, travelled: Float) -> Float:
     """Values at metres ``travelled``, smoothed over a metre as by tyres and springs."""
     if len(values) < 2 or travelled[-1] - travelled[0] < 0.5:
         return np.full(len(values), values.mean()) if len(values) else values

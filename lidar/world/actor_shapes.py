@@ -23,8 +23,8 @@ from lidar.world.actor_solids import (
     hoop,
     limb,
     loft,
-    mirrored,
-    repainted,
+    mirror,
+    repaint,
     sides,
     wheel,
 )
@@ -115,7 +115,7 @@ def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[
         )  # fmt: skip
     shell = loft(rings, color=paint)
     corner = sides(len(stations) - 1, 8)[:, 1]
-    shell = repainted(shell, corner == 7, material="tyre", color=DARK)
+    shell = repaint(shell, corner == 7, material="tyre", color=DARK)
     # the cabin: start and end of its glass, and its roof
     start, roof0, roof1, end = {
         "sedan": (0.40, 0.10, -0.42, -0.76),
@@ -134,20 +134,20 @@ def _car(size: tuple[float, float, float], *, profile: str, paint: Rgb) -> list[
     glass = loft(cabin, color=paint)
     span, side = sides(3, 4).T
     pane = ((side == 0) | (side == 2) | ((side == 1) & (span != 1))) & (span >= 0)
-    glass = repainted(glass, pane, material="glass", color=GLASS)
+    glass = repaint(glass, pane, material="glass", color=GLASS)
     radius = 0.36 if profile == "suv" else 0.315
     base = 0.29 * length
     parts = [shell, glass]
     for x in (-base, base):
-        parts += mirrored(wheel(x, w - 0.10, radius=radius, width=0.21))
+        parts += mirror(wheel(x, w - 0.10, radius=radius, width=0.21))
     parts += [_seat((-0.62 * half, -0.8 * w, 0.3), (-0.4 * half, 0.8 * w, height - 0.35))]
-    parts += mirrored(_seat((-0.12 * half, 0.12 * w, 0.3), (0.02 * half, 0.75 * w, height - 0.32)))
+    parts += mirror(_seat((-0.12 * half, 0.12 * w, 0.3), (0.02 * half, 0.75 * w, height - 0.32)))
     lamp = nose - 0.14
-    parts += mirrored(_lamp((0.955 * half, 0.50 * w, lamp), (half + 0.002, 0.78 * w, lamp + 0.12)))
+    parts += mirror(_lamp((0.955 * half, 0.50 * w, lamp), (half + 0.002, 0.78 * w, lamp + 0.12)))
     rear = tail - 0.22
-    parts += mirrored(_reflector((-half - 0.002, 0.55 * w, rear), (-0.955 * half, 0.84 * w, rear + 0.12)))
+    parts += mirror(_reflector((-half - 0.002, 0.55 * w, rear), (-0.955 * half, 0.84 * w, rear + 0.12)))
     parts += [_plate(half - 0.012, 0.36), _plate(-half + 0.012, 0.52)]
-    parts += mirrored(box((0.26 * half, w - 0.06, belt), (0.31 * half, w + 0.01, belt + 0.13), color=paint))
+    parts += mirror(box((0.26 * half, w - 0.06, belt), (0.31 * half, w + 0.01, belt + 0.13), color=paint))
     return parts
 
 
@@ -161,8 +161,8 @@ def _plate(x: float, z: float, *, y: float = 0.0) -> Mesh:
 def _lamps(front: float, rear: float, *, w: float, z: float) -> list[Mesh]:
     """Lamps in front, reflecting lamps behind."""
     return [
-        *mirrored(_lamp((front - 0.05, 0.62 * w, z), (front + 0.012, 0.92 * w, z + 0.16))),
-        *mirrored(_reflector((rear - 0.012, 0.70 * w, z), (rear + 0.05, 0.93 * w, z + 0.16))),
+        *mirror(_lamp((front - 0.05, 0.62 * w, z), (front + 0.012, 0.92 * w, z + 0.16))),
+        *mirror(_reflector((rear - 0.012, 0.70 * w, z), (rear + 0.05, 0.93 * w, z + 0.16))),
     ]
 
 
@@ -187,15 +187,15 @@ def _van(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
         )
     shell = loft(rings, color=paint)
     span, side = sides(5, 8).T
-    shell = repainted(shell, (side == 3) & (span == 2), material="glass", color=GLASS)
-    shell = repainted(shell, np.isin(side, (2, 4)) & np.isin(span, (1, 2)), material="glass", color=GLASS)
-    shell = repainted(shell, side == 7, material="tyre", color=DARK)
+    shell = repaint(shell, (side == 3) & (span == 2), material="glass", color=GLASS)
+    shell = repaint(shell, np.isin(side, (2, 4)) & np.isin(span, (1, 2)), material="glass", color=GLASS)
+    shell = repaint(shell, side == 7, material="tyre", color=DARK)
     parts = [
         shell,
         _seat((0.12 * half, -0.8 * w, 0.5), (0.24 * half, 0.8 * w, 1.6)),
     ]
     for x in (-0.29 * length, 0.31 * length):
-        parts += mirrored(wheel(x, w - 0.11, radius=0.34, width=0.23))
+        parts += mirror(wheel(x, w - 0.11, radius=0.34, width=0.23))
     return [*parts, *_lamps(half, -half, w=w, z=0.72), _plate(half - 0.01, 0.40), _plate(-half, 0.55)]
 
 
@@ -216,14 +216,14 @@ def _truck(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
         box((-half, -0.95 * w, 0.45), (-half + 0.08, 0.95 * w, 0.6), material="metal", color=DARK),
     ]  # fmt: skip
     span, side = sides(2, 4).T
-    parts[1] = repainted(
+    parts[1] = repaint(
         parts[1],
         ((side == 1) & (span == 1)) | (np.isin(side, (0, 2)) & (span >= 0)),
         material="glass",
         color=GLASS,
     )
     for x in (-0.26 * length, 0.36 * length):
-        parts += mirrored(wheel(x, w - 0.15, radius=0.48, width=0.29))
+        parts += mirror(wheel(x, w - 0.15, radius=0.48, width=0.29))
     parts += [_reflector((-half - 0.004, -w * 0.9, 1.0), (-half + 0.02, w * 0.9, 1.1))]
     parts += _lamps(half, -half, w=w, z=0.75)
     return [*parts, _plate(half - 0.01, 0.58), _plate(-half, 0.62)]
@@ -242,8 +242,8 @@ def _bus(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
         )
     shell = loft(rings, color=paint)
     span, side = sides(3, 8).T
-    shell = repainted(shell, np.isin(side, (1, 5)) & (span == 1), material="glass", color=GLASS)
-    shell = repainted(shell, side == 7, material="tyre", color=DARK)
+    shell = repaint(shell, np.isin(side, (1, 5)) & (span == 1), material="glass", color=GLASS)
+    shell = repaint(shell, side == 7, material="tyre", color=DARK)
     parts = [
         shell,
         _pane((half - 0.02, -0.88 * w, 1.0), (half + 0.01, 0.88 * w, height - 0.45)),
@@ -252,7 +252,7 @@ def _bus(size: tuple[float, float, float], paint: Rgb) -> list[Mesh]:
         _seat((-0.8 * half, 0.25 * w, 0.5), (0.75 * half, 0.85 * w, 1.35)),
     ]
     for x in (-0.24 * length, 0.27 * length):
-        parts += mirrored(wheel(x, w - 0.14, radius=0.48, width=0.28))
+        parts += mirror(wheel(x, w - 0.14, radius=0.48, width=0.28))
     return [*parts, *_lamps(half, -half, w=w, z=0.62), _plate(half - 0.01, 0.40), _plate(-half + 0.01, 0.72)]
 
 
@@ -269,7 +269,7 @@ def _bicycle(paint: Rgb) -> list[Mesh]:
     parts += [
         limb((0.33, -0.29, 1.02), (0.33, 0.29, 1.02), thick=(0.03, 0.03), material="metal", corners=4),
         box((-0.36, -0.08, 0.88), (-0.12, 0.08, 0.94), material="tyre", color=DARK),
-        *mirrored(box((-0.17, 0.09, 0.24), (-0.07, 0.18, 0.27), material="tyre", color=DARK)),
+        *mirror(box((-0.17, 0.09, 0.24), (-0.07, 0.18, 0.27), material="tyre", color=DARK)),
         _reflector((-0.62, -0.04, 0.66), (-0.60, 0.04, 0.72)),
         box((0.40, -0.03, 0.84), (0.42, 0.03, 0.90), material="retroreflector", color=WHITE),
     ]
@@ -295,7 +295,7 @@ def _motorcycle(paint: Rgb) -> list[Mesh]:
     ]
     parts += [
         box((-0.25, -0.14, 0.22), (0.32, 0.14, 0.60), material="metal", color=DARK),
-        *mirrored(limb((x, 0.09, r), (0.44, 0.09, 0.92), thick=(0.05, 0.05), material="metal", corners=4)),
+        *mirror(limb((x, 0.09, r), (0.44, 0.09, 0.92), thick=(0.05, 0.05), material="metal", corners=4)),
         limb((0.40, -0.36, 0.98), (0.40, 0.36, 0.98), thick=(0.035, 0.035), material="metal", corners=4),
         limb((-x, 0.0, r), (-0.2, 0.0, 0.36), thick=(0.08, 0.08), material="metal", color=DARK, corners=4),
         _lamp((0.52, -0.09, 0.76), (0.58, 0.09, 0.92)),

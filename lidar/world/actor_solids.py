@@ -22,7 +22,7 @@ RED: Rgb = (170, 20, 20)
 WHITE: Rgb = (238, 238, 232)
 
 
-def painted(points: Float, faces: NDArray[np.integer], *, material: str, color: Rgb | None = None) -> Mesh:
+def paint(points: Float, faces: NDArray[np.integer], *, material: str, color: Rgb | None = None) -> Mesh:
     """A closed mesh of one material, without a class; in the material's colour by default.
 
     Faces that all point inwards are flipped.
@@ -32,7 +32,7 @@ def painted(points: Float, faces: NDArray[np.integer], *, material: str, color: 
     return mesh if volume(mesh) > 0 else replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 
-def repainted(mesh: Mesh, faces: NDArray[np.bool_], *, material: str, color: Rgb | None = None) -> Mesh:
+def repaint(mesh: Mesh, faces: NDArray[np.bool_], *, material: str, color: Rgb | None = None) -> Mesh:
     """The mesh with another material on some of its faces."""
     of = materials()[material]
     return replace(
@@ -67,7 +67,7 @@ def loft(rings: ArrayLike, material: str = "car_paint", *, color: Rgb | None = N
         axis=2,
     ).reshape(-1, 3)
     fan = np.column_stack([np.zeros(n - 2, int), ring[1:-1], ring[2:]])
-    return painted(
+    return paint(
         points.reshape(-1, 3),
         np.vstack([side, fan, fan[:, ::-1] + n * (k - 1)]),
         material=material,
@@ -98,7 +98,7 @@ def box(
     return loft(np.stack([floor, lid])[:, ::-1], material, color=color)
 
 
-def mirrored(mesh: Mesh) -> list[Mesh]:
+def mirror(mesh: Mesh) -> list[Mesh]:
     """A part on the left and its mirror image on the right."""
     other = replace(mesh, vertices=mesh.vertices * [1.0, -1.0, 1.0], faces=mesh.faces[:, ::-1].copy())
     return [mesh, other]
@@ -116,7 +116,7 @@ def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10)
             )
         )
     tyre = loft(np.array(rings), "tyre")
-    return repainted(tyre, sides(3, corners)[:, 0] < 0, material="metal")
+    return repaint(tyre, sides(3, corners)[:, 0] < 0, material="metal")
 
 
 def hoop(x: float, radius: float, *, width: float, corners: int = 12) -> Mesh:
@@ -141,7 +141,7 @@ def hoop(x: float, radius: float, *, width: float, corners: int = 12) -> Mesh:
             np.column_stack([p + here, q + ahead, q + here]),
             np.column_stack([p + here, p + ahead, q + ahead]),
         ]
-    return painted(tubes.reshape(-1, 3) + np.array([x, 0.0, radius]), np.vstack(faces), material="tyre")
+    return paint(tubes.reshape(-1, 3) + np.array([x, 0.0, radius]), np.vstack(faces), material="tyre")
 
 
 def limb(
@@ -169,7 +169,7 @@ def limb(
 def ball(centre: ArrayLike, size: Sequence[float], *, material: str, color: Rgb | None = None) -> Mesh:
     """An ellipsoid of 48 faces of the given sizes along x, y and z."""
     points, faces = lathe([(0, -0.5), (0.7, -0.35), (1.0, 0.0), (0.7, 0.35), (0, 0.5)], sides=8)
-    return painted(points * size + np.asarray(centre, float), faces, material=material, color=color)
+    return paint(points * size + np.asarray(centre, float), faces, material=material, color=color)
 
 
 def volume(mesh: Mesh) -> float:

@@ -210,7 +210,7 @@ def _within(actors: Actors, rows: NDArray[np.int64], *, region: Region, time_ns:
     return inside
 
 
-def joined(groups: Sequence[Actors], *, first_feature: int) -> Actors:
+def join_actors(groups: Sequence[Actors], *, first_feature: int) -> Actors:
     """Actors of several groups as one, features numbered from ``first_feature``."""
     shapes: dict[str, ActorShape] = {}
     for group in groups:

@@ -40,7 +40,7 @@ def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mes
         parts += _arm(
             np.array([0.0, side * 0.125 * h, 0.80 * h]), -0.8 * angle, bend=0.25, h=h, jacket=jacket
         )
-    return _grounded(parts)
+    return _ground_parts(parts)
 
 
 def rider(
@@ -143,7 +143,7 @@ def _joint(a: Float, b: Float, *, first: float, second: float) -> Float:
     return knee
 
 
-def _grounded(parts: list[Mesh]) -> list[Mesh]:
+def _ground_parts(parts: list[Mesh]) -> list[Mesh]:
     """Parts shifted vertically so that the lowest point is on the ground."""
     low = min(float(part.vertices[:, 2].min()) for part in parts)
     return [part.shifted([0.0, 0.0, -low]) for part in parts]

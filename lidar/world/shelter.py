@@ -95,15 +95,15 @@ def _crossings(
     """Cells (k,) and heights (k,) where the lines up from their middles cross faces, and if these face up."""
     cell, height, up = np.empty(0, np.int64), np.empty(0), np.empty(0, np.bool_)
     mesh = part.vertices, part.faces, part.planes
-    found = _rasterised(mesh, corner, count, (cell, height, up))
+    found = _rasterise(mesh, corner, count, (cell, height, up))
     if found:
         cell, height, up = np.empty(found, np.int64), np.empty(found), np.empty(found, np.bool_)
-        _rasterised(mesh, corner, count, (cell, height, up))
+        _rasterise(mesh, corner, count, (cell, height, up))
     return cell, height, up
 
 
 @njit(cache=True, nogil=True)
-def _rasterised(mesh: Any, corner: Float, count: int, columns: Any) -> int:
+def _rasterise(mesh: Any, corner: Float, count: int, columns: Any) -> int:
     """The number of crossings; fill their columns as far as they have room."""
     vertices, faces, planes = mesh
     cell, height, facing = columns
@@ -152,7 +152,7 @@ def _way_out(roof: Float, floor: Float, *, top: Float) -> Float:
         return way
     ends, open_air = [], np.zeros(roof.shape, np.bool_)
     for dy, dx in _NEXT:
-        one, other = _shifted(dy, dx)
+        one, other = _shift(dy, dx)
         joined = covered[one] & covered[other] & (np.abs(floor[one] - floor[other]) < _STEP)
         length = np.full(int(joined.sum()), CELL * np.hypot(dx, dy))
         ends.append(np.stack([number[one][joined], number[other][joined], length]))
@@ -173,7 +173,7 @@ def _way_out(roof: Float, floor: Float, *, top: Float) -> Float:
     return way
 
 
-def _shifted(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _shift(dy: int, dx: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Slices of a grid and of its neighbours ``dy`` rows and ``dx`` columns on."""
     rows = slice(0, -dy or None), slice(dy, None)
     columns = (slice(0, -dx or None), slice(dx, None)) if dx >= 0 else (slice(-dx, None), slice(0, dx))

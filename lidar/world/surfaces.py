@@ -14,7 +14,7 @@ from geoscene.geometry.mesh import Mesh
 from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.world.settings import WorldSettings
 
 SOLID, GLASS, FOLIAGE, WATER = 1, 2, 4, 8
@@ -70,7 +70,7 @@ class SurfaceFaces(NamedTuple):
     leaves: Float
 
 
-def packed(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
+def pack_surfaces(surfaces: Surfaces, leaves: NDArray[np.integer] | None = None) -> NDArray[np.int64]:
     """The column `SurfaceFaces.packed` of surfaces and of their kinds of leaves (none by default)."""
     column = surfaces.feature.astype(np.int64) << 32
     if leaves is not None:
@@ -101,7 +101,7 @@ def _take(table: Any, face: Any, instance: Any, start: Any, named: Any, out: Any
         _take_one(table, face, instance, start, named, out, i)
 
 
-@inlined
+@inline
 def _take_one(table: Any, face: Any, instance: Any, start: Any, named: Any, out: Any, i: int) -> None:
     feature, klass, material, surface, color = table
     copy = instance[i]

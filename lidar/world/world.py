@@ -26,7 +26,7 @@ from lidar.raycast.relief import (
     WallRefiner,
     WallTables,
     ground_tables,
-    joined,
+    join,
     joined_ground,
 )
 from lidar.world.openings import openings_of
@@ -42,7 +42,7 @@ from lidar.world.surfaces import (
     SurfaceFaces,
     Surfaces,
     mask_bits,
-    packed,
+    pack_surfaces,
     surfaces_at,
     surfaces_of,
 )
@@ -317,7 +317,7 @@ class World:
         count = len(self._surfaces)
         tables = [NO_WALLS, *(tile.walls for tile in self._tiles.values())]
         faces = [0, *(self._first[rank] for rank in self._tiles)]
-        self._walls = WallRefiner(joined(tables, faces=faces, count=count))
+        self._walls = WallRefiner(join(tables, faces=faces, count=count))
         refiners: list[Refiner] = []
         if self.settings.relief != "off" and len(self._walls.tables.first):
             refiners.append(self._walls)
@@ -364,7 +364,7 @@ class World:
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
         self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
         self._surfaces = Surfaces.concatenate([*tables, MISS])
-        self._packed = packed(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
+        self._packed = pack_surfaces(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
         feature = self._surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
         self._still = self._static()

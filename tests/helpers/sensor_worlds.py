@@ -10,11 +10,11 @@ from geoscene.geometry.mesh import Mesh, concatenate
 from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.raycast.geometry import split
-from lidar.raycast.relief import NO_WALLS, WallRefiner, joined
+from lidar.raycast.relief import NO_WALLS, WallRefiner, join
 from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of
-from lidar.world.surfaces import MISS, SurfaceFaces, Surfaces, mask_bits, packed, surfaces_of
+from lidar.world.surfaces import MISS, SurfaceFaces, Surfaces, mask_bits, pack_surfaces, surfaces_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 
@@ -43,7 +43,7 @@ class MeshWorld:
             bits = mask_bits(np.arange(256, dtype=np.uint8))
             tables, added = openings_of(self.relief, origin=np.zeros(3), bits=bits)
             self.surfaces = Surfaces.concatenate([self.surfaces, added])
-        self.walls = WallRefiner(joined([tables], faces=[0], count=len(self.surfaces) + 1))
+        self.walls = WallRefiner(join([tables], faces=[0], count=len(self.surfaces) + 1))
         self.caster.refiners = [self.walls] if self.relief is not None else []
 
     def shelter(self, position):
@@ -55,7 +55,7 @@ class MeshWorld:
     @property
     def faces(self):
         surfaces = self.surfaces
-        what = np.append(packed(surfaces, surfaces.klass == Class.HEDGE), np.int64(-1) << 32)
+        what = np.append(pack_surfaces(surfaces, surfaces.klass == Class.HEDGE), np.int64(-1) << 32)
         low, high = int(surfaces.feature.min()), int(surfaces.feature.max())
         return SurfaceFaces(
             np.zeros(1, np.int64), np.empty(0, np.int32), what, low, high, np.array([0.0, LEAVES])

@@ -7,7 +7,7 @@ import numpy as np
 from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.scene.tile_files import Tile
 from geoscene.view.looks import FacadeLooks
-from geoscene.view.tiles import SCALE, TURN, _turned
+from geoscene.view.tiles import SCALE, TURN, _turn
 
 
 def unpack_tile(header, data):
@@ -50,4 +50,4 @@ def _transforms(columns, step):
     """Transforms (k, 3, 4) of the columns of upright copies."""
     x, y, z, turn, along, lift = columns.astype(np.int64)
     place = np.column_stack([np.cumsum(x) % 65_536, y, z]) * step
-    return np.dstack([_turned(along * SCALE, lift * SCALE, turn=turn * TURN), place[:, :, None]])
+    return np.dstack([_turn(along * SCALE, lift * SCALE, turn=turn * TURN), place[:, :, None]])

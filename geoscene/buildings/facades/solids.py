@@ -51,7 +51,7 @@ def relief_mesh(mesh: Mesh, relief: WallRelief) -> Mesh:
     kept = (relief.wall < 0) | ~done[relief.wall]
     templates = [_template(relief.openings, k) for k in range(len(relief.openings))]
     insets = _insets(mesh, relief, cells=cells.take(done[cells.wall]), templates=templates)
-    return _welded([mesh.take(kept), facing, insets])
+    return _weld([mesh.take(kept), facing, insets])
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +251,7 @@ def _face_of(relief: WallRelief) -> Ints:
     return out
 
 
-def _welded(parts: list[Mesh]) -> Mesh:
+def _weld(parts: list[Mesh]) -> Mesh:
     """The parts as one mesh, sorted by solids and surfaces; faces of one solid share vertices."""
     whole = concatenate(parts)
     bodies = whole.take(np.flatnonzero(whole.closed)[np.argsort(whole.feature[whole.closed], kind="stable")])
@@ -357,7 +357,7 @@ def _sides(xy: Float, depth: Float, *, region: Ints, outside: int) -> tuple[Floa
             [(*place[v].tolist(), d) for d in sorted(levels[v]) if ahead <= d <= depth[face[half]]]
             for v in (start[half], stop[half])
         ]
-        made = _zipped(*ends)
+        made = _zip_lines(*ends)
         out += made
         front += [int(region[face[others[0]]]) if others else outside] * len(made)
     return np.array(out, float).reshape(-1, 3, 3), np.array(front, np.int64)
@@ -366,7 +366,7 @@ def _sides(xy: Float, depth: Float, *, region: Ints, outside: int) -> tuple[Floa
 _Line = list[tuple[float, ...]]
 
 
-def _zipped(left: _Line, right: _Line) -> list[_Line]:
+def _zip_lines(left: _Line, right: _Line) -> list[_Line]:
     """Triangles between two lines of points from front to back; seen from the space, ``left`` is left."""
     out, i, j = [], 0, 0
     while i + 1 < len(left) or j + 1 < len(right):

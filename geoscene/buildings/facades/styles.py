@@ -192,15 +192,15 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
     storey = np.maximum(height - parapet, 0.5) / (storeys - 1 + ratio)
     storeys = np.maximum(np.rint((eaves - parapet) / storey - ratio + 1), 1).astype(np.int64)
 
-    bay = _rounded(one("bay", 2))
+    bay = _round_size(one("bay", 2))
     width, tall, sill = one("width", 3), one("height", 4), one("sill", 5)
-    width = _rounded(np.where(width <= 1, width * bay, width))
+    width = _round_size(np.where(width <= 1, width * bay, width))
     width = np.where(width > 0, np.minimum(width, bay - 0.05), 0.0)
     tall = np.where(tall <= 1, tall * storey, tall)
     sill = np.where(sill < 0, storey + sill - tall, sill)
-    tall = _rounded(np.minimum(tall, storey - sill - 0.25))
+    tall = _round_size(np.minimum(tall, storey - sill - 0.25))
     some = (width >= 0.3) & (tall >= 0.4) & (sill > 0.15)
-    sill = _rounded(sill)
+    sill = _round_size(sill)
     left = (bay - width) / 2
     window = np.where(some[:, None], np.stack([left, sill, left + width, sill + tall], axis=1), 0.0)
 
@@ -310,7 +310,7 @@ def _storeys(levels: Float, height: Float, *, usual: Float, ratio: Float) -> tup
     return np.maximum(some, 1).astype(np.int64), tagged
 
 
-def _rounded(value: Float) -> Float:
+def _round_size(value: Float) -> Float:
     """Values to 5 cm, so that buildings share kinds of openings."""
     return np.round(np.floor(value * 20.0 + 1e-6) / 20.0, 2)
 

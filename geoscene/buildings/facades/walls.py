@@ -58,8 +58,8 @@ def find_walls(mesh: Mesh) -> tuple[FacadeWalls, NDArray[np.int32]]:
     of_face = np.full(len(mesh), -1, np.int32)
     if not len(face):
         return _none(), of_face
-    wall = _connected(corners[face], _bearings(normal[face, :2], feature=mesh.feature[face]))
-    walls, number = _measured(
+    wall = _connect(corners[face], _bearings(normal[face, :2], feature=mesh.feature[face]))
+    walls, number = _measure(
         corners[face], normal[face, :2], feature=mesh.feature[face], wall=wall, area=area[face]
     )
     of_face[face] = number
@@ -100,7 +100,7 @@ def _of_largest(value: Float, *, group: Ints, area: Float) -> Float:
     return largest
 
 
-def _connected(corners: Float, bearing: Ints) -> Ints:
+def _connect(corners: Float, bearing: Ints) -> Ints:
     """Number (m,) of the wall of each face: faces of one bearing that edges connect."""
     from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
@@ -113,7 +113,7 @@ def _connected(corners: Float, bearing: Ints) -> Ints:
     return np.asarray(connected_components(links, directed=False)[1][:m], np.int64)
 
 
-def _measured(
+def _measure(
     corners: Float, normal: Float, *, feature: NDArray[np.int32], wall: Ints, area: Float
 ) -> tuple[FacadeWalls, Ints]:
     """The walls, sorted by feature and place, and the row (m,) of each face."""

@@ -123,7 +123,7 @@ class _Uncompressed:
         """Append points."""
         if not len(points):
             return
-        low, high = _summed(points["X"], points["Y"], points["Z"], points["bit_fields"], self._by_return)
+        low, high = _add_points(points["X"], points["Y"], points["Z"], points["bit_fields"], self._by_return)
         self._low = np.minimum(self._low, low * self._scale + self._offset)
         self._high = np.maximum(self._high, high * self._scale + self._offset)
         self.dest.write(points.data)
@@ -246,7 +246,7 @@ def _count(coordinate: Any, offset: float, scale: float, counts: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _summed(x: Any, y: Any, z: Any, bits: Any, by_return: Any) -> Any:
+def _add_points(x: Any, y: Any, z: Any, bits: Any, by_return: Any) -> Any:
     """Add points to the numbers (16,) of points by return; return the least and greatest counts (3,)."""
     low, high = np.array([x[0], y[0], z[0]]), np.array([x[0], y[0], z[0]])
     for i in range(len(x)):
@@ -340,7 +340,7 @@ def _check_layers(path: Path, header: Any) -> None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open_las(path: Path) -> Iterator[Any]:
     import laspy  # noqa: PLC0415
     import lazrs  # noqa: PLC0415
 
@@ -363,13 +363,13 @@ def read(path: Path) -> Table:
 
     Raises FormatError for a file that laspy cannot read.
     """
-    with _opened(path) as reader:
+    with _open_las(path) as reader:
         return _table(reader.read_points(reader.header.point_count))
 
 
 def read_chunks(path: Path, *, chunk: int = 1_000_000) -> Iterator[Table]:
     """The tables of a LAS or LAZ file, ``chunk`` points at a time; see `read`."""
-    with _opened(path) as reader:
+    with _open_las(path) as reader:
         for points in reader.chunk_iterator(chunk):
             yield _table(points)
 

@@ -24,13 +24,13 @@ GREATEST_RATIO = _LONGEST // 3 + 1
 """Bytes that a byte of compressed data stands for, at most."""
 
 
-def compressed(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def compress(data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Compress bytes; the same bytes give the same result."""
     room = np.empty(len(data) + len(data) // _LITERALS + 2, np.uint8)
     return room[: _compress(data, room, np.full(1 << _HASH_BITS, -1, np.int64))]
 
 
-def decompressed(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def decompress(data: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     """The ``size`` bytes that were compressed.
 
     Raises ValueError for damaged data.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
-from lidar.dataset.formats.lzf import decompressed
+from lidar.dataset.formats.lzf import decompress
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
 from lidar.errors import FormatError
 
@@ -80,7 +80,7 @@ def read(path: Path) -> Table:
         if encoding.strip() == b"binary":
             data = np.frombuffer(body, kinds, points)
         elif encoding.strip() == b"binary_compressed":
-            return _decompressed(body, kinds, points=points)
+            return _decompress(body, kinds, points=points)
         else:
             data = np.loadtxt(io.BytesIO(body), kinds, ndmin=1) if points else np.empty(0, kinds)
     except (KeyError, ValueError, TypeError, IndexError) as error:
@@ -90,12 +90,12 @@ def read(path: Path) -> Table:
     return {name: data[name] for name in names}
 
 
-def _decompressed(body: bytes, kinds: np.dtype[np.void], *, points: int) -> Table:
+def _decompress(body: bytes, kinds: np.dtype[np.void], *, points: int) -> Table:
     """The columns of a compressed body; raises ValueError if it is damaged."""
     packed, size = (int(word) for word in np.frombuffer(body, "<u4", 2))
     if size != points * kinds.itemsize:
         raise ValueError(f"{size} bytes stated for {points} points of {kinds.itemsize} bytes")
-    data = decompressed(np.frombuffer(body, np.uint8, packed, 8) if packed else np.empty(0, np.uint8), size)
+    data = decompress(np.frombuffer(body, np.uint8, packed, 8) if packed else np.empty(0, np.uint8), size)
     table, start = dict[str, NDArray[Any]](), 0
     for name in kinds.names or ():
         table[name] = np.frombuffer(data, kinds[name], points, start) if points else np.empty(0, kinds[name])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.support.files import write_atomically
-from lidar.dataset.formats.lzf import compressed
+from lidar.dataset.formats.lzf import compress
 from lidar.dataset.formats.pcd import count, pcd_header, read
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
@@ -25,7 +25,7 @@ def write(path: Path, table: Table) -> None:
     """
     columns = [column.astype(column.dtype.newbyteorder("<")).tobytes() for column in table.values()]
     data = np.frombuffer(b"".join(columns), np.uint8)
-    packed = compressed(data)
+    packed = compress(data)
     if max(len(data), len(packed)) > _MOST:
         raise FormatError(f"{path}: {len(data)} bytes of points; compressed PCD holds at most {_MOST}")
     sizes = np.array([len(packed), len(data)], "<u4")

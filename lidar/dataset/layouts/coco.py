@@ -74,9 +74,9 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
             if segmented:
                 segments = _segments(dataset, camera, frame=frame)
                 panoptic.append(_panoptic(segments, image, folder=folder / "annotations" / "panoptic"))
-                found = _masked(segments, boxes)
+                found = _mask(segments, boxes)
             else:
-                found = (_boxed(box) for box in boxes.values() if box["pixels"])
+                found = (_annotate_box(box) for box in boxes.values() if box["pixels"])
             for annotation in found:
                 number = {"id": len(objects) + 1, "image_id": image["id"]}
                 objects.append(number | annotation)
@@ -188,7 +188,7 @@ def _bbox(place: tuple[slice, slice]) -> list[int]:
     return [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
 
 
-def _masked(segments: _Segments, boxes: Mapping[int, Row]) -> Iterator[Row]:
+def _mask(segments: _Segments, boxes: Mapping[int, Row]) -> Iterator[Row]:
     """Annotations of the objects among the segments of an image.
 
     boxes : rows of the camera's boxes by the number of the instance
@@ -211,7 +211,7 @@ def _masked(segments: _Segments, boxes: Mapping[int, Row]) -> Iterator[Row]:
         }
 
 
-def _boxed(box: Row) -> Row:
+def _annotate_box(box: Row) -> Row:
     """The annotation of a road user of which only boxes are recorded."""
     bbox = _edges([box[name] for name in _SEEN])
     return {

@@ -169,11 +169,11 @@ def read_drive(dataset: Dataset, *, numbers: Sequence[int] = _NUMBERS) -> KittiD
             f"{dataset.path}: holds no clouds in the sensor frame; drive with `formats` {formats}"
         )
     streams = [color_images(dataset, name) for name in dataset.sensors("camera")]
-    cameras = [s for s in streams if s is not None and _rectified(s)]
-    return KittiDrive(dataset, clouds, _numbered(cameras, numbers))
+    cameras = [s for s in streams if s is not None and _is_rectified(s)]
+    return KittiDrive(dataset, clouds, _assign_numbers(cameras, numbers))
 
 
-def _rectified(camera: Stream) -> bool:
+def _is_rectified(camera: Stream) -> bool:
     """Whether a camera's images have no distortion, for which KITTI's projections have no place."""
     if camera.sensor["model"] == "pinhole" and not any(camera.sensor["distortion"]):
         return True
@@ -181,7 +181,7 @@ def _rectified(camera: Stream) -> bool:
     return False
 
 
-def _numbered(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[int, Stream]:
+def _assign_numbers(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[int, Stream]:
     """Cameras by numbers: that of their name, or else free ones in order; those beyond are left out."""
     own = {int(s.name[-1]): s for s in cameras if s.name in {f"image_{k}" for k in numbers}}
     others = [s for s in cameras if s.name not in {camera.name for camera in own.values()}]

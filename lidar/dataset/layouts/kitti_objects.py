@@ -63,7 +63,7 @@ def object_lines(
         values = [
             truncation(corners, drive.projections[number], sides=side[:2]),
             len(_VISIBLE) - int(np.searchsorted(_VISIBLE, flat["visibility"], side="right")),
-            _wrapped(yaw - np.arctan2(bottom[0], bottom[2])),
+            _wrap(yaw - np.arctan2(bottom[0], bottom[2])),
             *np.clip([flat[k] for k in ("left", "top", "right", "bottom")], 0, side),
             *size[[2, 1, 0]],
             *bottom,
@@ -102,6 +102,6 @@ def outline(corners: Float, projection: Float) -> tuple[Float, Float] | None:
     return pixels.min(axis=0), pixels.max(axis=0)
 
 
-def _wrapped(angle: float) -> float:
+def _wrap(angle: float) -> float:
     """An angle within -pi and pi."""
     return float(np.remainder(angle + np.pi, 2 * np.pi) - np.pi)

@@ -114,10 +114,10 @@ def oxts_columns(drive: KittiDrive) -> dict[str, NDArray[Any]]:
     tilt = level @ north @ turn
     columns = {"lat": lat, "lon": lon, "alt": position[:, 2], "roll": roll, "pitch": pitch, "yaw": yaw}
     columns |= {"vn": velocity[:, 1], "ve": velocity[:, 0]}
-    columns |= dict(zip(("vf", "vl", "vu"), _applied(level, velocity).T, strict=True))
+    columns |= dict(zip(("vf", "vl", "vu"), _apply(level, velocity).T, strict=True))
     for letter, vectors in (("a", force), ("w", rate)):
         columns |= {f"{letter}{axis}": vectors[:, k] for k, axis in enumerate("xyz")}
-        columns |= {f"{letter}{axis}": v for axis, v in zip("flu", _applied(tilt, vectors).T, strict=True)}
+        columns |= {f"{letter}{axis}": v for axis, v in zip("flu", _apply(tilt, vectors).T, strict=True)}
     zero = np.zeros(len(drive), np.int64)
     columns |= {"pos_accuracy": zero, "vel_accuracy": zero, "navstat": zero + _NAVSTAT}
     return columns | {"numsats": _satellites(drive), "posmode": zero, "velmode": zero, "orimode": zero}
@@ -129,7 +129,7 @@ def _about_z(angle: Float) -> Float:
     return np.moveaxis(np.array([[c, -s, zero], [s, c, zero], [zero, zero, zero + 1]]), 2, 0)
 
 
-def _applied(rotation: Float, vectors: Float) -> Float:
+def _apply(rotation: Float, vectors: Float) -> Float:
     """Vectors (n, 3) rotated by their rotations (n, 3, 3)."""
     return np.asarray(np.einsum("nij,nj->ni", rotation, vectors))
 

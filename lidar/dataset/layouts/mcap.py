@@ -46,7 +46,7 @@ def layout(topics: list[Topic]) -> dict[str, Any]:
         "layout": {
             "direction": "row",
             "first": first,
-            "second": _stacked(others),
+            "second": _stack(others),
             "splitPercentage": 65,
         },
     }
@@ -73,12 +73,12 @@ def _scene(topics: list[Topic]) -> dict[str, Any]:
     }
 
 
-def _stacked(panels: list[str]) -> Any:
+def _stack(panels: list[str]) -> Any:
     """Panels one above the other, of equal height."""
     first, *others = panels
     if not others:
         return first
     share = 100 / len(panels)
     return {
-        "direction": "column", "first": first, "second": _stacked(others), "splitPercentage": share
+        "direction": "column", "first": first, "second": _stack(others), "splitPercentage": share
     }  # fmt: skip

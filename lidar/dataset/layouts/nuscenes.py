@@ -114,7 +114,7 @@ def token_of(*parts: object) -> str:
     return hashlib.blake2b("/".join(map(str, parts)).encode(), digest_size=16).hexdigest()
 
 
-def _chained(rows: Sequence[Row]) -> None:
+def _chain(rows: Sequence[Row]) -> None:
     """Fill ``prev`` and ``next`` of rows in order of time."""
     for k, row in enumerate(rows):
         row["prev"] = rows[k - 1]["token"] if k else ""
@@ -150,7 +150,7 @@ class _Export:
             }
             for k in keys
         ]
-        _chained(samples)
+        _chain(samples)
         key_times = top.time_ns[keys]
         counts = {"lidar": 0, "camera": 0}
         total = sum(len(s.files) for s in self.streams.values())
@@ -162,7 +162,7 @@ class _Export:
                 rows.append(self._sample_data(channel, k, samples=samples, key_times=key_times, near=near))
                 counts[stream.sensor["kind"]] += 1
                 progress("nuScenes", sum(counts.values()), total=total)
-            _chained(rows)
+            _chain(rows)
             self.tables["sample_data"] += rows
         self._annotate(top, keys, samples=samples)
         self._describe(samples)
@@ -279,7 +279,7 @@ class _Export:
                 }
             )
         for instance, rows in annotations.items():
-            _chained(rows)
+            _chain(rows)
             self.tables["sample_annotation"] += rows
             self.tables["instance"].append(
                 {
@@ -333,8 +333,8 @@ class _Export:
                 "filename": mask,
             }
         ]
-        self.tables["category"] = _named("category", CATEGORIES, numbered=True)
-        self.tables["attribute"] = _named("attribute", _ATTRIBUTES)
+        self.tables["category"] = _name_of("category", CATEGORIES, numbered=True)
+        self.tables["attribute"] = _name_of("attribute", _ATTRIBUTES)
         self.tables["visibility"] = [
             {"token": str(k + 1), "level": level, "description": f"visibility {level[1:]} %"}
             for k, level in enumerate(_VISIBILITY)
@@ -353,7 +353,7 @@ class _Export:
             return np.zeros((1, 1), np.uint8)
         mask = Image.new("L", (width, height))
         pen = ImageDraw.Draw(mask)
-        for triangles in _paved(self.dataset):
+        for triangles in _triangulate_pavement(self.dataset):
             xy = (triangles / self.scale[:2] - self.zero[:2]) / _PIXEL
             inside = ((xy.max(axis=1) >= 0) & (xy.min(axis=1) <= [width, height])).all(axis=1)
             for corners in (xy[inside] * [1, -1] + [0, height]).tolist():
@@ -361,7 +361,7 @@ class _Export:
         return np.asarray(mask)
 
 
-def _paved(dataset: Dataset) -> Iterator[Float]:
+def _triangulate_pavement(dataset: Dataset) -> Iterator[Float]:
     """Triangles (n, 3, 2), scene metres, of the roads and sidewalks in each tile of a dataset's scene."""
     try:
         scene = open_scene(dataset.scene_path)
@@ -380,7 +380,7 @@ _TABLES = (
 )  # fmt: skip
 
 
-def _named(table: str, names: Iterable[str], *, numbered: bool = False) -> list[Row]:
+def _name_of(table: str, names: Iterable[str], *, numbered: bool = False) -> list[Row]:
     return [
         {"token": token_of(table, name), "name": name, "description": name}
         | ({"index": k} if numbered else {})

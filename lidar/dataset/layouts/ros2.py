@@ -13,7 +13,7 @@ from geoscene.errors import need
 from geoscene.support.progress import Progress
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.layouts.ros_drive import MAP, RosDrive, Topic
-from lidar.dataset.layouts.ros_messages import encoded, typestore
+from lidar.dataset.layouts.ros_messages import encode, typestore
 from lidar.dataset.layouts.ros_topics import topics_of
 
 NAME = "drive"
@@ -47,8 +47,8 @@ def write_recording(dataset: Dataset, folder: Path, *, storage: str, progress: P
     total = sum(topic.count for topic in topics)
     with bag:
         connections = [_connection(bag, topic) for topic in topics]
-        for done, (time_ns, k, make) in enumerate(merged(topics)):
-            bag.write(connections[k], drive.stamp(time_ns), encoded(make()))
+        for done, (time_ns, k, make) in enumerate(merge_messages(topics)):
+            bag.write(connections[k], drive.stamp(time_ns), encode(make()))
             progress("ROS 2", done + 1, total=total)
     for path in list((folder / NAME).iterdir()):
         path.rename(folder / path.name)
@@ -56,7 +56,7 @@ def write_recording(dataset: Dataset, folder: Path, *, storage: str, progress: P
     return topics
 
 
-def merged(topics: list[Topic]) -> Iterator[tuple[int, int, Callable[[], Any]]]:
+def merge_messages(topics: list[Topic]) -> Iterator[tuple[int, int, Callable[[], Any]]]:
     """Messages in order of time, of equal times in the order of the topics."""
 
     def numbered(k: int, topic: Topic) -> Iterator[tuple[int, int, Callable[[], Any]]]:

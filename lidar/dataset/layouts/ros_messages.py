@@ -62,7 +62,7 @@ def typestore() -> Any:
     return module.get_typestore(module.Stores.ROS2_HUMBLE)
 
 
-def encoded(message: Any) -> memoryview:
+def encode(message: Any) -> memoryview:
     """The bytes of a message, CDR in little-endian order."""
     packed: memoryview = typestore().serialize_cdr(message, message.__msgtype__, little_endian=True)
     return packed

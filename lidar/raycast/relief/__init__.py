@@ -12,6 +12,6 @@ from lidar.raycast.relief.march import SILL as SILL
 from lidar.raycast.relief.walls import NO_WALLS as NO_WALLS
 from lidar.raycast.relief.walls import WallRefiner as WallRefiner
 from lidar.raycast.relief.walls import WallTables as WallTables
-from lidar.raycast.relief.walls import joined as joined
+from lidar.raycast.relief.walls import join as join
 from lidar.raycast.relief.walls import pairs_of as pairs_of
 from lidar.raycast.relief.walls import tables_of as tables_of

@@ -11,7 +11,7 @@ import numpy as np
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.memory import called, inlined
+from lidar.raycast.memory import compile_out_of_line, inline
 from lidar.raycast.relief.roughness import BLOCK, KINDS, LEVELS, NODES, REACH, STEP, roughness
 
 DEPTH, _SLOPE, _SCALE, _JOINTS, FIELD_SLOPE = range(5, 10)
@@ -68,7 +68,7 @@ def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
     return out
 
 
-@inlined
+@inline
 def level_of(patch: float, scattered: Any, x: float, y: float) -> int:
     """The level of detail of a patch that is seen as one, metres long, about a place.
 
@@ -84,7 +84,7 @@ def level_of(patch: float, scattered: Any, x: float, y: float) -> int:
     return level
 
 
-@inlined
+@inline
 def _cell(field: Any, first: int, nodes: int, u: float, v: float) -> Any:
     """Block of a place in cells, the place in its cell, and the surface there, a + p u + q v + r u v.
 
@@ -104,7 +104,7 @@ def _cell(field: Any, first: int, nodes: int, u: float, v: float) -> Any:
     return block, u - fu, v - fv, a, p, q, r
 
 
-@inlined
+@inline
 def _joint(length: float, width: float, joint: float, deep: float, x: float, y: float) -> Any:
     """Height among stones in stretcher bond: 0 on top, ``-deep`` in the middle of joints."""
     row = np.floor(y / width)
@@ -115,14 +115,14 @@ def _joint(length: float, width: float, joint: float, deep: float, x: float, y: 
     return -deep * max(1.0 - 2.0 * edge / joint, 0.0)
 
 
-@inlined
+@inline
 def joints(rough: Any, k: int, x: float, y: float) -> Any:
     """Height of a kind with stones above its waves."""
     kinds = rough.kinds
     return _joint(kinds[k, 1], kinds[k, 2], kinds[k, 3], kinds[k, 4], x, y)
 
 
-@called
+@compile_out_of_line
 def height(rough: Any, k: int, x: float, y: float) -> Any:
     """Height of a kind at a place, metres."""
     first = rough.first[rough.number[k], 0]
@@ -131,7 +131,7 @@ def height(rough: Any, k: int, x: float, y: float) -> Any:
     return h + joints(rough, k, x, y) if rough.kinds[k, 1] > 0.0 else h
 
 
-@inlined
+@inline
 def _slopes(rough: Any, k: int, x: float, y: float) -> Any:
     """Slopes of `height` along x and y."""
     first = rough.first[rough.number[k], 0]
@@ -156,14 +156,14 @@ def _heights(rough: Any, k: int, level: int, xy: Any, out: Any) -> None:
         out[i] = rough.kinds[k, 0] * (a + p * u + q * v + r * u * v) + rough.kinds[k, _JOINTS]
 
 
-@inlined
+@inline
 def _gap(rough: Any, k: int, place: Any, way: Any, t: float) -> Any:
     """Metres of a ray above the surface at a parameter."""
     return place[2] + t * way[2] - height(rough, k, place[0] + t * way[0], place[1] + t * way[1])
 
 
-@called
-def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any) -> Any:
+@compile_out_of_line
+def _narrow(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any) -> Any:
     """The crossing between two parameters with the gaps there, by false position (Illinois)."""
     (a, above), (b, below) = low, high
     side = 0
@@ -187,7 +187,7 @@ def _narrowed(rough: Any, k: int, place: Any, way: Any, low: Any, high: Any) -> 
     return a
 
 
-@called
+@compile_out_of_line
 def _among_joints(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
     """Ray parameter of the first crossing of the surface by a ray that is below the top of the stones.
 
@@ -205,14 +205,14 @@ def _among_joints(rough: Any, k: int, place: Any, way: Any, start: float, end: f
         ahead = min(t + max(gap / closing, shortest), end)
         there = _gap(rough, k, place, way, ahead)
         if there <= 0.0:
-            return _narrowed(rough, k, place, way, (t, gap), (ahead, there))
+            return _narrow(rough, k, place, way, (t, gap), (ahead, there))
         if ahead >= end:
             return np.inf
         t, gap = ahead, there
     return t
 
 
-@called
+@compile_out_of_line
 def _in_joint(rough: Any, k: int, place: Any, way: Any, start: float, end: float) -> Any:
     """`_crossing` of a ray that is below the top of the stones at ``start``."""
     t = _among_joints(rough, k, place, way, start, end)
@@ -222,13 +222,13 @@ def _in_joint(rough: Any, k: int, place: Any, way: Any, start: float, end: float
     return t, sx, sy
 
 
-@inlined
+@inline
 def _inverse(way: float) -> Any:
     """One over a change; for none a number so great that no border is reached."""
     return 1.0 / way if way != 0.0 else 1e300
 
 
-@inlined
+@inline
 def begin(rough: Any, k: int, level: int, place: Any, way: Any, span: Any, lanes: Any, n: int) -> None:
     """Put a ray into a lane.
 
@@ -251,7 +251,7 @@ def begin(rough: Any, k: int, level: int, place: Any, way: Any, span: Any, lanes
     lanes[n, _FIRST], lanes[n, _NODES] = rough.first[f, level], NODES >> level
 
 
-@inlined
+@inline
 def descend(rough: Any, lanes: Any, n: int) -> None:
     """Advance the ray of a lane from the plane to the highest place near ahead of it."""
     t, dx, dy, dz = lanes[n, _T], lanes[n, DX], lanes[n, DY], lanes[n, _DZ]
@@ -264,7 +264,7 @@ def descend(rough: Any, lanes: Any, n: int) -> None:
     lanes[n, _T] = t + max(min(falls, (REACH - 1) / max(abs(dx), abs(dy))), 0.0)
 
 
-@inlined
+@inline
 def _step(rough: Any, lanes: Any, n: int) -> Any:
     """Advance the ray of a lane by a step; whether it goes on.
 
@@ -299,7 +299,7 @@ def _step(rough: Any, lanes: Any, n: int) -> Any:
     return not (crosses | ends)
 
 
-@inlined
+@inline
 def follow(rough: Any, lanes: Any, active: Any, count: int) -> None:
     """Follow the rays of lanes to their first crossing: its parameter (inf: none) and the slopes there.
 

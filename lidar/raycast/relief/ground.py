@@ -13,7 +13,7 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.raycast.rays import share
 from lidar.raycast.relief.crossing import (
     COLUMNS,
@@ -107,7 +107,7 @@ class GroundRefiner:
         return at
 
 
-@inlined
+@inline
 def _on_plane(plane: Any, f: int, origin: Any, direction: Any) -> Any:
     """A ray relative to the plane of a face: x, y and height at parameter 0, and their changes."""
     a, b, c = plane[f, 0], plane[f, 1], plane[f, 2]
@@ -116,13 +116,13 @@ def _on_plane(plane: Any, f: int, origin: Any, direction: Any) -> Any:
     return (x, y, z - (a * x + b * y + c)), (dx, dy, dz - (a * dx + b * dy))
 
 
-@inlined
+@inline
 def _length(direction: Any) -> Any:
     """Length of a vector."""
     return np.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
 
 
-@inlined
+@inline
 def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: int) -> None:
     """Write the hit of a lane on a face; beyond the end of the ray it is a miss."""
     distance, face, instance, cosine, normal = columns
@@ -144,7 +144,7 @@ def _put(tables: Any, rays: Any, i: int, f: int, columns: Any, lanes: Any, n: in
         normal[i, 0], normal[i, 1], normal[i, 2] = nx * z, ny * z, z
 
 
-@inlined
+@inline
 def _enter(tables: Any, rough: Any, rays: Any, i: int, columns: Any, lanes: Any, n: int) -> Any:
     """Put a ray that hits a rough face into a lane; 1 if it does so, else 0."""
     distance, face, instance, cosine, _ = columns
@@ -189,7 +189,7 @@ def _refine(tables: Any, rough: Any, rays: Any, low: int, high: int, columns: An
             _put(tables, rays, ray[n], face[ray[n]], columns, lanes, n)
 
 
-@inlined
+@inline
 def _enter_below(tables: Any, rough: Any, rays: Any, f: int, i: int, lanes: Any, n: int) -> Any:
     """Put a ray that starts between the surface and the plane of a face into a lane.
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 
 OVER, _FARTHEST = 1e-3, 0.1
 """Metres off a plane at which a ray from behind it goes on, as far as shadow rays keep off surfaces; and
 metres along the ray at most."""
 
 
-@inlined
+@inline
 def beyond_plane(leaving: float, length: float) -> Any:
     """Parameter by which a ray goes on beyond a plane that it crosses from behind.
 
@@ -23,7 +23,7 @@ def beyond_plane(leaving: float, length: float) -> Any:
     return min(OVER / leaving, _FARTHEST / length)
 
 
-@inlined
+@inline
 def direction_of(rays: Any, i: int) -> Any:
     """A ray's direction in the caster's axes."""
     x, y, z = rays.directions[i, 0], rays.directions[i, 1], rays.directions[i, 2]
@@ -37,7 +37,7 @@ def direction_of(rays: Any, i: int) -> Any:
     )
 
 
-@inlined
+@inline
 def origin_of(rays: Any, i: int) -> Any:
     """A ray's origin in the caster's axes."""
     x, y, z = 0.0, 0.0, 0.0

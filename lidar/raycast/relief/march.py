@@ -14,7 +14,7 @@ import numpy as np
 
 from geoscene.buildings.facades import Openings
 from geoscene.typing import Float
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 
 WALL, SILL, FRAME, INFILL, ROOM = range(5)
 """Surfaces of an opening: `WALL` are the panel and the reveal."""
@@ -51,7 +51,7 @@ def opening_table(openings: Openings) -> Float:
     return np.ascontiguousarray(np.column_stack(columns), np.float64)
 
 
-@inlined
+@inline
 def within(kinds: Any, k: int, first: int, x: float, y: float, by: float) -> Any:
     """Whether a point lies in a rectangle of the table, grown by some metres."""
     return (
@@ -60,7 +60,7 @@ def within(kinds: Any, k: int, first: int, x: float, y: float, by: float) -> Any
     )
 
 
-@inlined
+@inline
 def _pane(low: float, high: float, bars: float, bar: float, place: float) -> Any:
     """Ends of the pane, between bars of one direction, that holds a place; empty on a bar.
 
@@ -75,7 +75,7 @@ def _pane(low: float, high: float, bars: float, bar: float, place: float) -> Any
     return start, end
 
 
-@inlined
+@inline
 def _leaves(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, ray: Any) -> Any:
     """Ray parameter and axis at which a ray in a box leaves it."""
     ox, oy, oz, dx, dy, dz = ray
@@ -95,7 +95,7 @@ def _leaves(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, ra
     return t, axis
 
 
-@inlined
+@inline
 def _enters(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, ray: Any, near: float) -> Any:
     """Ray parameter and axis at which a ray enters a block from ``near`` on; inf if it does not."""
     ox, oy, oz, dx, dy, dz = ray
@@ -121,7 +121,7 @@ def _enters(x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, ra
     return t, axis
 
 
-@inlined
+@inline
 def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
     """Follow a ray through the layers of an opening: ray parameter, axis of the normal, and surface.
 
@@ -185,7 +185,7 @@ def march(kinds: Any, k: int, ray: Any, start: float, layer: int) -> Any:
         layer = 1
 
 
-@inlined
+@inline
 def layer_of(kinds: Any, k: int, x: float, y: float, z: float) -> int:
     """The layer whose air holds a point, its surfaces included; -1 for none."""
     if z <= kinds[k, PANEL_DEPTH] + _ON:
@@ -201,7 +201,7 @@ def layer_of(kinds: Any, k: int, x: float, y: float, z: float) -> int:
     return 2 if p - _ON <= x <= r + _ON and q - _ON <= y <= s + _ON else -1
 
 
-@inlined
+@inline
 def in_room(kinds: Any, k: int, width: float, height: float, ray: Any) -> Any:
     """Ray parameter and axis at which a ray that has passed the pane hits the room; it is closed."""
     return _leaves(0.0, 0.0, kinds[k, PANE_DEPTH], width, height, kinds[k, ROOM_DEPTH], ray)

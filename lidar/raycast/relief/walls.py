@@ -13,7 +13,7 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.raycast.rays import share
 from lidar.raycast.relief.lines import beyond_plane, direction_of, origin_of
 from lidar.raycast.relief.march import (
@@ -131,7 +131,7 @@ def tables_of(relief: WallRelief, pairs: WallPairs, *, origin: Float, bits: NDAr
     )
 
 
-def joined(tables: Sequence[WallTables], *, faces: Sequence[int], count: int) -> WallTables:
+def join(tables: Sequence[WallTables], *, faces: Sequence[int], count: int) -> WallTables:
     """The tables of several tiles.
 
     faces : number of the first face of each tile
@@ -212,7 +212,7 @@ class WallRefiner:
         return hits
 
 
-@inlined
+@inline
 def on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
     """A ray relative to the first cell of a wall: origin without its depth, direction."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]
@@ -227,13 +227,13 @@ def on_wall(frame: Any, w: int, origin: Any, direction: Any) -> Any:
     )
 
 
-@inlined
+@inline
 def outwards(frame: Any, w: int) -> Any:
     """The horizontal normal of a wall."""
     return frame[w, _TANGENT + 1], -frame[w, _TANGENT]
 
 
-@inlined
+@inline
 def cell_number(frame: Any, w: int, u: float, v: float) -> Any:
     """Number of the cell of a wall's grid at a place (-1: none), and its lower left corner."""
     width, height, ground = frame[w, _WIDTH], frame[w, _HEIGHT], frame[w, _GROUND]
@@ -246,7 +246,7 @@ def cell_number(frame: Any, w: int, u: float, v: float) -> Any:
     return np.int64(row * frame[w, _COLUMNS] + column), column * width, low
 
 
-@inlined
+@inline
 def _write_normal(frame: Any, w: int, axis: int, along: float, up: float, out: Any, i: int) -> None:
     """Write the normal of a surface across an axis of the wall; it faces a ray with these components."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]
@@ -259,13 +259,13 @@ def _write_normal(frame: Any, w: int, axis: int, along: float, up: float, out: A
         out[i, 0], out[i, 1], out[i, 2] = ty, -tx, 0.0
 
 
-@inlined
+@inline
 def height_of(frame: Any, w: int, bottom: float) -> Any:
     """Height of the cell of a wall that starts at a height above the first one."""
     return frame[w, _HEIGHT] if bottom > 0.0 else frame[w, _GROUND]
 
 
-@inlined
+@inline
 def _refine_one(tables: Any, rays: Any, i: int, columns: Any) -> None:
     """Refine one hit."""
     distance, face, instance, cosine, normal = columns
@@ -305,7 +305,7 @@ def _refine_one(tables: Any, rays: Any, i: int, columns: Any) -> None:
         _write(frame, w, (s, axis, face[i]), (dx, dy, dz), direction, columns, i)
 
 
-@inlined
+@inline
 def _write(frame: Any, w: int, hit: Any, way: Any, direction: Any, columns: Any, i: int) -> None:
     """Write a hit: range, axis of the normal, and face."""
     distance, face, instance, cosine, normal = columns
@@ -326,7 +326,7 @@ def _refine(tables: Any, rays: Any, low: int, high: int, columns: Any) -> None:
         _refine_one(tables, rays, order[j] if len(order) > 0 else j, columns)
 
 
-@inlined
+@inline
 def _leave_one(tables: Any, rays: Any, on: Any, i: int, columns: Any) -> Any:
     """Ray parameter at which a ray leaves the opening in which it starts; 0 and inf as in `_leave`."""
     w = tables.wall[on[i]]
@@ -368,7 +368,7 @@ def _leave(tables: Any, rays: Any, on: Any, columns: Any, at: Any) -> None:
             at[i] = _leave_one(tables, rays, on, i, columns)
 
 
-@inlined
+@inline
 def depth_of(frame: Any, w: int, place: Any) -> Any:
     """Depth of a place behind the plane of a wall."""
     tx, ty = frame[w, _TANGENT], frame[w, _TANGENT + 1]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.typing import Float
 from lidar.raycast import Caster
-from lidar.sensors.camera.sign_faces import OF_SHAPE, PLATE, SIDE, face_levels, plate_levels, sampled
+from lidar.sensors.camera.sign_faces import OF_SHAPE, PLATE, SIDE, face_levels, plate_levels, sample
 from lidar.sensors.camera.signal_lamps import LENSES
-from lidar.sensors.camera.texture import compiled, hashed
+from lidar.sensors.camera.texture import compiled, hash_place
 from lidar.world.actor_shapes import CLOTHES, FLEET
 from lidar.world.actor_solids import WHITE
 from lidar.world.people import HAIR, SKIN
@@ -86,7 +86,7 @@ def colors(
         centre, across = _plate_axes(world, instance[rows], face=face[rows], place=spot)
         for number in np.unique(feature[rows]).tolist():
             own = np.flatnonzero(feature[rows] == number)
-            out[rows[own]] = sampled(
+            out[rows[own]] = sample(
                 plate_levels(number),
                 np.column_stack([across[own], spot[own, 2] - centre[own]]),
                 width=width[rows[own]],
@@ -112,11 +112,11 @@ def _draw_signs(
         for number in np.unique(feature[signs]).tolist():
             own = signs[feature[signs] == number]
             where = place(own)[:, 1:] - [0.0, SIGN_HEIGHT]
-            out[own] = sampled(face_levels(faces.get(number, "plain")), where, width=width[own], side=SIDE)
+            out[own] = sample(face_levels(faces.get(number, "plain")), where, width=width[own], side=SIDE)
     signals = np.flatnonzero((klass == _SIGNAL) & (material == _GLASS))
     if len(signals):
         where = place(signals)[:, 1:] - [0.0, LENSES]
-        out[signals] = sampled(face_levels("signal"), where, width=width[signals], side=SIDE)
+        out[signals] = sample(face_levels("signal"), where, width=width[signals], side=SIDE)
 
 
 @compiled
@@ -146,7 +146,9 @@ def _vary(
         elif m == _PAINT:
             for c in range(3):  # cars have the paints of the catalogue, in shades
                 shade = (
-                    1.0 + 0.16 * (hashed(feature[i], 95, 20) - 0.5) + 0.08 * (hashed(feature[i], c, 96) - 0.5)
+                    1.0
+                    + 0.16 * (hash_place(feature[i], 95, 20) - 0.5)
+                    + 0.08 * (hash_place(feature[i], c, 96) - 0.5)
                 )
                 color[i, c] = np.uint8(min(color[i, c] * shade, 255.0))
 
@@ -161,7 +163,7 @@ def _one_of(color: NDArray[np.uint8], table: NDArray[np.uint8]) -> bool:
 
 @compiled
 def _pick(color: NDArray[np.uint8], feature: int, table: NDArray[np.uint8], key: int) -> None:
-    color[:] = table[int(hashed(feature, key, 20) * len(table))]
+    color[:] = table[int(hash_place(feature, key, 20) * len(table))]
 
 
 _FACES: weakref.WeakKeyDictionary[World, dict[int, str]] = weakref.WeakKeyDictionary()

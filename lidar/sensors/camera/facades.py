@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import materials
 from geoscene.support.compiled import njit
 from lidar.raycast import Hits
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.raycast.relief import FRAME, INFILL, ROOM, SILL, WallTables, march
 from lidar.raycast.relief.walls import depth_of, height_of, on_wall, outwards
 from lidar.world.surfaces import Surfaces
@@ -85,7 +85,7 @@ def _walls(facades: Any, face: Any, instance: Any, wall: Any, color: Any, materi
             _wall_one(facades, face[i], i, wall, color, material)
 
 
-@inlined
+@inline
 def _wall_one(facades: Any, f: int, i: int, wall: Any, color: Any, material: Any) -> None:
     w = facades.tables.wall[f]
     wall[i] = w
@@ -109,7 +109,7 @@ def flatten(facades: Any, wall: Any, view: Any, size: Any, distance: Any, normal
             _flatten_one(facades.tables.frame, wall[i], i, view, size, distance, normal)
 
 
-@inlined
+@inline
 def _flatten_one(frame: Any, w: int, i: int, view: Any, size: Any, distance: Any, normal: Any) -> None:
     origins, rows, directions = view
     o, t = rows[i], distance[i]
@@ -122,7 +122,7 @@ def _flatten_one(frame: Any, w: int, i: int, view: Any, size: Any, distance: Any
         normal[i, 2] = 0.0
 
 
-@inlined
+@inline
 def _lengths(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) -> Any:
     """Metres of a footprint that see, in one direction: panel, its back, reveal, frame, panes, infill.
 
@@ -155,7 +155,7 @@ def _lengths(kinds: Any, k: int, axis: int, low: float, high: float, slope: floa
     return panel, back, reveal, frame, panes, infill
 
 
-@inlined
+@inline
 def _sill(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) -> Any:
     """Metres of a footprint that see the sill, in one direction: its front, moved back by its depth."""
     p, q = kinds[k, march.SILL_BOX + axis], kinds[k, march.SILL_BOX + 2 + axis]
@@ -163,7 +163,7 @@ def _sill(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) 
     return max(min(high, max(q, q - shift)) - max(low, min(p, p - shift)), 0.0) if q > p else 0.0
 
 
-@inlined
+@inline
 def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool:
     """Whether a footprint, with these ends in both directions, sees nothing of an opening."""
     x0, x1 = across
@@ -176,7 +176,7 @@ def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool
     return bool(_sill(kinds, k, 0, x0, x1, 0.0) * _sill(kinds, k, 1, y0, y1, slope) == 0.0)
 
 
-@inlined
+@inline
 def _paint(facades: Any, face: int, share: float, linear: Any, out: Any) -> None:
     """Add a painted part to what is seen."""
     out[PAINTED] += share
@@ -184,7 +184,7 @@ def _paint(facades: Any, face: int, share: float, linear: Any, out: Any) -> None
         out[LIGHT + c] += share * linear[facades.color[face, c]]
 
 
-@inlined
+@inline
 def _room(facades: Any, cell: int, w: int, at: Any, share: float, linear: Any, out: Any) -> None:
     """Add the room behind a pane; ``at`` is the pixel's ray in the cell, for each metre of depth."""
     tables = facades.tables
@@ -204,7 +204,7 @@ def _room(facades: Any, cell: int, w: int, at: Any, share: float, linear: Any, o
         out[BEHIND + c] += share * light * linear[facades.color[face, c]]
 
 
-@inlined
+@inline
 def _row(y: float, ground: float, height: float) -> Any:
     """Row of cells at a height; -1 below the lowest."""
     if y < ground:
@@ -212,7 +212,7 @@ def _row(y: float, ground: float, height: float) -> Any:
     return 1.0 + math.floor((y - ground) / height)
 
 
-@inlined
+@inline
 def facade(facades: Any, w: int, place: Any, direction: Any, size: float, linear: Any, out: Any) -> None:
     """Fill ``out`` (`SEEN`,) with what a pixel sees of the openings of a wall.
 

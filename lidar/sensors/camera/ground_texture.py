@@ -19,11 +19,11 @@ from lidar.sensors.camera.texture import (
     FACTOR_Y,
     cell,
     compiled,
-    hashed,
+    hash_place,
     inlined,
     joints,
-    keyed,
-    mixed,
+    key,
+    mix,
     noise,
     pulses,
 )
@@ -149,8 +149,8 @@ def _within(d: float, half: float, width: float) -> float:
 
 @inlined
 def _part(h: np.uint32, k: int) -> float:
-    """`lidar.sensors.camera.texture.hashed` of a cell with the key h for k = 0."""
-    return float(mixed(np.uint32(h + keyed(0, 0, k))))
+    """`lidar.sensors.camera.texture.hash_place` of a cell with the key h for k = 0."""
+    return float(mix(np.uint32(h + key(0, 0, k))))
 
 
 @inlined
@@ -166,7 +166,7 @@ def _spot(
     """Key of the cell of a place, the radius of its spot, and the place from its middle."""
     side, _, least, most = sizes
     fine = 1.0 / side
-    h = keyed(cell(x * fine), cell(y * fine), 0)
+    h = key(cell(x * fine), cell(y * fine), 0)
     r = least + (most - least) * _part(h, 62 + which)
     free = 0.5 - 1.3 * r * fine
     dx = x - (np.floor(x * fine) + 0.5 + free * (2.0 * _part(h, 64 + which) - 1.0)) * side
@@ -217,7 +217,7 @@ def spots(
 @inlined
 def _patch_at(x: float, y: float) -> tuple[np.uint32, float, float, float, float]:
     """Key of the cell of a place, half the sides of its patch, and the place from its middle."""
-    h = keyed(cell(x / _PATCH), cell(y / _PATCH), 0)
+    h = key(cell(x / _PATCH), cell(y / _PATCH), 0)
     a = _PATCH_LONG[0] + (_PATCH_LONG[1] - _PATCH_LONG[0]) * _part(h, 71)
     b = _PATCH_WIDE[0] + (_PATCH_WIDE[1] - _PATCH_WIDE[0]) * _part(h, 72)
     free = 0.5 - math.sqrt(a * a + b * b) / _PATCH
@@ -256,12 +256,12 @@ def patch(x: float, y: float, hx: float, hy: float, across: float, along: float)
 @inlined
 def _slope(x: float, y: float, k: int) -> tuple[float, float, float]:
     """`lidar.sensors.camera.texture.noise` and its derivatives."""
-    h = keyed(cell(x), cell(y), k)
+    h = key(cell(x), cell(y), k)
     s, t = x - np.floor(x), y - np.floor(y)
     u, v = s * s * (3.0 - 2.0 * s), t * t * (3.0 - 2.0 * t)
     du, dv = 6.0 * s * (1.0 - s), 6.0 * t * (1.0 - t)
-    p, q = float(mixed(h)), float(mixed(np.uint32(h + FACTOR_X)))
-    r, w = float(mixed(np.uint32(h + FACTOR_Y))), float(mixed(np.uint32(h + FACTOR_X + FACTOR_Y)))
+    p, q = float(mix(h)), float(mix(np.uint32(h + FACTOR_X)))
+    r, w = float(mix(np.uint32(h + FACTOR_Y))), float(mix(np.uint32(h + FACTOR_X + FACTOR_Y)))
     low, high = p + u * (q - p), r + u * (w - r)
     return (
         2.0 * (low + v * (high - low)) - 1.0,
@@ -295,7 +295,7 @@ def near_crack(x: float, y: float, along: float, worn: float) -> bool:
 
 
 @compiled
-def cracked(x: float, y: float, hx: float, hy: float, across: float, along: float, kind: int) -> float:
+def draw_cracks(x: float, y: float, hx: float, hy: float, across: float, along: float, kind: int) -> float:
     """Share of a footprint in cracks: the zeros of a noise, where another one says that ground is worn."""
     worn = wear(x, y, kind) if across <= CRACKS else 0.0
     if worn <= 0.0:
@@ -320,7 +320,7 @@ def _slabs(x: float, y: float, side: float, footprint: float) -> float:
     joint = 0.014
     tone = 1.0
     if footprint < side:
-        tone += 0.2 * (1.0 - footprint / side) * (hashed(cell(x / side), cell(y / side), 5) - 0.5)
+        tone += 0.2 * (1.0 - footprint / side) * (hash_place(cell(x / side), cell(y / side), 5) - 0.5)
     share = 2.0 * joint / side - (joint / side) ** 2
     return tone * (1.0 - _JOINT_DARK * joints(x, y, side, joint, footprint)) / (1.0 - _JOINT_DARK * share)
 
@@ -329,10 +329,10 @@ def _slabs(x: float, y: float, side: float, footprint: float) -> float:
 def _setts(x: float, y: float, footprint: float) -> float:
     """Factor of setts in shifted rows, each of its own tone, with dark joints; its mean is 1."""
     row = cell(y / _SETT_WIDE)
-    shifted = x + _SETT_LONG * hashed(row, 0, 84)
+    shifted = x + _SETT_LONG * hash_place(row, 0, 84)
     tone = 1.0
     if footprint < _SETT_WIDE:
-        stone = hashed(cell(shifted / _SETT_LONG), row, 85) - 0.5
+        stone = hash_place(cell(shifted / _SETT_LONG), row, 85) - 0.5
         tone += 0.6 * (1.0 - footprint / _SETT_WIDE) * stone
     a, b = _SETT_JOINT / _SETT_LONG, _SETT_JOINT / _SETT_WIDE
     share = a + b - a * b
@@ -363,14 +363,14 @@ def ground(
     if kind == ASPHALT:
         tone *= patch(x, y, hx, hy, across, along)
     else:
-        tone *= paved(kind, x, y, math.sqrt(across * along))
+        tone *= triangulate_pavement(kind, x, y, math.sqrt(across * along))
     if CRACK_SHARE[kind] > 0.0:
-        tone *= cracks(cracked(x, y, hx, hy, across, along, kind), kind)
+        tone *= cracks(draw_cracks(x, y, hx, hy, across, along, kind), kind)
     return 1.0 + PAINT_KEPT * (tone - 1.0) if painted else tone
 
 
 @compiled
-def paved(kind: int, x: float, y: float, footprint: float) -> float:
+def triangulate_pavement(kind: int, x: float, y: float, footprint: float) -> float:
     """Factor of slabs or setts."""
     if kind == CONCRETE:
         return _slabs(x, y, _SLAB_CONCRETE, footprint)

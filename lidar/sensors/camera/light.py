@@ -140,7 +140,7 @@ def daylight(
     diffuse = (radiance * (weight * normal[:, 2])[:, None])[above].sum(axis=0)
     down = diffuse + beam * max(rise, 0.0)
     if cloud > 0:
-        beam, sky, down = _clouded(beam, sky, diffuse=diffuse, rise=rise, sine=sine, cloud=cloud)
+        beam, sky, down = _add_clouds(beam, sky, diffuse=diffuse, rise=rise, sine=sine, cloud=cloud)
         radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
     radiance[~above] = (_GROUND + snow * (_SNOW - _GROUND)) / np.pi * down
     basis = _harmonics(normal)
@@ -153,7 +153,7 @@ def daylight(
     return Light(s, beam, ambient, sky, sky[1].mean(axis=0), mean, exposure)
 
 
-def _clouded(
+def _add_clouds(
     beam: Float, sky: Float, *, diffuse: Float, rise: float, sine: Float, cloud: float
 ) -> tuple[Float, Float, Float]:
     """Beam, sky and downward irradiance under clouds that cover a share of the sky.

@@ -21,8 +21,8 @@ from lidar.sensors.camera import appearance, shade
 from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.facades import RenderedFacades, facades_of, flatten, walls_of
 from lidar.sensors.camera.light import Light, daylight
-from lidar.sensors.camera.signal_lamps import Lamps, emitted
-from lidar.sensors.physics.fresnel import mirrored
+from lidar.sensors.camera.signal_lamps import Lamps, emit
+from lidar.sensors.physics.fresnel import reflect
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.surfaces import Surfaces, label_hits
@@ -191,7 +191,7 @@ def render(
     exposure = light.exposure * 2.0**options.exposure
     walls = facades_of(world)
     k = options.supersample
-    trace = functools.partial(_traced, poses=poses, world=world, times=times, options=options)
+    trace = functools.partial(_trace, poses=poses, world=world, times=times, options=options)
     colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, options=options)
 
     def band(edges: tuple[int, int], image: _Image, *, sample: int) -> None:
@@ -212,7 +212,7 @@ def render(
         else:
             fine = _finer(camera, k)
             sharp = trace(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
-            image.light[here] = _binned(colour(sharp.view(world), angle=1 / fine.fx), k, width=w)
+            image.light[here] = _bin_values(colour(sharp.view(world), angle=1 / fine.fx), k, width=w)
 
     def refine(pixels: NDArray[np.int64], image: _Image, *, sample: int) -> None:
         """Colour of single pixels of an image, from more rays."""
@@ -232,12 +232,12 @@ def render(
             image = _Image.of(h * w, coloured=coloured)
             list(run(functools.partial(band, image=image, sample=sample), bands))
             if coloured:
-                rgb = shade.developed(image.light, exposure).reshape(h, w, 3)
+                rgb = shade.develop_tone(image.light, exposure).reshape(h, w, 3)
             if coloured and options.edge_rays > k:
                 edge = edge_pixels(rgb, image.feature.reshape(h, w), klass=image.klass.reshape(h, w))
                 parts = np.split(edge, range(_EDGES, len(edge), _EDGES))
                 list(run(functools.partial(refine, image=image, sample=sample), parts))
-                rgb.reshape(-1, 3)[edge] = shade.developed(image.light[edge], exposure)
+                rgb.reshape(-1, 3)[edge] = shade.develop_tone(image.light[edge], exposure)
             total = image.light if total is None else total + image.light
             if sample == samples // 2:
                 middle = image
@@ -247,7 +247,7 @@ def render(
         if noise is not None:
             electrons = noise.standard_normal((h, w, 3), np.float32).reshape(-1, 3)
             total = _noisy(total, exposure, normal=electrons, options=options)
-        rgb = shade.developed(total, exposure).reshape(h, w, 3)
+        rgb = shade.develop_tone(total, exposure).reshape(h, w, 3)
     depth = np.where(middle.range <= camera.far, middle.range, np.inf)
     return CameraImage(
         rgb if coloured else None,
@@ -317,7 +317,7 @@ def _finer(camera: CameraSpec, k: int) -> CameraSpec:
     )
 
 
-def _binned(fine: NDArray[np.float32], k: int, *, width: int) -> NDArray[np.float32]:
+def _bin_values(fine: NDArray[np.float32], k: int, *, width: int) -> NDArray[np.float32]:
     """Means (n, 3) over blocks of k by k pixels; ``width`` is that of the coarse image."""
     mean: NDArray[np.float32] = fine.reshape(-1, k, width, k, 3).mean(axis=(1, 3), dtype=np.float32)
     return mean.reshape(-1, 3)
@@ -332,7 +332,7 @@ def _finer_pixels(pixels: NDArray[np.int64], k: int, *, width: int) -> NDArray[n
     return (rows * (width * k) + columns).reshape(-1)
 
 
-def _traced(
+def _trace(
     camera: CameraSpec,
     pixels: _Pixels,
     *,
@@ -430,14 +430,14 @@ def radiance(
     blur, angle : a pixel is blur + angle * distance metres wide
     """
     wet = world.settings.wetness > 0
-    out, gloss, facet = _shaded(
+    out, gloss, facet = _shade(
         world, view, light=light, walls=walls, size=(blur, angle), options=options, wet=wet
     )
     row = np.flatnonzero(gloss > _GLOSS)
     if len(row):
         mirror = _mirrored_view(world, view, row=row, facet=facet[row], options=options)
         size = float(angle * np.median(view.hits.range[row])), angle
-        seen, _, _ = _shaded(world, mirror, light=light, walls=walls, size=size, options=options, wet=False)
+        seen, _, _ = _shade(world, mirror, light=light, walls=walls, size=size, options=options, wet=False)
         out[row] += gloss[row, None] * seen
     return out
 
@@ -454,9 +454,7 @@ def _mirrored_view(
     direction, normal = view.direction[row], view.hits.normal[row]
     place = view.origin[view.row[row]] + view.hits.range[row, None] * direction
     facets = facet / np.linalg.norm(facet, axis=1, keepdims=True)
-    towards = mirrored(
-        direction / np.linalg.norm(direction, axis=1, keepdims=True), facets.astype(np.float64)
-    )
+    towards = reflect(direction / np.linalg.norm(direction, axis=1, keepdims=True), facets.astype(np.float64))
     # A rough film also sends light below its horizon, from where it is mirrored once more.
     below = np.minimum(np.einsum("ij,ij->i", towards, normal), 0.0)
     towards -= 2 * below[:, None] * normal
@@ -469,7 +467,7 @@ def _mirrored_view(
     return TracedView(start, each, towards, np.ones(len(row), np.bool_), time, hits, world.lookup(hits))
 
 
-def _shaded(
+def _shade(
     world: World,
     view: TracedView,
     *,
@@ -536,7 +534,7 @@ def _shaded(
         standing = hits.instance[rows] >= 0
         rows, state = rows[standing], state[standing]
         away = hits.range[rows] * np.linalg.norm(view.direction[rows], axis=1)
-        seen = emitted(
+        seen = emit(
             state,
             place=_on_shapes(world, view, rows=rows),
             width=size[0] + size[1] * away,
@@ -620,7 +618,7 @@ def optical_flow(
         raise InputError(f"camera {camera.name}: optical flow needs {rows} poses of each frame")
     start = np.zeros(rows) if times is None else np.asarray(times, float)
     end = np.ones(rows) if later_times is None else np.asarray(later_times, float)
-    view = _traced(
+    view = _trace(
         camera,
         slice(0, camera.width * camera.height),
         poses=poses,

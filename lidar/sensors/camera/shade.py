@@ -19,7 +19,7 @@ from lidar.sensors.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, Rend
 from lidar.sensors.camera.facades import PAINTED as PAINTED_PARTS
 from lidar.sensors.camera.facades import UPRIGHT as UPRIGHT_SIDES
 from lidar.sensors.camera.ground_texture import HIGHEST, LOWEST, ground
-from lidar.sensors.camera.texture import compiled, detail, grain, hashed, inlined, noise
+from lidar.sensors.camera.texture import compiled, detail, grain, hash_place, inlined, noise
 from lidar.sensors.camera.texture_blocks import BLOCK, DETAIL, PAINTED, PLACES, UPRIGHT, factors
 from lidar.sensors.camera.texture_blocks import scratch as block_scratch
 
@@ -124,7 +124,7 @@ def develop(radiance: Single, exposure: float, table: NDArray[np.uint8], out: ND
             out[i, c] = table[int(math.sqrt(x) * (_STEPS - 1) + 0.5)]
 
 
-def developed(radiance: Single, exposure: float) -> NDArray[np.uint8]:
+def develop_tone(radiance: Single, exposure: float) -> NDArray[np.uint8]:
     """The sRGB bytes (n, 3) of radiances (n, 3) times the exposure."""
     out = np.empty(radiance.shape, np.uint8)
     develop(radiance, exposure, transfer_table(), out)
@@ -219,7 +219,7 @@ def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> No
 
 
 @inlined
-def _mirrored(
+def _mirror(
     sky: Float, sun: Float, d: Float, nx: float, ny: float, nz: float, town: Float, out: Float
 ) -> None:
     """Radiance that a mirror reflects: the sky where the ray rises, else ``town``, the lit surroundings."""
@@ -238,11 +238,11 @@ def _step(value: float, level: float, edge: float) -> float:
 
 
 @inlined
-def _painted(feature: int, wall: int, albedo: Float) -> None:
+def _paint(feature: int, wall: int, albedo: Float) -> None:
     """Replace a building's default colour by one derived from its number."""
-    shade = hashed(feature, 7, 20)
+    shade = hash_place(feature, 7, 20)
     shade = 0.5 + 0.6 * shade if wall else 0.7 + 1.1 * shade
-    warm = 0.24 * (hashed(feature, 8, 20) - 0.35)
+    warm = 0.24 * (hash_place(feature, 8, 20) - 0.35)
     albedo[0] *= shade * (1.0 + 0.6 * warm)
     albedo[1] *= shade
     albedo[2] *= shade * (1.0 - 1.6 * warm)
@@ -290,11 +290,11 @@ def _facing(i: int, normal: Any, wall: Any, frame: Any) -> Any:
 
 
 _PLACED = 10
-"""Numbers that `_placed` returns."""
+"""Numbers that `_place` returns."""
 
 
 @inlined
-def _placed(i: int, view: Any, wall: Any, frame: Any, settings: Any) -> Any:
+def _place(i: int, view: Any, wall: Any, frame: Any, settings: Any) -> Any:
     """Direction (a unit vector), place, distance, cosine of incidence and widths of a pixel's hit.
 
     The first width is across the ray, the second one on the surface.
@@ -390,7 +390,7 @@ def pixel(
     if not range_[i] < np.inf:
         _background(i, direction, light, colors, out)
         return
-    at = _placed(i, view, wall, walls.tables.frame, settings)
+    at = _place(i, view, wall, walls.tables.frame, settings)
     factor = 1.0
     if detailed:
         factor = _factor(_texture(i, at, view, found, walls.tables.frame, tables), at)
@@ -447,7 +447,7 @@ def _surface(
     if detailed and klass[i] == _BUILDING:
         r, g, b = color[i, 0], color[i, 1], color[i, 2]
         if r == plain[m, 0] and g == plain[m, 1] and b == plain[m, 2]:
-            _painted(feature[i], w >= 0, albedo)
+            _paint(feature[i], w >= 0, albedo)
     glass = aside = upwards = 0.0
     open_sky = 1.0
     if w >= 0:
@@ -490,7 +490,7 @@ def _surface(
 
     _irradiance(ambient, beam, sun, nx, ny, nz, lit[i], open_sky, irradiance)
     if shine > 0.0:
-        _mirrored(sky, sun, d, rx, ry, rz, town, glow)
+        _mirror(sky, sun, d, rx, ry, rz, town, glow)
     for c in range(3):
         irradiance[c] *= albedo[c]
     if aside > 0.0:
@@ -573,7 +573,7 @@ def shade(
         for j in range(n):
             i, kind[j] = first + j, -1
             if range_[i] < np.inf:
-                here = _placed(i, view, wall, frame, settings)
+                here = _place(i, view, wall, frame, settings)
                 for c in range(_PLACED):
                     at[j, c] = here[c]
                 if settings[3]:

@@ -306,7 +306,7 @@ def _levels(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]:
     return tuple(levels)
 
 
-def sampled(
+def sample(
     levels: tuple[NDArray[np.float32], ...], place: Float, *, width: Float, side: float = SIDE
 ) -> NDArray[np.uint8]:
     """SRGB (n, 3) at places (n, 2) in metres right of and above the centre of a face, over some widths (n,).

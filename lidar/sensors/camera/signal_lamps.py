@@ -53,7 +53,7 @@ class Lamps:
         return rows[known], self.state[at[known]]
 
 
-def emitted(state: NDArray[np.uint8], *, place: Float, width: Float, exposure: float) -> NDArray[np.float32]:
+def emit(state: NDArray[np.uint8], *, place: Float, width: Float, exposure: float) -> NDArray[np.float32]:
     """Linear light (n, 3) that lamps add, in units of `light.Light`.
 
     state    : (n,) which lamp of the head is lit

@@ -26,7 +26,7 @@ FACTOR_X, FACTOR_Y, _C = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32
 
 
 @inlined
-def mixed(h: np.uint32) -> np.float32:
+def mix(h: np.uint32) -> np.float32:
     """A number 0 <= m < 1 from 32 bits, well mixed (constants of C. Wellons' hash-prospector, 2018)."""
     h = np.uint32((h ^ (h >> np.uint32(16))) * np.uint32(0x7FEB352D))
     h = np.uint32((h ^ (h >> np.uint32(15))) * np.uint32(0x846CA68B))
@@ -34,7 +34,7 @@ def mixed(h: np.uint32) -> np.float32:
 
 
 @inlined
-def keyed(i: int, j: int, k: int) -> np.uint32:
+def key(i: int, j: int, k: int) -> np.uint32:
     """32 bits for three integers, to be mixed."""
     return np.uint32(
         np.uint32(np.uint32(i) * FACTOR_X) + np.uint32(np.uint32(j) * FACTOR_Y) + np.uint32(np.uint32(k) * _C)
@@ -42,9 +42,9 @@ def keyed(i: int, j: int, k: int) -> np.uint32:
 
 
 @inlined
-def hashed(i: int, j: int, k: int) -> float:
+def hash_place(i: int, j: int, k: int) -> float:
     """A number 0 <= h < 1 from three integers."""
-    return float(mixed(keyed(i, j, k)))
+    return float(mix(key(i, j, k)))
 
 
 @inlined
@@ -58,8 +58,8 @@ def between(h: np.uint32, u: np.float32, v: np.float32) -> float:
     """Smooth noise in -1..1 at (u, v) in the cell of a lattice whose key is h."""
     u = u * u * (np.float32(3.0) - np.float32(2.0) * u)
     v = v * v * (np.float32(3.0) - np.float32(2.0) * v)
-    p, q = mixed(h), mixed(np.uint32(h + FACTOR_X))
-    r, s = mixed(np.uint32(h + FACTOR_Y)), mixed(np.uint32(h + FACTOR_X + FACTOR_Y))
+    p, q = mix(h), mix(np.uint32(h + FACTOR_X))
+    r, s = mix(np.uint32(h + FACTOR_Y)), mix(np.uint32(h + FACTOR_X + FACTOR_Y))
     low = p + u * (q - p)
     return float(np.float32(2.0) * (low + v * (r + u * (s - r) - low)) - np.float32(1.0))
 
@@ -67,7 +67,7 @@ def between(h: np.uint32, u: np.float32, v: np.float32) -> float:
 @inlined
 def noise(x: float, y: float, k: int) -> float:
     """Smooth noise in -1..1 on a lattice of spacing 1."""
-    return between(keyed(cell(x), cell(y), k), np.float32(x - np.floor(x)), np.float32(y - np.floor(y)))
+    return between(key(cell(x), cell(y), k), np.float32(x - np.floor(x)), np.float32(y - np.floor(y)))
 
 
 @compiled
@@ -81,7 +81,7 @@ def grain(x: float, y: float, fine: float, footprint: float, k: int) -> float:
 
 @inlined
 def span(x: float, period: float, footprint: float) -> tuple[float, float, float, float]:
-    """A footprint about x on a pattern, for `covered`: its ends within their periods, periods between."""
+    """A footprint about x on a pattern, for `cover`: its ends within their periods, periods between."""
     f = max(footprint, 1e-3)
     low, high = x - 0.5 * f, x + 0.5 * f
     first, last = np.floor(low / period), np.floor(high / period)
@@ -89,7 +89,7 @@ def span(x: float, period: float, footprint: float) -> tuple[float, float, float
 
 
 @inlined
-def covered(ends: tuple[float, float, float, float], period: float, width: float) -> float:
+def cover(ends: tuple[float, float, float, float], period: float, width: float) -> float:
     """Share of a `span` that lies on pulses, each ``width`` wide and in the middle of its period."""
     low, high, whole, inverse = ends
     gap = 0.5 * (period - width)
@@ -100,7 +100,7 @@ def covered(ends: tuple[float, float, float, float], period: float, width: float
 @inlined
 def pulses(x: float, period: float, width: float, footprint: float) -> float:
     """Share of a footprint about x that lies on a train of pulses."""
-    return covered(span(x, period, footprint), period, width)
+    return cover(span(x, period, footprint), period, width)
 
 
 @inlined
@@ -148,7 +148,7 @@ FINE = 1.0 / GRAINS[:, :, 1]
 @inlined
 def slabs(a: float, b: float, footprint: float, tone: float) -> float:
     """The factor with slabs of several tones and their joints."""
-    slab = hashed(cell(a / 0.6), cell(b / 0.6), 5) - 0.5
+    slab = hash_place(cell(a / 0.6), cell(b / 0.6), 5) - 0.5
     tone += 0.16 * max(1.0 - footprint / 0.6, 0.0) * slab
     return tone * (1.0 - 0.45 * joints(a, b, 0.6, 0.014, footprint))
 

@@ -23,19 +23,19 @@ from lidar.sensors.camera.ground_texture import (
     PAINT_KEPT,
     PATCHES,
     SPOT_LEVEL,
-    cracked,
     cracks,
+    draw_cracks,
     near_crack,
     near_patch,
     near_spot,
     patch,
-    paved,
     spot_fade,
     spot_sizes,
     spots,
+    triangulate_pavement,
     wear,
 )
-from lidar.sensors.camera.texture import GRAINS, between, cell, compiled, courses, keyed, shingles, slabs
+from lidar.sensors.camera.texture import GRAINS, between, cell, compiled, courses, key, shingles, slabs
 
 BLOCK = 256
 """Pixels of a block; its columns stay in the processor's first cache."""
@@ -133,7 +133,7 @@ def _ground(kind: int, painted: int, n: int, at: Float, work: Scratch, tone: Flo
         _patch(n, at, work, tone)
     else:
         for i in range(n):
-            tone[i] *= paved(kind, x[i], y[i], np.sqrt(across[i] * along[i]))
+            tone[i] *= triangulate_pavement(kind, x[i], y[i], np.sqrt(across[i] * along[i]))
     if CRACK_SHARE[kind] > 0.0:
         _crack(kind, n, at, work, tone)
     if painted:
@@ -184,7 +184,7 @@ def _crack(kind: int, n: int, at: Float, work: Scratch, tone: Float) -> None:
         for i in range(n):
             near[i] = near_crack(x[i], y[i], along[i], worn[i])
     for i in range(n):
-        share = cracked(x[i], y[i], hx[i], hy[i], across[i], along[i], kind) if near[i] else 0.0
+        share = draw_cracks(x[i], y[i], hx[i], hy[i], across[i], along[i], kind) if near[i] else 0.0
         tone[i] *= cracks(share, kind)
 
 
@@ -231,7 +231,7 @@ def _add_mean(
 def _noises(n: int, k: int, x: Float, y: Float, work: Scratch) -> Any:
     """`lidar.sensors.camera.texture.noise` at n places."""
     keys, (u, v, out) = work[3], (work[4][0], work[4][1], work[4][2])
-    first = keyed(0, 0, k)
+    first = key(0, 0, k)
     for i in range(n):
         keys[i] = np.uint32(first + np.uint32(np.uint32(cell(x[i])) * _A))
     for i in range(n):

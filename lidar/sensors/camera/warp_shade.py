@@ -200,14 +200,14 @@ class WarpShader:
             upload = self.device.upload
             results = [upload(column) for column in (out, gloss, facet)]
             given = (
-                _filled(WarpView, map(upload, (origin, row, direction, range_, normal))),
-                _filled(WarpSurfaces, map(upload, (klass, material, color, feature, wall))),
+                _fill(WarpView, map(upload, (origin, row, direction, range_, normal))),
+                _fill(WarpSurfaces, map(upload, (klass, material, color, feature, wall))),
                 self._walls(walls),
                 upload(lit),
                 self._kept_in(WarpLight, light),
                 self._kept_in(Materials, tables),
-                _filled(WarpSettings, settings),
-                _filled(Covers, covers),
+                _fill(WarpSettings, settings),
+                _fill(Covers, covers),
                 upload(shade.TOWN * light[-1]),
                 *results,
                 self._globals,
@@ -224,7 +224,7 @@ class WarpShader:
     def _kept_in(self, struct: Any, values: Iterable[Any]) -> Any:
         """A struct with these values, of which arrays are copied to the device unless they are there."""
         kinds = [field.type for field in struct.vars.values()]
-        return _filled(struct, map(self._kept, values, kinds))
+        return _fill(struct, map(self._kept, values, kinds))
 
     def _kept(self, value: Any, kind: Any) -> Any:
         if not isinstance(value, np.ndarray):
@@ -239,7 +239,7 @@ class WarpShader:
         return copy
 
 
-def _filled(struct: Any, values: Iterable[Any]) -> Any:
+def _fill(struct: Any, values: Iterable[Any]) -> Any:
     """A struct of Warp with these values of its fields."""
     new = struct()
     for name, value in zip(struct.vars, values, strict=True):

@@ -15,8 +15,8 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.surface_echoes import surface_echoes
-from lidar.sensors.physics.detector import Deviates, detected, false_echoes, measured_range, received
-from lidar.sensors.physics.echoes import Echoes, TracedEchoes, joined, numbered, reported, traced
+from lidar.sensors.physics.detector import Deviates, detect_echoes, false_echoes, measured_range, receive
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, join, number_echoes, select_reported, trace
 from lidar.sensors.physics.intensity import reflectivity_code
 from lidar.sensors.physics.link import transmission
 from lidar.sensors.physics.settings import PLAIN, ScannerSettings
@@ -88,10 +88,10 @@ def scan(
         settings=settings,
         threads=threads,
     )
-    return measured(sweep)
+    return measure(sweep)
 
 
-def measured(sweep: Sweep) -> Cloud:
+def measure(sweep: Sweep) -> Cloud:
     """The point cloud of a sweep without stages."""
     return report(sweep, detect(sweep, sweep.echoes, deviates=deviates_of(sweep)))
 
@@ -112,7 +112,7 @@ def cast(
 
     pulses : (k,) ascending rows of the frame's pulses to send; all by default
     """
-    firings = fired(sensor, frame, settings=settings)
+    firings = find_pulse(sensor, frame, settings=settings)
     if pulses is not None:
         firings = _only(firings, pulses)
     sent = firings
@@ -136,7 +136,7 @@ def cast(
     return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
 
 
-def fired(sensor: Sensor, frame: int, *, settings: ScannerSettings) -> Firings:
+def find_pulse(sensor: Sensor, frame: int, *, settings: ScannerSettings) -> Firings:
     """The pulses of a frame, at the times whose poses they are cast from."""
     firings = fire(sensor, frame)
     if settings.poses == "firing":
@@ -178,18 +178,18 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> DetectedEchoe
     sensor, settings, offset = sweep.sensor, sweep.settings, sweep.sensor.pattern.range_offset
     echoes = echoes.where(echoes.range + offset >= sensor.min_range)
     if settings.link or settings.detection:
-        echoes = detected(sensor, echoes, settings=settings, deviates=deviates)
+        echoes = detect_echoes(sensor, echoes, settings=settings, deviates=deviates)
     false = false_echoes(
         sensor, sweep.firings, echoes=echoes, settings=settings, seed=sweep.seed, frame=sweep.frame
     )
     is_traced = isinstance(echoes, TracedEchoes)
     for k, (origin, found) in enumerate(false):
         first = len(sweep.echoes) + k * len(sweep.firings)
-        echoes = joined(echoes, traced(found, origin, source=first + found.pulse) if is_traced else found)
-    number, count = numbered(echoes)
+        echoes = join(echoes, trace(found, origin, source=first + found.pulse) if is_traced else found)
+    number, count = number_echoes(echoes)
     if settings.rays > 1 or settings.mirrors or false or is_traced:
-        power = received(sensor, echoes)
-        rows = reported(
+        power = receive(sensor, echoes)
+        rows = select_reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest
         )
         if len(rows) < len(echoes):

@@ -15,8 +15,8 @@ from lidar.raycast.hits import own_faces
 from lidar.sensors.laser.foliage import Foliage
 from lidar.sensors.laser.rays import MovingSensor, PulseRays, beam_of
 from lidar.sensors.laser.reflection import EchoCollector, SurfaceOptics, glossy_codes
-from lidar.sensors.physics.echoes import Echoes, by_pulse, joined, merged
-from lidar.sensors.physics.fresnel import mirrored, pane_reflection, surface_reflection
+from lidar.sensors.physics.echoes import Echoes, by_pulse, join, merge
+from lidar.sensors.physics.fresnel import pane_reflection, reflect, surface_reflection
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor
@@ -98,7 +98,7 @@ def surface_echoes(
     echoes, surfaces = collector.echoes()
     if not len(surfaces):
         return echoes
-    return by_pulse(echoes, merged(joined(surfaces, *beyond), separation, gap=gap))
+    return by_pulse(echoes, merge(join(surfaces, *beyond), separation, gap=gap))
 
 
 def _beyond(
@@ -143,7 +143,7 @@ def _beyond(
         place = start + hits.range[:, None] * direction
         if not layer:
             ghosts = world.caster.cast(
-                place, mirrored(direction, hits.normal), near=_CLEAR, far=far, time=time, on=own_faces(hits)
+                place, reflect(direction, hits.normal), near=_CLEAR, far=far, time=time, on=own_faces(hits)
             )
             found.append(
                 _along(

@@ -193,7 +193,7 @@ def observe_gnss(
         quality=np.array([STATES[name].quality for name in NAMES], np.int8)[state],
         satellites=sky.count.astype(np.int8),
         dop=dop,
-        lonlath=_shifted(frame, position, error=error),
+        lonlath=_shift(frame, position, error=error),
         speed=speed,
         course=_course(measured_velocity, speed, least=3.0 * np.nan_to_num(sizes) + 0.01),
         error=error,
@@ -259,7 +259,7 @@ def gauss_markov(rng: np.random.Generator, dt: float, *, tau: Float) -> Float:
     return out
 
 
-def _shifted(frame: Frame, position: Float, *, error: Float) -> Float:
+def _shift(frame: Frame, position: Float, *, error: Float) -> Float:
     """Longitude, latitude and height (n, 3) of positions displaced by metres east, north and up."""
     lon, lat = frame.to_geographic(position[:, 0], position[:, 1])
     turn, scale = frame.convergence(lon, lat), frame.scale(lon, lat)

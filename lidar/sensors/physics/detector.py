@@ -19,7 +19,7 @@ from lidar.sensors.physics.link import (
     noise_of,
 )
 from lidar.sensors.physics.pulse_identity import has_code
-from lidar.sensors.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
+from lidar.sensors.physics.range_error import quantise, signal_sigma, stretch_sigma, walk
 from lidar.sensors.physics.reflect import RETRO
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.patterns.beams import Firings
@@ -33,7 +33,7 @@ _BLOOM_POWER = 0.01  # of the retro-reflector's power, assumed
 _OVERLAP = 5e-5  # probability that a pulse of another scanner is received, typical value (1e-5 to 1e-4)
 
 
-def received(sensor: Sensor, echoes: Echoes) -> Float:
+def receive(sensor: Sensor, echoes: Echoes) -> Float:
     """Power (m,) of each echo over the detection threshold."""
     return amplitude(
         echoes.apparent,
@@ -44,13 +44,15 @@ def received(sensor: Sensor, echoes: Echoes) -> Float:
     )
 
 
-def detected(sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, deviates: Deviates) -> EchoesT:
+def detect_echoes(
+    sensor: Sensor, echoes: EchoesT, *, settings: ScannerSettings, deviates: Deviates
+) -> EchoesT:
     """The echoes that pass the threshold, with the apparent reflectance that the sensor measures.
 
     With ``detection``, noise is added to the power before it is compared with the threshold, which gives the
     probability of `link.detection_probability`; the measured reflectance includes that noise.
     """
-    power = received(sensor, echoes)
+    power = receive(sensor, echoes)
     measured = power
     if settings.detection:
         sigma = noise_of(power, added_noise(sensor, settings), signal_noise=sensor.signal_noise)
@@ -141,7 +143,7 @@ def measured_range(
         error = generator(seed, sensor.name, "bias").normal(0, sensor.bias_sigma, lasers)
         distance = distance + error[pulses.channel[echoes.pulse]]
     if settings.walk or settings.range_noise == "signal":
-        power = np.maximum(received(sensor, echoes), 1.0)
+        power = np.maximum(receive(sensor, echoes), 1.0)
         if settings.walk:
             distance = distance + walk(power)
     if settings.range_noise != "none":
@@ -152,4 +154,4 @@ def measured_range(
     if settings.stretch and settings.rays == 1:
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
         distance = distance + width * deviates("stretch", echoes)
-    return quantised(distance, sensor.range_quantum) if settings.quantise else distance
+    return quantise(distance, sensor.range_quantum) if settings.quantise else distance

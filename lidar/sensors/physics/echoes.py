@@ -13,7 +13,7 @@ from geoscene.classes import Class
 from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.sensors.physics.footprint import AXIS_ONLY, Gap
 
 _MODES = ("strongest", "first", "last", "dual", "all")
@@ -69,7 +69,7 @@ class TracedEchoes(Echoes):
     source: NDArray[np.int32]
 
 
-def traced(echoes: Echoes, origin: Origin, *, source: NDArray[np.integer]) -> TracedEchoes:
+def trace(echoes: Echoes, origin: Origin, *, source: NDArray[np.integer]) -> TracedEchoes:
     """Echoes with an origin and their sources (m,)."""
     added: list[Any] = [np.full(len(echoes), origin, np.uint8), source.astype(np.int32)]
     return TracedEchoes(*echoes.columns().values(), *added)
@@ -95,7 +95,7 @@ def artificial_echoes(
 EchoesT = TypeVar("EchoesT", bound=Echoes)
 
 
-def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
+def join(first: EchoesT, *others: EchoesT) -> EchoesT:
     """All rows, sorted by pulse and range."""
     together = (first, *(other for other in others if len(other)))
     if len(together) == 1:
@@ -104,7 +104,7 @@ def joined(first: EchoesT, *others: EchoesT) -> EchoesT:
     return both.take(np.lexsort((both.range, both.pulse)))
 
 
-def merged(surfaces: EchoesT, separation: float, *, gap: Gap = AXIS_ONLY) -> EchoesT:
+def merge(surfaces: EchoesT, separation: float, *, gap: Gap = AXIS_ONLY) -> EchoesT:
     """The echoes of pulses that hit these surfaces.
 
     Consecutive surfaces of a pulse within ``separation`` metres give one echo, with the sum of their power at
@@ -129,8 +129,8 @@ def by_pulse(first: EchoesT, other: EchoesT) -> EchoesT:
     return both.take(np.argsort(both.pulse, kind="stable"))
 
 
-def mixed(echoes: EchoesT, is_new: NDArray[np.bool_], *, pulses: int, separation: float) -> EchoesT:
-    """Echoes in any order, sorted by pulse and range, and merged as by `merged` where a pulse has new ones.
+def mix(echoes: EchoesT, is_new: NDArray[np.bool_], *, pulses: int, separation: float) -> EchoesT:
+    """Echoes in any order, sorted by pulse and range, and merged as by `merge` where a pulse has new ones.
 
     Echoes of pulses without new ones stay as they are, in the order in which they come. An echo of several
     has the columns of the one that sends back most, whatever is on the beam's axis.
@@ -147,7 +147,7 @@ def mixed(echoes: EchoesT, is_new: NDArray[np.bool_], *, pulses: int, separation
     return replace(echoes.take(bearer[:count]), range=place[:count], apparent=power[:count])
 
 
-@inlined
+@inline
 def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
     """Insert the number ``new`` into the first ``size`` entries of ``row``, which are sorted by distance."""
     j = size
@@ -157,7 +157,7 @@ def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
     row[j] = new
 
 
-@inlined
+@inline
 def depth_of(distance: Any, cosine: Any, gap: Any) -> Any:
     """Metres along the beam between neighbouring rays on a surface at this distance and cosine of incidence.
 
@@ -166,7 +166,7 @@ def depth_of(distance: Any, cosine: Any, gap: Any) -> Any:
     return (gap[0] + gap[1] * distance) * np.sqrt(1 - cosine * cosine) / max(cosine, _GRAZING)
 
 
-@inlined
+@inline
 def gather(
     row: Any,
     size: Any,
@@ -273,7 +273,7 @@ def _mix(columns: Any, pulses: Any, separation: Any, bearer: Any, place: Any, po
     return count
 
 
-def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def number_echoes(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Number of each echo in its pulse, from 1, and echoes of the pulse; rows sorted by pulse and range."""
     number, count = np.empty(len(echoes), np.uint8), np.empty(len(echoes), np.uint8)
     _number(echoes.pulse, number, count)
@@ -282,7 +282,7 @@ def numbered(echoes: Echoes) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 @njit(cache=True, nogil=True)
 def _number(pulse: Any, number: Any, count: Any) -> None:
-    """Fill ``number`` and ``count``, see `numbered`."""
+    """Fill ``number`` and ``count``, see `number_echoes`."""
     start = 0
     for i in range(len(pulse)):
         if i and pulse[i] != pulse[i - 1]:
@@ -292,7 +292,7 @@ def _number(pulse: Any, number: Any, count: Any) -> None:
             count[k] = i - start + 1
 
 
-def reported(
+def select_reported(
     echoes: Echoes, amplitude: Float, *, mode: str, most: int, second: bool = False
 ) -> NDArray[np.int64]:
     """Rows that a sensor reports in a return mode; rows sorted by pulse and range.
@@ -302,12 +302,12 @@ def reported(
     second : in ``dual``, report the second strongest too where the strongest echo is the last
     """
     rows = np.empty(len(echoes), np.int64)
-    count = _reported(echoes.pulse, amplitude, _MODES.index(mode), most, second, rows)
+    count = _select_reported(echoes.pulse, amplitude, _MODES.index(mode), most, second, rows)
     return rows[:count]
 
 
 @njit(cache=True, nogil=True)
-def _reported(pulse: Any, amplitude: Any, mode: Any, most: Any, second: Any, rows: Any) -> Any:
+def _select_reported(pulse: Any, amplitude: Any, mode: Any, most: Any, second: Any, rows: Any) -> Any:
     """Fill ``rows`` with the reported rows and return their number."""
     count, stop = 0, 0
     while stop < len(pulse):

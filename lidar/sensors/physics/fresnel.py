@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 
 AIR, WATER, GLASS = 1.0003, 1.33, 1.5
 """Refractive indices."""
@@ -42,7 +42,7 @@ def pane_reflection(cosine: ArrayLike, index: float = GLASS) -> Float:
     return s / (1 + s) + p / (1 + p)
 
 
-@inlined
+@inline
 def film(cosine: Any, reflectance: Any) -> Any:
     """Factor of the reflectance of a diffuse surface under a smooth film of water; compiled.
 
@@ -86,7 +86,7 @@ def glint(cosine: ArrayLike, *, wind: float = 3.0) -> Float:
     return back
 
 
-def mirrored(direction: Float, normal: Float) -> Float:
+def reflect(direction: Float, normal: Float) -> Float:
     """Directions (n, 3) mirrored at surfaces with unit normals (n, 3); lengths are kept."""
     along = np.einsum("ij,ij->i", direction, normal)[:, None]
     reflected: Float = direction - 2 * along * normal

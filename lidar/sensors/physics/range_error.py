@@ -42,7 +42,7 @@ def walk(received: ArrayLike) -> Float:
     return error
 
 
-def quantised(distance: Float, quantum: float) -> Float:
+def quantise(distance: Float, quantum: float) -> Float:
     """Distances rounded to multiples of ``quantum`` metres; unchanged if that is 0."""
     if quantum <= 0:
         return distance

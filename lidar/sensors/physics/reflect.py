@@ -12,7 +12,7 @@ from geoscene.classes import materials
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.sensors.physics.fresnel import through_water
 
 WAVELENGTHS_NM = (905.0, 1064.0, 1550.0)
@@ -109,7 +109,7 @@ def apparent(
     return back
 
 
-@inlined
+@inline
 def sent_back(reflectance: Any, cosine: Any, specular: Any, law: Any) -> Any:
     """`apparent` of one surface, for compiled code; ``law`` is an index in `INCIDENCE_LAWS`."""
     if reflectance > RETRO:

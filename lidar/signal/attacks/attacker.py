@@ -15,7 +15,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.geometry import ALL
-from lidar.sensors.physics.echoes import Origin, TracedEchoes, joined, numbered
+from lidar.sensors.physics.echoes import Origin, TracedEchoes, join, number_echoes
 from lidar.sensors.physics.link import amplitude
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.signal.situation import Situation
@@ -208,7 +208,9 @@ class Attacker(Stage):
         if at.world is not None and at.poses is not None:
             start, stop = pulses.sensor.window_ns(int(at.frame))
             moment = np.array([(pulses.time_ns[row] - start) / (stop - start)])
-            return not _occluded(at.world, at.poses(pulses.time_ns[[row]]), towards=towards, moment=moment)
+            return not _test_occlusion(
+                at.world, at.poses(pulses.time_ns[[row]]), towards=towards, moment=moment
+            )
         beside = np.flatnonzero(pulses.direction @ (towards / away) > np.cos(_BESIDE))
         found = np.isin(echoes.pulse, beside)
         hidden = found.any() and bool(echoes.range[found].max() <= away - _FOUND_BEFORE)
@@ -216,12 +218,12 @@ class Attacker(Stage):
             return not hidden
         pose = at.poses(pulses.time_ns[[row]])
         world = at.surroundings(np.concatenate([pose.position, pose.place(towards[None])]))
-        if _occluded(world, pose, towards=towards):
+        if _test_occlusion(world, pose, towards=towards):
             return False
         return not (hidden and bool(np.isin(echoes.klass[found], _NOT_IN_SCENES).any()))
 
 
-def _occluded(world: World, pose: Poses, *, towards: Float, moment: Float | None = None) -> bool:
+def _test_occlusion(world: World, pose: Poses, *, towards: Float, moment: Float | None = None) -> bool:
     """Whether anything but glass is between a sensor at a pose and a device.
 
     towards : (3,) from the sensor to the device, metres in the sensor frame
@@ -344,7 +346,7 @@ def sent_back(
     near = away < sensor.min_range
     heard = ~near & (away <= sensor.max_range)
     apparent = pulses.apparent(power[heard], distance[heard])
-    found = joined(echoes, added_echoes(row[heard], distance[heard], apparent=apparent, origin=origin))
+    found = join(echoes, added_echoes(row[heard], distance[heard], apparent=apparent, origin=origin))
     return found.where(~crowded_out(pulses, found, row=row[near], power=power[near]))
 
 
@@ -365,7 +367,7 @@ def crowded_out(
     np.maximum.at(strongest, echoes.pulse, received)
     hit = (strength > 1)[echoes.pulse]
     beaten = hit & (strength > strongest)[echoes.pulse]
-    number, count = numbered(echoes)
+    number, count = number_echoes(echoes)
     return {
         "strongest": beaten,
         "first": hit,

@@ -58,7 +58,7 @@ class CameraBlind(Stage):
         angle = np.degrees(np.arccos(cosine)).reshape(frame.rgb.shape[:2])
         glare = self.power * self.core**2 / (angle**2 + self.core**2)
         light = linear_table()[frame.rgb] + glare[:, :, None] * _TINTS[self.tint]
-        return replace(frame, rgb=_coded(light))
+        return replace(frame, rgb=_encode(light))
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Patch(Stage):
             u, v = self._in_world(frame, camera=at.camera, at=at, high=high)
         shown = (u >= 0) & (u <= 1) & (v >= 0) & (v <= 1)
         rgb = frame.rgb.copy()
-        rgb[shown] = _sampled(picture, u=u[shown], v=v[shown])
+        rgb[shown] = _sample(picture, u=u[shown], v=v[shown])
         return replace(frame, rgb=rgb)
 
     def _on_image(self, frame: CameraImage, *, high: float) -> tuple[Float, Float]:
@@ -171,7 +171,7 @@ def _picture(file: str) -> NDArray[np.uint8]:
         raise InputError(f"file = {file!r} cannot be read as a picture ({error})") from None
 
 
-def _sampled(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uint8]:
+def _sample(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uint8]:
     """Colours (k, 3) of the nearest pixels of a picture at coordinates from 0 to 1."""
     height, width = picture.shape[:2]
     row = np.minimum((v * height).astype(np.int64), height - 1)
@@ -180,7 +180,7 @@ def _sampled(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.ui
     return chosen
 
 
-def _coded(light: Float) -> NDArray[np.uint8]:
+def _encode(light: Float) -> NDArray[np.uint8]:
     """The sRGB of linear light; what is over 1 is saturated."""
     c = np.clip(light, 0, 1)
     coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)

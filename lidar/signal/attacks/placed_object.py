@@ -20,7 +20,7 @@ from lidar.signal.attacks.attacker import file_digest
 from lidar.signal.registry import Stages
 from lidar.signal.stage import Stage, parameter
 from lidar.world.actor_shapes import ActorShape
-from lidar.world.actors import Actors, joined
+from lidar.world.actors import Actors, join_actors
 from lidar.world.ground import ground_height, ground_heights
 
 _CLASSES = (
@@ -153,7 +153,7 @@ def with_objects(
     from lidar.world.actors import first_feature  # noqa: PLC0415  (0.1 s)
 
     groups: Iterable[Actors] = [one.scene(scene, trajectory) for one in placed]
-    return joined([*([] if actors is None else [actors]), *groups], first_feature=first_feature(scene))
+    return join_actors([*([] if actors is None else [actors]), *groups], first_feature=first_feature(scene))
 
 
 @lru_cache(maxsize=16)

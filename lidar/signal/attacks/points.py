@@ -125,7 +125,7 @@ class Perturb(Tampering):
             way = rng.normal(size=(len(rows), 3))
             way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
             far = self.bound * np.cbrt(rng.random((len(rows), 1)))
-        return _moved(cloud, rows, xyz=cloud.xyz[rows] + far * way)
+        return _move(cloud, rows, xyz=cloud.xyz[rows] + far * way)
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class Move(TargetReturns):
         c, s = np.cos(np.radians(self.turn)), np.sin(np.radians(self.turn))
         middle = xyz.mean(axis=0)
         xyz = (xyz - middle) @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) + middle
-        return _moved(cloud, rows, xyz=xyz + np.array([self.ahead, self.left, self.up]))
+        return _move(cloud, rows, xyz=xyz + np.array([self.ahead, self.left, self.up]))
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Insert(Region):
         distance = np.maximum(enters[rows] + self.noise * rng.standard_normal(len(rows)), 0.1)
         added = _false_returns(cloud, rows, distance=distance, intensity=self.intensity)
         if self.replaces:
-            return _replaced(cloud, rows, added=added)
+            return _replace_returns(cloud, rows, added=added)
         order = np.argsort(np.append(np.arange(len(cloud)), rows), kind="stable")
         return TracedCloud.concatenate([cloud, replace(added, hidden=np.full(len(rows), -1, np.int32))]).take(
             order
@@ -214,10 +214,10 @@ class FalseWeather(Tampering):
         bright = np.minimum(rng.exponential(max(self.intensity, 1e-9), len(cloud)), 255)
         rows = self.chosen(np.flatnonzero(hit & (distance < cloud.range)), rng=rng)
         added = _false_returns(cloud, rows, distance=distance[rows], intensity=bright[rows])
-        return _replaced(cloud, rows, added=added)
+        return _replace_returns(cloud, rows, added=added)
 
 
-def _moved(cloud: TracedCloud, rows: Ints, *, xyz: NDArray[np.floating]) -> TracedCloud:
+def _move(cloud: TracedCloud, rows: Ints, *, xyz: NDArray[np.floating]) -> TracedCloud:
     """The cloud with returns at other places (k, 3); their ranges change as their distances do."""
     before = np.linalg.norm(cloud.xyz[rows].astype(np.float64), axis=1)
     moved, distance, origin = cloud.xyz.copy(), cloud.range.copy(), cloud.origin.copy()
@@ -250,7 +250,7 @@ def _false_returns(
     )
 
 
-def _replaced(cloud: TracedCloud, rows: Ints, *, added: TracedCloud) -> TracedCloud:
+def _replace_returns(cloud: TracedCloud, rows: Ints, *, added: TracedCloud) -> TracedCloud:
     """The cloud with other returns in the place of some."""
     row = np.arange(len(cloud))
     row[rows] = len(cloud) + np.arange(len(rows))

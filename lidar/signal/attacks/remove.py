@@ -42,7 +42,7 @@ class Remove(Attacker):
             return echoes
         aim = self.spent(aim.where(rng.random(len(aim.row)) < self.share), rng=rng)
         if self.method == "saturation":
-            return echoes.where(~_dazzled(pulses, echoes, aim=aim))
+            return echoes.where(~_dazzle(pulses, echoes, aim=aim))
         sensor = pulses.sensor
         aim = aim.where(has_code(sensor, len(aim.row), rng=rng))
         if self.method == "near":
@@ -61,7 +61,7 @@ class Remove(Attacker):
         )
 
 
-def _dazzled(pulses: Pulses, echoes: TracedEchoes, *, aim: Aim) -> NDArray[np.bool_]:
+def _dazzle(pulses: Pulses, echoes: TracedEchoes, *, aim: Aim) -> NDArray[np.bool_]:
     """Mask (m,) of echoes that are weaker than steady light on the receiver."""
     level = np.zeros(len(pulses))
     level[aim.row] = aim.power

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 
 from lidar.errors import InputError
-from lidar.sensors.physics.echoes import Origin, TracedEchoes, artificial_echoes, traced
+from lidar.sensors.physics.echoes import Origin, TracedEchoes, artificial_echoes, trace
 from lidar.sensors.rig.scanner import Sensor, firings
 from lidar.signal.attacks.attacker import Attacker
 from lidar.signal.registry import Stages
@@ -49,5 +49,5 @@ def check_sight(stages: Stages, frames: Iterable[tuple[Situation, Callable[[], S
 def sent_only(sensor: Sensor, at: Situation) -> Seen:
     """A frame of a drive, whose world tells what is in between."""
     none = artificial_echoes(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
-    nothing = traced(none, Origin.SURFACE, source=np.empty(0, np.int32))
+    nothing = trace(none, Origin.SURFACE, source=np.empty(0, np.int32))
     return pulses_of(sensor, firings(sensor, int(at.frame))), nothing, at

@@ -17,7 +17,7 @@ from lidar.signal.weather.backscatter import (
     drawn_particles,
     even_echo,
     least_power,
-    noticed,
+    notice,
     pulse_shape,
     scattering,
     strength,
@@ -72,7 +72,7 @@ def through_air(
                 lens=lens,
             ),
         ]
-    single = noticed(found, least=least, separation=sensor.echo_separation)
+    single = notice(found, least=least, separation=sensor.echo_separation)
     dimmed = replace(echoes, apparent=echoes.apparent * np.exp(-2 * medium.extinction * column))
     pulse, place, power = (np.concatenate(each) for each in zip(*soft, single, strict=True))
     if not len(pulse):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.sensors.physics.link import GATE, amplitude
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.weather.media import Medium
@@ -322,7 +322,7 @@ def drawn_particles(
     return found
 
 
-@inlined
+@inline
 def _uniform(key: Any, number: Any) -> Any:
     """The random number (0 to 1) of a key with a counter: SplitMix64, as `geoscene.support.splitmix`."""
     x = key + np.uint64(number) * np.uint64(0x9E3779B97F4A7C15)
@@ -365,7 +365,7 @@ def _meet(classes: Any, key: Any, end: Any, extinction: Any) -> Any:
     return pulse[:found], place[:found], power[:found]
 
 
-def noticed(found: Found, *, least: float, separation: float) -> Found:
+def notice(found: Found, *, least: float, separation: float) -> Found:
     """The particles, by pulse, that return more than a power over the threshold with those near by.
 
     separation : metres, of particles that may give one echo

@@ -49,7 +49,7 @@ _STRAY = 0.086
 angle in degrees (CIE), from 1 to 90 degrees."""
 
 
-def weathered(
+def add_weather(
     image: CameraImage, setting: WeatherSetting, *, at: Situation, rng: np.random.Generator
 ) -> CameraImage:
     """The image in a weather; depth and labels stay ground truth.
@@ -76,7 +76,7 @@ def weathered(
         light = light + _glare(image, setting, air=air, at=at, pose=pose)
         light = _through_window(light, setting, at=at)
     has_ray = np.isfinite(pixel_rays(at.camera)[:, 2]).reshape(*image.rgb.shape[:2], 1)
-    return replace(image, rgb=np.where(has_ray, _developed(light), image.rgb))
+    return replace(image, rgb=np.where(has_ray, _develop(light), image.rgb))
 
 
 def _through_air(
@@ -92,7 +92,7 @@ def _through_air(
     """Light (h, w, 3) that is left of that of the surfaces, and what the medium adds."""
     assert at.camera is not None  # noqa: S101
     camera = at.camera
-    added = _exposed(at, lambda sources: sources.mean)
+    added = _expose(at, lambda sources: sources.mean)
     path = np.where(np.isfinite(distance), distance, _to_sky(camera, pose, top=_TOP[setting.kind]))
     field = field_of(setting, FARTHEST, at=at)
     if field is not None:
@@ -125,7 +125,7 @@ def _through_window(
     return through_drops(light, drops, camera=at.camera) * (1 - _dirt(setting, at.camera, seed=at.seed))
 
 
-def _exposed(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]:
+def _expose(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]:
     """A colour (3,) of the light, in full scales of the camera."""
     assert at.light is not None  # noqa: S101
     assert at.camera is not None  # noqa: S101
@@ -221,7 +221,7 @@ def _glare(
     angle = np.degrees(np.arccos(np.clip(pixel_rays(camera) @ sun, -1, 1)))
     veil = np.nan_to_num(10 / np.maximum(angle, 1.0) ** 2).reshape(camera.height, camera.width, 1)
     share = min(setting.drops + setting.dirt, 1.0) / _STRAY * float(sun[2]) * math.exp(-air.extinction * path)
-    glare: NDArray[np.float32] = (share * veil * _exposed(at, lambda light: light.beam)).astype(np.float32)
+    glare: NDArray[np.float32] = (share * veil * _expose(at, lambda light: light.beam)).astype(np.float32)
     return glare
 
 
@@ -260,7 +260,7 @@ def _blotches(width: int, height: int, *, name: str, seed: int) -> NDArray[np.fl
     return factor
 
 
-def _developed(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _develop(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     """The bytes (h, w, 3) of exposed linear light."""
     rgb = np.empty(light.shape, np.uint8)
     flat = np.ascontiguousarray(light.reshape(-1, 3), np.float32)

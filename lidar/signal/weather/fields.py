@@ -15,7 +15,7 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
-from lidar.raycast.memory import inlined
+from lidar.raycast.memory import inline
 from lidar.signal.situation import Situation
 from lidar.signal.weather.setting import WeatherSetting
 from lidar.world.shelter import CELL
@@ -245,17 +245,17 @@ def amounts(
 ) -> tuple[Float, Float]:
     """The share (m,) of the medium at ranges along pulses, and its integral from the beam's start, metres."""
     here, column = np.empty(len(pulse)), np.empty(len(pulse))
-    _amounts(_packed(field), (rays.start, rays.way), (pulse.astype(np.int64), distance), here, column)
+    _amounts(_pack(field), (rays.start, rays.way), (pulse.astype(np.int64), distance), here, column)
     return here, column
 
 
-def _packed(field: Field) -> tuple[Any, ...]:
+def _pack(field: Field) -> tuple[Any, ...]:
     cover = field.cover or _OPEN
     frame = *field.corner, field.ground, field.height, field.beyond, *cover.corner
     return field.share, frame, cover.roof, cover.share
 
 
-@inlined
+@inline
 def _share(field: Any, rays: Any, pulse: Any, distance: Any) -> Any:
     """The share of the medium at a range along a pulse."""
     grid, frame, roof, left = field
@@ -315,7 +315,7 @@ def strongest_response(
         shape.sum() * max(field.beyond, float(field.share.max()))
     )
     air = end, white, beyond, extinction, shape, step, near, least
-    _strongest(_packed(field), (rays.start, rays.way), air, place, power)
+    _strongest(_pack(field), (rays.start, rays.way), air, place, power)
     return place, power
 
 

@@ -68,7 +68,7 @@ def _drop_raster(
     return wet
 
 
-def dazzled(
+def dazzle(
     pulses: Pulses, echoes: TracedEchoes, *, sunlight: float, at: Situation, rng: np.random.Generator
 ) -> TracedEchoes:
     """Echoes with the noise that sunlight adds to the detector in beams near the sun, and false ones.

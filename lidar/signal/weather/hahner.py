@@ -151,14 +151,14 @@ def hahner_snow(
         disks = flake_disks(rate, fall_speed=fall_speed, medium=medium, rng=rng)
         beams = azimuth[rows], distance[rows], intensity[rows]
         found = np.empty((3, len(rows)))
-        _snowed(beams, disks, divergence / 2, found)
+        _snow(beams, disks, divergence / 2, found)
         place[rows], bright[rows] = found[0], np.clip(found[1], 0, 255)
         state[rows] = found[2].astype(np.uint8)
     return RemainingReturns(state, place, bright)
 
 
 @njit(cache=True, nogil=True)
-def _snowed(beams: Any, disks: Any, half: Any, found: Any) -> None:
+def _snow(beams: Any, disks: Any, half: Any, found: Any) -> None:
     """Fill ``found``: range, intensity and state of each beam."""
     azimuth, distance, intensity = beams
     where, away, radius = disks

@@ -149,7 +149,7 @@ def _classes() -> tuple[Float, Float]:
 
 
 @cache
-def _averaged(phase: str, wavelength_nm: float) -> tuple[Float, Float]:
+def _average(phase: str, wavelength_nm: float) -> tuple[Float, Float]:
     """Mie efficiencies (k,) of extinction and back-scatter of spheres, averaged within each class."""
     middle, width = _classes()
     across = (np.arange(12) + 0.5) / 12 - 0.5
@@ -175,7 +175,7 @@ def drop_backscatter(diameter: ArrayLike, wavelength_nm: float) -> Float:
     axial = front + front * (1 - front) ** 2 * (n / (2 - n)) ** 2 * water
     share = np.clip(np.log(d / _SPHERE) / log(_OBLATE / _SPHERE), 0, 1)
     middle, _ = _classes()
-    sphere = np.interp(d, middle, _averaged("water", wavelength_nm)[1])
+    sphere = np.interp(d, middle, _average("water", wavelength_nm)[1])
     efficiency: Float = np.exp((1 - share) * np.log(sphere) + share * np.log(axial))
     return efficiency
 
@@ -215,7 +215,7 @@ def snow_extinction(rate: float, wavelength_nm: float, *, medium: str = "gunn-ma
 
 
 def _extinction(distribution: tuple[float, float], phase: str, *, wavelength_nm: float) -> float:
-    efficiency, _ = _averaged(phase, wavelength_nm)
+    efficiency, _ = _average(phase, wavelength_nm)
     diameter, number = _numbers(distribution)
     return float(1e-6 * pi / 4 * (diameter**2 * efficiency * number).sum())
 

@@ -14,7 +14,7 @@ from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.echoes import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import parameter
-from lidar.signal.weather.camera import weathered
+from lidar.signal.weather.camera import add_weather
 from lidar.signal.weather.hahner import hahner_fog, hahner_snow
 from lidar.signal.weather.lisa import LOST, SCATTERED, Lidar, RemainingReturns, goodin, lisa
 from lidar.signal.weather.media import medium_of
@@ -54,7 +54,7 @@ class WeatherModel(WeatherSetting):
         code = cloud.intensity.astype(np.float64)
         if self.model == "hahner_fog":
             alpha = medium_of("fog", amount, wavelength_nm=_NM, medium=self.medium).extinction
-            return _changed(cloud, hahner_fog(distance, code, extinction=alpha, rng=rng), white=1.0)
+            return _change(cloud, hahner_fog(distance, code, extinction=alpha, rng=rng), white=1.0)
         if self.model == "hahner_snow":
             azimuth = np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0]).astype(np.float64)
             found = hahner_snow(
@@ -67,12 +67,12 @@ class WeatherModel(WeatherSetting):
                 fall_speed=self.fall_speed,
                 medium=self.medium,
             )
-            return _changed(cloud, found, white=1.0)
-        return _changed(cloud, self._dimmed(distance, code / _WHITE, amount=amount, rng=rng), white=_WHITE)
+            return _change(cloud, found, white=1.0)
+        return _change(cloud, self._dimmed(distance, code / _WHITE, amount=amount, rng=rng), white=_WHITE)
 
     def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The image that a camera takes in this weather, by the physical model: these have no cameras."""
-        return weathered(frame, self, at=at, rng=rng)
+        return add_weather(frame, self, at=at, rng=rng)
 
     def _dimmed(
         self, distance: Float, reflectance: Float, *, amount: float, rng: np.random.Generator
@@ -92,7 +92,7 @@ class WeatherModel(WeatherSetting):
         )
 
 
-def _changed(cloud: TracedCloud, found: RemainingReturns, *, white: float) -> TracedCloud:
+def _change(cloud: TracedCloud, found: RemainingReturns, *, white: float) -> TracedCloud:
     """A cloud with the returns of a model; ``white``: intensity code of its reflectance 1."""
     hit = found.state == SCATTERED
     xyz, old = cloud.xyz.astype(np.float64), cloud.range

@@ -12,9 +12,9 @@ from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, parameter
 from lidar.signal.weather.air import through_air
-from lidar.signal.weather.camera import weathered
+from lidar.signal.weather.camera import add_weather
 from lidar.signal.weather.fields import amounts, field_of, rays_of
-from lidar.signal.weather.glass import dazzled, through_glass
+from lidar.signal.weather.glass import dazzle, through_glass
 from lidar.signal.weather.media import Medium, medium_of
 from lidar.signal.weather.setting import WeatherSetting
 
@@ -40,7 +40,7 @@ class Weather(WeatherSetting):
         if self.drops or self.dirt:
             echoes = through_glass(pulses, echoes, drops=self.drops, dirt=self.dirt, at=at)
         if self.sunlight:
-            echoes = dazzled(pulses, echoes, sunlight=self.sunlight, at=at, rng=rng)
+            echoes = dazzle(pulses, echoes, sunlight=self.sunlight, at=at, rng=rng)
         return echoes
 
     def clearness(self, pulses: Pulses, row: int, *, distance: float, at: Situation) -> float:
@@ -58,7 +58,7 @@ class Weather(WeatherSetting):
 
     def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The image that the camera takes."""
-        return weathered(frame, self, at=at, rng=rng)
+        return add_weather(frame, self, at=at, rng=rng)
 
     def _medium(self, wavelength_nm: float, *, amount: float) -> Medium:
         return medium_of(self.kind, amount, wavelength_nm=wavelength_nm, medium=self.medium)

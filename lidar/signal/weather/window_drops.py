@@ -80,12 +80,12 @@ def through_drops(light: NDArray[np.float32], drops: Drops, *, camera: CameraSpe
     blur = APERTURE * scale / 4 / _COARSE
     seen = gaussian_filter(seen, (blur, blur, 0), mode="nearest")
     cover = gaussian_filter(cover, blur, mode="nearest")
-    seen, cover = _enlarged(seen, light.shape[:2]), _enlarged(cover[..., None], light.shape[:2])
+    seen, cover = _enlarge(seen, light.shape[:2]), _enlarge(cover[..., None], light.shape[:2])
     out: NDArray[np.float32] = light * (1 - cover) + seen
     return out
 
 
-def _enlarged(coarse: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def _enlarge(coarse: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
     """A coarse image on a grid of `_COARSE` times as many pixels, bilinear."""
     h, w = shape
     for axis, n in ((0, h), (1, w)):

@@ -24,7 +24,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.random_streams import generator
 from lidar.sensors.camera.png import write_png
 from lidar.tools.defences.calibration import Calibration, Joint, calibration_text, tail_of
-from lidar.tools.defences.fusion import FUSED, fused, fused_threshold, joint_of
+from lidar.tools.defences.fusion import FUSED, fuse_verdicts, fused_threshold, joint_of
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.reading import RecordedScans, read_scans
 from lidar.tools.defences.registry import NamedDefence
@@ -127,7 +127,7 @@ def defend(
         if out is not None:
             check_target(out, source=dataset.path, overwrite=overwrite)
     with nullcontext() if out is None else atomic_folder(out, mark=_MARK, names=_NAMES) as part:
-        return _defended(
+        return _defend(
             datasets,
             defences,
             calibration=calibration,
@@ -140,7 +140,7 @@ def defend(
         )
 
 
-def _defended(
+def _defend(
     datasets: Sequence[Dataset],
     defences: Sequence[NamedDefence],
     *,
@@ -171,7 +171,7 @@ def _defended(
     tally, tables = DefenceTally(), _Tables()
     for place, scans, judged in job.judged(progress):
         if rule:
-            judged.verdicts[FUSED] = fused(dict(judged.verdicts), calibration, rule=rule)
+            judged.verdicts[FUSED] = fuse_verdicts(dict(judged.verdicts), calibration, rule=rule)
         frame = judged.frame
         truth = _truth_of(scans, frame)
         tally.add(judged, truth)

@@ -27,7 +27,7 @@ _DRAWN = 150
 """Returns of a frame that are drawn for them."""
 
 
-def fused(verdicts: Mapping[str, Verdict], calibration: Calibration, *, rule: str) -> Verdict:
+def fuse_verdicts(verdicts: Mapping[str, Verdict], calibration: Calibration, *, rule: str) -> Verdict:
     """The verdict of several defences.
 
     Each suspicion becomes the share p of genuine samples that are at least as suspicious. ``harmonic`` takes
@@ -37,7 +37,7 @@ def fused(verdicts: Mapping[str, Verdict], calibration: Calibration, *, rule: st
     Raises InputError if a defence is not calibrated.
     """
     returns, objects = (
-        _fused(
+        _fuse(
             {n: c for n, v in verdicts.items() if (c := getattr(v, level)) is not None},
             calibration,
             level=level,
@@ -46,19 +46,19 @@ def fused(verdicts: Mapping[str, Verdict], calibration: Calibration, *, rule: st
         for level in ("returns", "objects")
     )
     frame = {name: np.array([v.frame]) for name, v in verdicts.items()}
-    frames = _fused(frame, calibration, level="frames", rule=rule)
+    frames = _fuse(frame, calibration, level="frames", rule=rule)
     assert frames is not None  # noqa: S101
     return Verdict(returns, objects, float(frames[0]))
 
 
-def _fused(columns: Mapping[str, Float], calibration: Calibration, *, level: str, rule: str) -> Float | None:
+def _fuse(columns: Mapping[str, Float], calibration: Calibration, *, level: str, rule: str) -> Float | None:
     if not columns:
         return None
     shares = np.stack([calibration.tail(name, level).of(column) for name, column in columns.items()])
-    return _suspicion(_combined(shares, rule=rule))
+    return _suspicion(_combine(shares, rule=rule))
 
 
-def _combined(shares: Float, *, rule: str) -> Float:
+def _combine(shares: Float, *, rule: str) -> Float:
     """One share (n,) of k shares (k, n)."""
     if rule == "fisher":
         from scipy.special import gammaincc  # noqa: PLC0415  (0.2 s)

@@ -63,7 +63,7 @@ class NavigationDefence(Defence):
         frame, past = frames[-1], frames[0]
         if len(frames) < 2:
             return Verdict(None, None, 0.0)
-        found = matched(frame, past, sigma=self.sigma, floor=self.floor, rng=rng)
+        found = match_sweeps(frame, past, sigma=self.sigma, floor=self.floor, rng=rng)
         if found is None:
             return Verdict(None, None, 0.0)
         squared = float(found.shift @ np.linalg.solve(found.covariance, found.shift))
@@ -123,7 +123,7 @@ def _turn_by_gyroscope(data: Measured, times: Float) -> float:
     return float(np.trapezoid(np.interp(knots, at, rate), (knots - knots[0]) / 1e9))
 
 
-def matched(
+def match_sweeps(
     frame: Observation, past: Observation, *, sigma: float, floor: float, rng: np.random.Generator
 ) -> Correction | None:
     """The motion that a frame needs to fit an earlier one; both are placed by the recorded poses first.

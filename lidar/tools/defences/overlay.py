@@ -93,7 +93,7 @@ class Overlay(Defence):
         body = frame.members[row]
         if len(body) < 4 or np.abs(frame.time_ns[body] - picture.time_ns).min() > 1e9 * self.lag:
             return None
-        pixels = projected(frame, body, picture=picture)
+        pixels = project_returns(frame, body, picture=picture)
         with np.errstate(invalid="ignore"):
             within = (pixels >= 0) & (pixels < [picture.camera.width, picture.camera.height])
         shown = within[:, 0] & within[:, 1]
@@ -145,7 +145,7 @@ def suspicion_of(evidence: Evidence) -> float:
     return (1 - evidence.edges) * (1 - evidence.contrast)
 
 
-def projected(frame: Observation, rows: NDArray[np.intp], *, picture: Picture) -> Float:
+def project_returns(frame: Observation, rows: NDArray[np.intp], *, picture: Picture) -> Float:
     """Pixels (n, 2) of returns in a picture, from where the vehicle was when it was taken; NaN behind it."""
     camera = picture.camera
     pose = frame.trajectory.at([picture.time_ns]).mounted(camera.mount.translation, camera.mount.rotation)

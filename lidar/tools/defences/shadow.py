@@ -45,7 +45,7 @@ class Shadow(Defence):
         if len(body) < 3:
             return 0.0
         center = float(np.arctan2(*frame.xyz[body, 1::-1].mean(axis=0)))
-        side = _turned(frame.azimuth - center)
+        side = _turn(frame.azimuth - center)
         left, right = side[body].min(), side[body].max()
         slope = frame.xyz[:, 2] / np.maximum(np.hypot(*frame.xyz[:, :2].T), 1e-6)
         low, high = slope[body].min(), slope[body].max()
@@ -62,7 +62,7 @@ class Shadow(Defence):
         return inside / total if total else 0.0
 
 
-def _turned(angle: Float) -> Float:
+def _turn(angle: Float) -> Float:
     """Angles within -pi to pi."""
     wrapped: Float = (angle + np.pi) % (2 * np.pi) - np.pi
     return wrapped

@@ -32,7 +32,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
-from lidar.signal.run import Altered, cloud_truth, unaltered, write_truth
+from lidar.signal.run import Altered, cloud_truth, trace_unaltered, write_truth
 from lidar.simulation.boxes import merge_box_files
 from lidar.tools.denoise.filters import Bools, Filter
 from lidar.tools.denoise.scores import FilterTally
@@ -214,8 +214,8 @@ class _DatasetFrame(_Frame):
         if job.out is None:
             return
         cloud = recorded_cloud(job.dataset, job.recording, form=job.form, scanner=device, frame=self._number)
-        altered = Altered(unaltered(cloud).cloud.where(kept), cloud)
-        truth = self._truth or cloud_truth(unaltered(cloud), start_ns=cloud.start_ns)
+        altered = Altered(trace_unaltered(cloud).cloud.where(kept), cloud)
+        truth = self._truth or cloud_truth(trace_unaltered(cloud), start_ns=cloud.start_ns)
         write_altered(
             altered,
             _filtered_truth(truth, kept),

@@ -30,7 +30,7 @@ class Rectangle:
     edge: float
 
 
-def fitted(xy: NDArray[np.floating]) -> Rectangle:
+def fit_rectangle(xy: NDArray[np.floating]) -> Rectangle:
     """The rectangle (closeness criterion of Zhang et al. 2017) around points (n, 2).
 
     Of 45 directions it is the one in which most points are close to an edge.
@@ -55,7 +55,7 @@ def _to_edge(side: Float) -> Float:
     return nearest
 
 
-def completed(seen: Rectangle, *, length: float, width: float) -> Rectangle:
+def complete_rectangle(seen: Rectangle, *, length: float, width: float) -> Rectangle:
     """A vehicle's rectangle, extended away from the sensor to a typical length and width.
 
     The longer side is the vehicle's length if it is longer than a width can be, else its front or rear, and

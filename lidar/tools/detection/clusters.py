@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Bools, Float, Ints
-from lidar.tools.detection.boxes import Rectangle, fitted
+from lidar.tools.detection.boxes import Rectangle, fit_rectangle
 from lidar.tools.detection.detector import CloudPoints
 from lidar.tools.detection.ground import height_above_ground
 
@@ -119,7 +119,7 @@ class Scan:
     clusters: tuple[PointCluster, ...]
 
 
-def clustered(cloud: CloudPoints, *, settings: DetectorSettings) -> Scan:
+def find_clusters(cloud: CloudPoints, *, settings: DetectorSettings) -> Scan:
     """The clusters of a cloud of one turn of a scanner that stands upright on a vehicle.
 
     Points above the ground, up to 2.5 m, are clustered seen from above; clusters that are too long are
@@ -155,7 +155,7 @@ def clustered(cloud: CloudPoints, *, settings: DetectorSettings) -> Scan:
 def _shape(
     height: Float, middle: NDArray[np.floating], *, tall: _Tall, settings: DetectorSettings
 ) -> ClusterShape:
-    seen = fitted(middle)
+    seen = fit_rectangle(middle)
     distance = float(np.hypot(*seen.centre))
     around = tall.near(middle, radius=0.25)
     following = around[around < settings.band[1] + 0.5 + _SPACING * distance]
@@ -206,19 +206,19 @@ class _Tall:
 def _clusters(xy: NDArray[np.floating], *, settings: DetectorSettings) -> Ints:
     """Number (n,) of the cluster of each cell."""
     link = settings.link[0] + settings.link[1] * np.hypot(*xy.T)
-    groups = _linked(xy, link)
+    groups = _link(xy, link)
     if not len(xy):
         return groups
     count = int(groups.max()) + 1
     span = np.array([np.ptp(xy[groups == k], axis=0).max() for k in range(count)])
     again = (span > 6.0)[groups]
     if again.any():
-        groups[again] = count + _linked(xy[again], link[again] / 2)
+        groups[again] = count + _link(xy[again], link[again] / 2)
         groups = np.unique(groups, return_inverse=True)[1]
     return groups
 
 
-def _linked(xy: NDArray[np.floating], link: NDArray[np.floating]) -> Ints:
+def _link(xy: NDArray[np.floating], link: NDArray[np.floating]) -> Ints:
     """Connected components (n,) of places (n, 2) that are linked within the smaller of their distances."""
     if not len(xy):
         return np.empty(0, np.int64)

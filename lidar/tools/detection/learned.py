@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import FormatError
-from lidar.tools.detection.boxes import Rectangle, completed
-from lidar.tools.detection.clusters import PLAIN, DetectorSettings, PointCluster, clustered
+from lidar.tools.detection.boxes import Rectangle, complete_rectangle
+from lidar.tools.detection.clusters import PLAIN, DetectorSettings, PointCluster, find_clusters
 from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detections, apart, table
 from lidar.tools.detection.features import FEATURES, features
 from lidar.tools.detection.forest import Forest, read_forest, write_forest
@@ -50,7 +50,7 @@ class Learned:
 
     def detect(self, cloud: CloudPoints) -> Detections:
         """Road users in a cloud of one turn of a scanner that stands upright on a vehicle."""
-        scan = clustered(cloud, settings=self.settings)
+        scan = find_clusters(cloud, settings=self.settings)
         scores = self.scores(features(scan))
         found = []
         for one, row in zip(scan.clusters, scores, strict=True):
@@ -106,7 +106,7 @@ def _found(one: PointCluster, kind: str, *, score: float, settings: DetectorSett
     shape, seen = one.shape, one.shape.seen
     if kind == "vehicle":
         high = shape.above > _HANGING and shape.roof < _HIGHEST
-        box = completed(seen, length=settings.length, width=settings.width)
+        box = complete_rectangle(seen, length=settings.length, width=settings.width)
         return DetectedObject(box, (one.floor, one.floor + (shape.roof if high else shape.top)), score, kind)
     size = tuple(np.maximum(seen.size, _SMALLEST[kind]).tolist())
     box = Rectangle(seen.centre, (size[0], size[1]), seen.yaw, seen.edge)

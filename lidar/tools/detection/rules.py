@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lidar.tools.detection.boxes import Rectangle, completed
-from lidar.tools.detection.clusters import PLAIN, WALL, ClusterShape, DetectorSettings, clustered, ramp
+from lidar.tools.detection.boxes import Rectangle, complete_rectangle
+from lidar.tools.detection.clusters import PLAIN, WALL, ClusterShape, DetectorSettings, find_clusters, ramp
 from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detections, apart, table
 
 
@@ -31,12 +31,12 @@ def detect(cloud: CloudPoints, *, settings: DetectorSettings = PLAIN) -> Detecti
     Each cluster gets a rectangle; its size, its height, the share of points above it and the number of cells
     give the score by rules.
     """
-    scan = clustered(cloud, settings=settings)
-    found = [_judged(one.shape, floor=one.floor, settings=settings) for one in scan.clusters]
+    scan = find_clusters(cloud, settings=settings)
+    found = [_judge(one.shape, floor=one.floor, settings=settings) for one in scan.clusters]
     return table(apart([one for one in found if one.score >= settings.certain]), scan.xyz)
 
 
-def _judged(shape: ClusterShape, *, floor: float, settings: DetectorSettings) -> DetectedObject:
+def _judge(shape: ClusterShape, *, floor: float, settings: DetectorSettings) -> DetectedObject:
     """What a cluster most likely is, with the score of the rules.
 
     floor : z of the ground below it
@@ -44,7 +44,7 @@ def _judged(shape: ClusterShape, *, floor: float, settings: DetectorSettings) ->
     seen, (length, width) = shape.seen, shape.seen.size
     person = Rectangle(seen.centre, (max(length, 0.5), max(width, 0.5)), seen.yaw, seen.edge)
     cycle = Rectangle(seen.centre, (max(length, 1.7), max(width, 0.6)), seen.yaw, seen.edge)
-    vehicle = completed(seen, length=settings.length, width=settings.width)
+    vehicle = complete_rectangle(seen, length=settings.length, width=settings.width)
     choices = [
         DetectedObject(person, (floor, floor + shape.top), _as_person(shape), "person"),
         DetectedObject(cycle, (floor, floor + shape.top), _as_cycle(shape), "cycle"),

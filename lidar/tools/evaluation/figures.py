@@ -19,7 +19,7 @@ from geoscene.typing import Float
 from lidar.tools.evaluation.pose_errors import absolute, by_axis
 from lidar.tools.evaluation.trajectories import ESTIMATE, file_of
 from lidar.tools.evaluation.trajectory import Compared
-from lidar.tools.plots.drawn import WIDE, plain, thinned
+from lidar.tools.plots.drawn import WIDE, plain, thin
 
 _MARGIN = 25.0
 """Metres around the trajectories in the plan."""
@@ -54,8 +54,8 @@ def plan(compared: Compared) -> Canvas:
     bar = max(b for b in _BARS if b <= max(wide / 4, _BARS[0]))
     place = low + np.array([0.04 * wide, 0.05 * tall])
     lines = [
-        Series("truth", thinned(*ways[0].T), color=_TRUE),
-        Series("estimate", thinned(*ways[1].T), color=_FOUND),
+        Series("truth", thin(*ways[0].T), color=_TRUE),
+        Series("estimate", thin(*ways[1].T), color=_FOUND),
         Series(f"{bar:g} m", [(place[0], place[1]), (place[0] + bar, place[1])], color=(0, 0, 0)),
     ]
     errors = compared.errors
@@ -106,14 +106,14 @@ def drift(compared: Compared) -> Canvas:
     parts = [
         Panel(
             Axes(f"Absolute error (alignment {kind})", "true way, m", "m", plain),
-            [Series("translation", thinned(way, moved), color=COLORS[0])],
+            [Series("translation", thin(way, moved), color=COLORS[0])],
             x_log=False,
             y_log=False,
             x_ends=ends,
         ),
         Panel(
             Axes("", "true way, m", "degrees", plain),
-            [Series("rotation", thinned(way, np.degrees(turned)), color=COLORS[1])],
+            [Series("rotation", thin(way, np.degrees(turned)), color=COLORS[1])],
             x_log=False,
             y_log=False,
             x_ends=ends,
@@ -153,7 +153,7 @@ def axes(compared: Compared) -> Canvas:
     parts = [
         Panel(
             Axes(title, "true way, m", unit, plain),
-            [Series(name, thinned(way, values[:, k]), color=COLORS[k]) for k, name in enumerate(names)],
+            [Series(name, thin(way, values[:, k]), color=COLORS[k]) for k, name in enumerate(names)],
             x_log=False,
             y_log=False,
             x_ends=ends,
@@ -191,7 +191,7 @@ def qualities(estimate: Path) -> Canvas | None:
     parts = [
         Panel(
             Axes("By the estimate" if k == 0 else "", "frame", name, plain),
-            [Series(name, thinned(frame, v), color=COLORS[k % len(COLORS)])],
+            [Series(name, thin(frame, v), color=COLORS[k % len(COLORS)])],
             x_log=False,
             y_log=False,
             x_ends=ends,

@@ -84,14 +84,14 @@ def statistics(errors: Float, *, least: int = 1, seed: int = 0) -> Statistics:
     if blocks < FEWEST:
         values = [Value(v) for v in plain]
     else:
-        drawn = _resampled(errors, size=size, seed=seed)
+        drawn = _resample(errors, size=size, seed=seed)
         low, high = np.percentile(drawn, _ENDS, axis=0)
         values = [Value(v, float(a), float(b)) for v, a, b in zip(plain, low, high, strict=True)]
     rmse, mean, median = values
     return Statistics(rmse, mean, median, float(errors.max()), n, blocks)
 
 
-def _resampled(errors: Float, *, size: int, seed: int) -> Float:
+def _resample(errors: Float, *, size: int, seed: int) -> Float:
     """Root mean square, mean and median (`RESAMPLES`, 3) of series of blocks drawn with replacement."""
     rng, n = generator(seed, "blocks", len(errors)), len(errors)
     count = -(-n // size)

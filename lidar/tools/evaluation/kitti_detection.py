@@ -155,14 +155,14 @@ def _average(
     if not count:
         return None, 0
     hits = [
-        _matched(f.overlap[measure] > limit, f, roles=r, best="score")
+        _match(f.overlap[measure] > limit, f, roles=r, best="score")
         for f, r in zip(frames, roles, strict=True)
     ]
     precision = np.zeros(RECALLS + 1)
     for k, least in enumerate(_thresholds(np.concatenate([h.scores for h in hits]), count)):
         right = wrong = 0
         for frame, role in zip(frames, roles, strict=True):
-            found = _matched(
+            found = _match(
                 frame.overlap[measure] > limit,
                 frame,
                 roles=role,
@@ -199,7 +199,7 @@ class _Matched:
     wrong: int
 
 
-def _matched(
+def _match(
     near: Bools, frame: _Frame, *, roles: tuple[Ints, Ints], best: Float | str, least: float | None = None
 ) -> _Matched:
     """Match each true object in order with the best free detection near it.

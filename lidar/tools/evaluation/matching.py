@@ -48,7 +48,7 @@ class TrajectoryAlignment:
         return path.moved(self.rotation, self.shift, scale=self.scale)
 
 
-def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = None) -> PosePairs:
+def match_poses(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = None) -> PosePairs:
     """Pair the poses of two paths by time; those of files without times by their number.
 
     how   : ``interpolated`` takes the truth between its poses at each time of the estimate; ``nearest`` takes
@@ -67,7 +67,7 @@ def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = 
     if estimate.timed != truth.timed:
         raise InputError("one trajectory has times and the other none: give both as TUM, or a dataset")
     gap_ns = round(1e9 * (GAPS_S[how] if gap_s is None else gap_s))
-    pairs = (_interpolated if how == "interpolated" else _nearest)(estimate, truth, gap_ns=gap_ns)
+    pairs = (_interpolate if how == "interpolated" else _nearest)(estimate, truth, gap_ns=gap_ns)
     if len(pairs) < 2:
         spans = (f"{p.time_ns[0] / 1e9:.3f} to {p.time_ns[-1] / 1e9:.3f}" for p in (estimate, truth))
         raise InputError(
@@ -77,7 +77,7 @@ def matched(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | None = 
     return pairs
 
 
-def _interpolated(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> PosePairs:
+def _interpolate(estimate: Path3D, truth: Path3D, *, gap_ns: int) -> PosePairs:
     knots, at = truth.time_ns, estimate.time_ns
     after = np.clip(np.searchsorted(knots, at), 1, len(knots) - 1)
     inside = (at >= knots[0]) & (at <= knots[-1]) & (knots[after] - knots[after - 1] <= gap_ns)

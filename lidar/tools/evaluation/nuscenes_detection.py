@@ -164,7 +164,7 @@ def true_boxes(dataset: Dataset, samples: KeyFrames) -> Boxes:
         speed = _velocities(places, samples.time_ns[[row for row, _ in way]])
         for (row, box), place, velocity in zip(way, places, speed, strict=True):
             category = CATEGORIES[int(class_codes().nuscenes[Class[box["class"].upper()]])]
-            kind = _detected(category)
+            kind = _detect(category)
             if kind and box["points"]:
                 size = [box[name] for name in ("width", "length", "height")]
                 attribute = (attributes_of(category, box) or [""])[0]
@@ -200,7 +200,7 @@ def _velocities(place: Float, time_ns: Ints) -> Float:
     return out
 
 
-def _detected(category: str) -> str:
+def _detect(category: str) -> str:
     """The class of the benchmark of a category; empty for none."""
     words = category.split(".")
     if words[:2] == ["human", "pedestrian"]:

@@ -142,7 +142,7 @@ def score_tracks(steps: Sequence[Step], *, kind: str, measure: str) -> TrackScor
     lengths: tuple[dict[int, int], dict[int, int]] = defaultdict(int), defaultdict(int)
     for step in steps:
         near = step.overlap >= limit
-        partner = _assigned(step, near, last=last)
+        partner = _assign(step, near, last=last)
         skipped = np.zeros(len(step.found), bool)
         for row in np.flatnonzero(partner < 0).tolist():
             skipped[row] = bool((near[row] & ~step.counts).any())
@@ -172,7 +172,7 @@ def score_tracks(steps: Sequence[Step], *, kind: str, measure: str) -> TrackScor
     return TrackScore(kind, measure, objects, missed, wrong, switches, mota, motp, idf1)
 
 
-def _assigned(step: Step, near: Bools, *, last: Mapping[int, int]) -> Ints:
+def _assign(step: Step, near: Bools, *, last: Mapping[int, int]) -> Ints:
     """Column (n,) of the true object of each found one; -1 for none.
 
     Pairs of the frame before that still overlap are kept; others are those of the greatest sum of overlaps.

@@ -14,7 +14,7 @@ from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import EvaluateOptions, MapOptions
 from lidar.tools.evaluation.intervals import Statistics, Value, statistics
-from lidar.tools.evaluation.matching import PosePairs, TrajectoryAlignment, alignment, matched
+from lidar.tools.evaluation.matching import PosePairs, TrajectoryAlignment, alignment, match_poses
 from lidar.tools.evaluation.pose_errors import (
     KITTI_LENGTHS,
     KITTI_STEP,
@@ -142,7 +142,7 @@ def evaluate_trajectory(
     found = read_path(estimate, truth=dataset, sensor=options.sensor)
     if file_of(estimate).is_dir():
         found = found.mounted(mount)
-    pairs = matched(found, truth, how=options.associate, gap_s=options.max_gap)
+    pairs = match_poses(found, truth, how=options.associate, gap_s=options.max_gap)
     motion = alignment(pairs, options.align)
     aligned = PosePairs(motion.of(pairs.estimate), pairs.truth, pairs.left_out)
     way = pairs.truth.distance()

@@ -33,7 +33,7 @@ def linked_clusters(points: NDArray[np.floating], *, p: float) -> Ints:
     cell = cell.reshape(n)
     away, near = (column.reshape(n, -1) for column in cKDTree(points).query(points, k=min(_NEAREST, n), p=p))
     row, place = np.nonzero(away <= 1)
-    cluster = joined(np.column_stack([cell[row], cell[near[row, place]]]), count=len(corner))
+    cluster = join(np.column_stack([cell[row], cell[near[row, place]]]), count=len(corner))
     beside = cKDTree(corner).query_pairs(np.ceil(1 / side), p=np.inf, output_type="ndarray")
     members = _Members(cell)
     while len(beside := beside[cluster[beside[:, 0]] != cluster[beside[:, 1]]]):
@@ -48,12 +48,12 @@ def linked_clusters(points: NDArray[np.floating], *, p: float) -> Ints:
             most = 1
             first, second = (points[members.of(number)] for number in beside[0])
             met = beside[: int(cKDTree(first).query(second, p=p)[0].min() <= 1)]
-        cluster = joined(cluster[met], count=len(corner))[cluster]
+        cluster = join(cluster[met], count=len(corner))[cluster]
         beside = beside[most:]
     return cluster[cell]
 
 
-def joined(links: NDArray[np.integer], *, count: int) -> Ints:
+def join(links: NDArray[np.integer], *, count: int) -> Ints:
     """Number (count,) of the connected component of each node; links (k, 2) are pairs of nodes."""
     from scipy.sparse import coo_array  # noqa: PLC0415  (0.2 s)
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415

@@ -158,7 +158,7 @@ class _Geometry:
         recording, scanner = self._recording, self._scanners[name]
         sent = sent_pulses(recording, scanner, frame=frame)
         ring = np.asarray(table["ring"]).astype(np.int64)
-        row = _fired(ring, drive_ns(recording.start, table["gps_time"]), sent=sent)
+        row = _find_pulse(ring, drive_ns(recording.start, table["gps_time"]), sent=sent)
         mount = scanner.spec.mount
         poses = recording.trajectory.at(sent.time_ns[row]).mounted(mount.translation, mount.rotation)
         echo = table.get("echo", np.ones(len(ring), np.uint8))
@@ -166,7 +166,7 @@ class _Geometry:
         return poses.seen(recording.geo.scene_points(world)), cells
 
 
-def _fired(ring: NDArray[np.int64], time_ns: NDArray[np.int64], *, sent: Firings) -> NDArray[np.int64]:
+def _find_pulse(ring: NDArray[np.int64], time_ns: NDArray[np.int64], *, sent: Firings) -> NDArray[np.int64]:
     """Row (n,) of the pulse of each return: of its ring, the nearest in time.
 
     Raises FormatError for rings without a pulse.

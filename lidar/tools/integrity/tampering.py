@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float, Ints
 from lidar.tools.integrity.blocks import SECTORS, BlockTest, block_of, block_test
-from lidar.tools.integrity.linkage import joined, linked_clusters
+from lidar.tools.integrity.linkage import join, linked_clusters
 from lidar.tools.integrity.watermark import CHAINED, Decoded, WatermarkCells, WatermarkKey, earlier
 
 NOISE = 0.001
@@ -108,7 +108,7 @@ def frame_verdict(
         return FrameVerdict(bits, wrong, test, np.ones(len(xyz), bool), (), suspicion)
     near = np.isin(block, _with_neighbours(test.tampered))
     noisy = noise > watermark.step / 40
-    forged = _forged(evidence, xyz, among=near, noisy=noisy)
+    forged = _detect_forged(evidence, xyz, among=near, noisy=noisy)
     places = _places("added or moved", xyz[forged], ring=cells.ring[forged])
     if near.any():
         places += _gaps(watermark, xyz[~forged], cells=cells.where(~forged), near=near[~forged], noisy=noisy)
@@ -125,7 +125,7 @@ def _evidence(watermark: WatermarkKey, decoded: Decoded, *, noise: float) -> Flo
     return found
 
 
-def _forged(
+def _detect_forged(
     evidence: Float, xyz: NDArray[np.floating], *, among: NDArray[np.bool_], noisy: bool
 ) -> NDArray[np.bool_]:
     """Returns (n,) that are forged: by their own evidence, or that of most of their neighbours.
@@ -232,4 +232,4 @@ def _clusters(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
     beside = linked_clusters(np.column_stack([turn, 0.9 * ring, away / _DEPTH]), p=np.inf)
     rows = np.arange(n)
     links = np.column_stack([np.append(rows, rows), np.append(n + near, n + near.max() + 1 + beside)])
-    return joined(links, count=int(links.max()) + 1)[:n]
+    return join(links, count=int(links.max()) + 1)[:n]

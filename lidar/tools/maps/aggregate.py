@@ -31,7 +31,7 @@ from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.selection import Selection
 from lidar.tools.maps.source import COLUMNS, MapClouds
 from lidar.tools.maps.tiles import INDEX, NAMES, open_tiles
-from lidar.tools.maps.voxels import thinned
+from lidar.tools.maps.voxels import thin
 
 _MOST_DRAWN = 5_000_000
 """Points of a map up to which notebooks show a picture of it."""
@@ -118,7 +118,7 @@ def aggregate(
     read = _Read()
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
-        stream = thinned(stream, options.voxel, out=out, offset=source.geo.offset)
+        stream = thin(stream, options.voxel, out=out, offset=source.geo.offset)
     outliers = Outliers(*options.outliers) if options.outliers else None
     if outliers:
         stream = outliers.without(stream, out=out, offset=source.geo.offset)
@@ -130,10 +130,10 @@ def aggregate(
     if options.raster:
         stream = rasters.measured(stream)
     limits = source.height_range() if options.color == "height" else (0.0, 0.0)
-    with _opened(out, source, options=options) as (named, append):
+    with _open_file(out, source, options=options) as (named, append):
         written = 0
         for table in stream:
-            append(_colored(table, options.color, limits=limits))
+            append(_color_points(table, options.color, limits=limits))
             written += rows(table)
         write_map_provenance(dataset, named)
         beside = rasters.write(named, crs=dataset.crs)
@@ -199,7 +199,7 @@ class _Read:
             yield {column: values[keep] for column, values in table.items() if column != "imaged"}
 
 
-def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
+def _color_points(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
     if color == "image":
         return table
     if color == "class":
@@ -214,7 +214,7 @@ def _colored(table: Table, color: str, *, limits: tuple[float, float]) -> Table:
 
 
 @contextmanager
-def _opened(
+def _open_file(
     out: Path, source: MapClouds, *, options: MapOptions
 ) -> Iterator[tuple[Path, Callable[[Table], None]]]:
     """Yield the path whose folder and name files beside a map have, and a function that appends tables.

@@ -162,7 +162,7 @@ def measured_motion(
     """
     seconds = np.diff(time_ns) * 1e-9
     if unit:
-        at, angle = _turned(dataset, unit)
+        at, angle = _turn(dataset, unit)
         turn = np.diff(np.column_stack([np.interp(time_ns, at, axis) for axis in angle.T]), axis=0)
     else:
         middle, turn = (time_ns[1:] + time_ns[:-1]) / 2, np.zeros((len(seconds), 3))
@@ -183,7 +183,7 @@ def measured_motion(
     return RelativeMotion(time_ns, step, _sigma(seconds, along=np.where(known, *_SPEEDS), gyro=bool(unit)))
 
 
-def _turned(dataset: Dataset, unit: str) -> tuple[Ints, Float]:
+def _turn(dataset: Dataset, unit: str) -> tuple[Ints, Float]:
     """Times (n,) of the samples of an inertial unit, and the angles (n, 3) that it turned about its axes."""
     blocks = list(read_samples(dataset.paths.measurements(unit)))
     at = np.concatenate([block.time_ns for block in blocks])

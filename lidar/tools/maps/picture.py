@@ -159,7 +159,7 @@ def cloud_picture(
     image[:] = BACKGROUND
     nearest = np.full((height, width), np.inf)
     _splat(pixels, z, rgb, 0.5 * point * camera.fx, image, nearest)
-    return _edged(image, nearest) if depth else image
+    return _shade_edges(image, nearest) if depth else image
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -183,7 +183,7 @@ def _splat(
                         image[v, u, c] = colors[i, c]
 
 
-def _edged(image: Pixels, nearest: Float) -> Pixels:
+def _shade_edges(image: Pixels, nearest: Float) -> Pixels:
     """The image with eye-dome lighting (Boucheny 2009): pixels behind their neighbours are darker."""
     height, width = nearest.shape
     far = np.isinf(nearest)

@@ -26,7 +26,7 @@ _DIFFERENCE = 1e-6  # radians and metres, over which derivatives are taken
 _SMALL = 1e-7  # radians and metres: the last step
 
 
-def fitted(motion: RelativeMotion, fixes: MeasuredPositions) -> Float:
+def fit_poses(motion: RelativeMotion, fixes: MeasuredPositions) -> Float:
     """Poses (n + 1, 4, 4) at the times of a motion, true metres, that fit it and some fixes best.
 
     The pose graph has a pose for each second (6 unknowns), edges of the motion between successive ones, the

@@ -26,7 +26,7 @@ from lidar.tools.maps.measured_poses import (
     trajectory_in,
     trajectory_of,
 )
-from lidar.tools.maps.pose_graph import fitted
+from lidar.tools.maps.pose_graph import fit_poses
 
 _STEP_NS = 100_000_000  # between poses by an inertial unit, and those that are compared with the truth
 
@@ -73,7 +73,7 @@ def measured_trajectory(
         motion = measured_motion(dataset, fixes, unit=unit, time_ns=time_ns)
     if clouds:
         motion = aligned_motion(clouds, motion, progress=progress)
-    return trajectory_of(fitted(motion, fixes), motion.time_ns, frame=dataset.frame, scale=fixes.scale)
+    return trajectory_of(fit_poses(motion, fixes), motion.time_ns, frame=dataset.frame, scale=fixes.scale)
 
 
 def pose_errors(found: Trajectory, true: Trajectory) -> PoseErrors:

@@ -27,7 +27,7 @@ def nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
     return data.take(order[first])
 
 
-def thinned(
+def thin(
     tables: Iterator[Table], voxel: float, *, out: Path, offset: tuple[float, float, float]
 ) -> Iterator[Table]:
     """Tables with one point per voxel, by squares."""

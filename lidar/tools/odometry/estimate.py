@@ -63,7 +63,7 @@ class MotionEstimate:
         return float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
 
 
-def propagated(poses: Float, step_covariance: Float, *, first: Float | None = None) -> Float:
+def propagate(poses: Float, step_covariance: Float, *, first: Float | None = None) -> Float:
     """Standard deviations (n, 6) of poses whose steps have errors that do not depend on each other.
 
     poses           : (n, 4, 4)

@@ -9,7 +9,7 @@ from geoscene.typing import Bools, Float
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.features import ImageFeatures, matches
-from lidar.tools.odometry.view_geometry import moved_back, tangents, triangulated
+from lidar.tools.odometry.view_geometry import moved_back, tangents, triangulate
 
 _NEIGHBOURS = 8
 _CELL = 8.0  # pixels: side of the cells in which nearer points hide farther ones
@@ -105,7 +105,7 @@ def stereo_distances(first: ImageFeatures, second: ImageFeatures, *, pose: Float
     sigma = np.hypot(first.sigma[here], second.sigma[there])
     on = np.abs(np.einsum("ni,ni->n", normal, ahead)) < _EPIPOLAR * sigma
     here, there, sigma = here[on], there[on], sigma[on]
-    found, deviation = triangulated(
+    found, deviation = triangulate(
         first.bearing[here], second.bearing[there], pose=pose, sigma=sigma / np.sqrt(2.0)
     )
     distance[here], fuzz[here] = found, deviation

@@ -16,7 +16,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.sensors.rig.imu_grades import PRESETS, Noise
 from lidar.sensors.rig.specs import ImuSpec, rig_of
 from lidar.tools.odometry.estimate import MotionEstimate
-from lidar.tools.odometry.fusion import Fixed, fixes_of, fused, unit_of
+from lidar.tools.odometry.fusion import Fixed, fixes_of, fuse_measurements, unit_of
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.scans import scans_of
 from lidar.tools.odometry.settings import OdometrySettings
@@ -47,7 +47,7 @@ def fused_odometry(
     sensors = dataset.sensors()
     if unknown := [name for name in names if name not in sensors]:
         raise InputError(f"`sensor` {unknown[0]}: not in {dataset.path}; there are {', '.join(sensors)}")
-    receiver, unit = (_named(dataset, kind, names=names) for kind in ("gnss", "imu"))
+    receiver, unit = (_name_of(dataset, kind, names=names) for kind in ("gnss", "imu"))
     if not receiver:
         raise DatasetError(
             f"{dataset.path}: has no satellite receiver, which georeferences; choose another `method`"
@@ -65,7 +65,7 @@ def fused_odometry(
         if sigma is None:
             sigma = np.tile(np.repeat(_DRIFT, 3), (len(steps), 1))
     progress("fusing", 0, total=0)
-    found = fused(time_ns, fixes, unit=inertial, steps=steps, step_sigma=sigma, settings=settings)
+    found = fuse_measurements(time_ns, fixes, unit=inertial, steps=steps, step_sigma=sigma, settings=settings)
     counts: dict[str, Any] = {"used": {}, "left_out": {}}
     for quality in np.unique(fixes.quality).tolist():
         name, of = _QUALITIES.get(quality, str(quality)), fixes.quality == quality
@@ -87,7 +87,7 @@ def fused_odometry(
     )
 
 
-def _named(dataset: Dataset, kind: str, *, names: tuple[str, ...]) -> str:
+def _name_of(dataset: Dataset, kind: str, *, names: tuple[str, ...]) -> str:
     """The sensor of a kind that is named, or the first; empty if there is none."""
     there = dataset.sensors(kind)
     return next((name for name in (*names, *there) if name in there), "")

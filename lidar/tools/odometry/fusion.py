@@ -146,7 +146,7 @@ def unit_of(dataset: Dataset, name: str, *, noise: Noise, fixes: Fixed) -> Unit:
     return Unit(samples, noise, mount, gravity, earth)
 
 
-def fused(
+def fuse_measurements(
     time_ns: Ints,
     fixes: Fixed,
     *,

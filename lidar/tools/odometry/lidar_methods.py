@@ -18,7 +18,7 @@ from geoscene.errors import need
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.estimate import MotionEstimate, propagated
+from lidar.tools.odometry.estimate import MotionEstimate, propagate
 from lidar.tools.odometry.local_map import LocalMap
 from lidar.tools.odometry.scans import SweepSequence
 from lidar.tools.odometry.settings import OdometrySettings
@@ -87,7 +87,7 @@ def lidar_odometry(
     if any(one is not None for one in information):
         free = np.diag(_usual(scans, settings) ** 2)
         covariance = [free if one is None else np.linalg.inv(one) for one in information]
-        sigma = propagated(covered, np.array(covariance))
+        sigma = propagate(covered, np.array(covariance))
         step_sigma = np.sqrt(np.einsum("nii->ni", np.array(covariance)))
     points_of = np.array(counts, np.int64)
     return MotionEstimate(

@@ -136,11 +136,11 @@ def pose_of(
                 needed = min(needed, np.log(1 - _CERTAIN) / np.log(1 - good))
     if most < 6:
         return None
-    pose, covariance = _refined(sighted.take(_inliers(sighted, best)), best, start=start, prior=prior)
+    pose, covariance = _refine(sighted.take(_inliers(sighted, best)), best, start=start, prior=prior)
     inliers = _inliers(sighted, pose)
     if np.count_nonzero(inliers) < 6:
         return None
-    pose, covariance = _refined(sighted.take(inliers), pose, start=start, prior=prior)
+    pose, covariance = _refine(sighted.take(inliers), pose, start=start, prior=prior)
     return pose, _inliers(sighted, pose), covariance
 
 
@@ -150,7 +150,7 @@ def _inliers(sighted: Sighted, pose: Float) -> Bools:
     return inliers
 
 
-def _refined(sighted: Sighted, pose: Float, *, start: Float, prior: Float | None) -> tuple[Float, Float]:
+def _refine(sighted: Sighted, pose: Float, *, start: Float, prior: Float | None) -> tuple[Float, Float]:
     """The pose of least errors next to one, and its covariance; see `pose_of`."""
     across, covariance = tangents(sighted.bearing), np.eye(6)
     given = np.diag(prior**-2) if prior is not None else 1e-9 * np.eye(6)
@@ -160,7 +160,7 @@ def _refined(sighted: Sighted, pose: Float, *, start: Float, prior: Float | None
         unit = seen[:, :, None] / distance
         flat = (np.eye(3) - unit @ np.swapaxes(unit, 1, 2)) / distance
         front = np.swapaxes(across, 1, 2) @ flat * weight[:, None, None]
-        jacobian = np.concatenate([front @ _skewed(seen), -front], axis=2)
+        jacobian = np.concatenate([front @ _skew(seen), -front], axis=2)
         robust = 1.0 / (1.0 + (errors**2).sum(axis=1))
         information = np.einsum("nij,n,nik->jk", jacobian, robust, jacobian)
         wanted = np.einsum("nij,n,ni->j", jacobian, robust, errors)
@@ -177,7 +177,7 @@ def _refined(sighted: Sighted, pose: Float, *, start: Float, prior: Float | None
     return pose, covariance
 
 
-def _skewed(vectors: Float) -> Float:
+def _skew(vectors: Float) -> Float:
     """Matrices (n, 3, 3) of the cross products with vectors (n, 3)."""
     out = np.zeros((len(vectors), 3, 3))
     x, y, z = vectors.T
@@ -215,7 +215,7 @@ def two_view_pose(first: Float, second: Float, *, sigma: float) -> tuple[Float, 
     return pose, inliers
 
 
-def triangulated(first: Float, second: Float, *, pose: Float, sigma: Float) -> tuple[Float, Float]:
+def triangulate(first: Float, second: Float, *, pose: Float, sigma: Float) -> tuple[Float, Float]:
     """Distances (n,) of points from the first view, and their standard deviations over them.
 
     first, second : (n, 3) bearings in each view

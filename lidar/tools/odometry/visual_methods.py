@@ -13,14 +13,14 @@ from lidar.dataset.recorded import Stream, color_images
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.estimate import MotionEstimate, propagated
+from lidar.tools.odometry.estimate import MotionEstimate, propagate
 from lidar.tools.odometry.feature_depths import laser_distances, stereo_distances
 from lidar.tools.odometry.features import ImageFeatures, camera_of, read_features
 from lidar.tools.odometry.keyframes import Keyframe, close_loops
 from lidar.tools.odometry.scans import SweepSequence, scans_of
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import scaled_motion
-from lidar.tools.odometry.visual_tracking import ENOUGH, FeatureDepths, Tracked, tracked
+from lidar.tools.odometry.visual_tracking import ENOUGH, FeatureDepths, Tracked, track_camera
 
 VISUAL_METHODS = ("orb", "orb+depth", "stereo")
 """Methods by their names."""
@@ -54,7 +54,7 @@ def visual_odometry(
         measure = _by_laser(scans, images, camera=camera, settings=settings)
     elif other is not None:
         measure = _by_stereo(images, other, settings=settings)
-    found = tracked(images, camera, measure=measure, settings=settings, progress=progress)
+    found = track_camera(images, camera, measure=measure, settings=settings, progress=progress)
     corrected = np.array([frame.pose for frame in found.keyframes])
     if found.loops:
         corrected = close_loops(found.keyframes, found.loops)
@@ -63,7 +63,7 @@ def visual_odometry(
     scale = "measured distances"
     if measure is None:
         factors, scale = _scale_by_road(found, images, height=float(mount[2, 3]))
-        poses = _rescaled(poses, factors[found.reference])
+        poses = _rescale(poses, factors[found.reference])
     back = np.asarray(np.linalg.inv(mount), float)
     vehicle = mount @ np.linalg.inv(poses[0]) @ poses @ back
     report = {
@@ -83,7 +83,7 @@ def visual_odometry(
     covariance = _of_vehicle(found.covariance[1:], back=back)
     sigma = step_sigma = None
     if measure is not None:
-        sigma, step_sigma = propagated(vehicle, covariance), np.sqrt(np.einsum("nii->ni", covariance))
+        sigma, step_sigma = propagate(vehicle, covariance), np.sqrt(np.einsum("nii->ni", covariance))
     quality = {"matches": found.matched, "inliers": found.inliers}
     return MotionEstimate(images.time_ns, vehicle, sigma, step_sigma, quality, report)
 
@@ -189,7 +189,7 @@ def _below(frame: Keyframe, *, turn: Float, height: float) -> Float:
     return below
 
 
-def _rescaled(poses: Float, factor: Float) -> Float:
+def _rescale(poses: Float, factor: Float) -> Float:
     """Poses whose steps are longer by factors (n,), those of the later poses."""
     step = np.diff(poses[:, :3, 3], axis=0) * factor[1:, None]
     out = poses.copy()

@@ -22,7 +22,7 @@ from lidar.tools.odometry.deskewing import still
 from lidar.tools.odometry.features import ImageFeatures, matches, read_features
 from lidar.tools.odometry.keyframes import Keyframe, refine_window
 from lidar.tools.odometry.settings import OdometrySettings
-from lidar.tools.odometry.view_geometry import Sighted, pose_of, scaled_motion, triangulated, two_view_pose
+from lidar.tools.odometry.view_geometry import Sighted, pose_of, scaled_motion, triangulate, two_view_pose
 
 ENOUGH = 15
 """Inliers from which a pose is that of the image."""
@@ -78,11 +78,11 @@ def _at_start(features: ImageFeatures, distance: Float, *, motion: Float) -> tup
     local = np.where(known, distance, 1.0)[:, None] * features.bearing
     moved = still(local, features.seconds, motion=motion)
     length = np.linalg.norm(moved, axis=1)
-    bearing = np.where(known[:, None], moved / length[:, None], _turned(features, motion))
+    bearing = np.where(known[:, None], moved / length[:, None], _turn(features, motion))
     return replace(features, bearing=bearing), np.where(known, length, np.nan)
 
 
-def tracked(
+def track_camera(
     images: Stream,
     camera: CameraSpec,
     *,
@@ -155,7 +155,7 @@ def tracked(
         first_pair = measure is None and unknown and good.any()
         if (inliers[row] < settings.keyframe_matches * best and (measure or not unknown)) or first_pair:
             frame = _keyframe(row, features, pose=pose, rate=rate, measure=measure, tracks=tracks)
-            _linked(frame, last, rows=rows[good], mine=mine[good], sigma=settings.pixel / camera.fx)
+            _link(frame, last, rows=rows[good], mine=mine[good], sigma=settings.pixel / camera.fx)
             frame.way = last.way + float(np.linalg.norm(pose[:3, 3] - last.pose[:3, 3]))
             tracks = int(frame.track.max(initial=tracks - 1)) + 1
             keyframes.append(frame)
@@ -240,14 +240,14 @@ def _keyframe(
     return Keyframe(row, pose, features, distance, fuzz, known, track)
 
 
-def _linked(frame: Keyframe, last: Keyframe, *, rows: Ints, mine: Ints, sigma: float) -> None:
+def _link(frame: Keyframe, last: Keyframe, *, rows: Ints, mine: Ints, sigma: float) -> None:
     """Give the features of a keyframe the points of the map that they match, and new ones distances."""
     frame.track[mine] = last.track[rows]
     pose = np.linalg.inv(last.pose) @ frame.pose
     lack = ~np.isfinite(last.distance[rows])
     if lack.any():
         here, there = last.features.bearing[rows[lack]], frame.features.bearing[mine[lack]]
-        distance, fuzz = triangulated(here, there, pose=pose, sigma=np.full(len(here), sigma))
+        distance, fuzz = triangulate(here, there, pose=pose, sigma=np.full(len(here), sigma))
         turned = np.einsum("ni,ni->n", here, there @ pose[:3, :3].T)
         wide = (np.arccos(np.clip(turned, -1, 1)) > _FIRST_ANGLE) & (fuzz < 0.3)
         last.distance[rows[lack]] = np.where(wide, distance, np.nan)
@@ -338,7 +338,7 @@ def _loops(
     return []
 
 
-def _turned(features: ImageFeatures, motion: Float) -> Float:
+def _turn(features: ImageFeatures, motion: Float) -> Float:
     """Bearings (n, 3) at the frame's start: rows exposed later are turned back.
 
     motion : (4, 4) of the camera in a second

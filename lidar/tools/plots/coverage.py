@@ -20,7 +20,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.options import PlotOptions
 from lidar.tools.maps.colors import ramp
-from lidar.tools.plots.drawn import Drawn, plain, thinned
+from lidar.tools.plots.drawn import Drawn, plain, thin
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
@@ -74,9 +74,7 @@ def coverage(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> D
             np.add.at(counts, y * wide + x, np.uint32(1))
     if not counts.any():
         raise DatasetError(f"{dataset.path}: no returns in these frames of {', '.join(names)}")
-    grid, first = _cropped(
-        counts.reshape(tall, wide), first.astype(np.int64), track=trajectory.position / side
-    )
+    grid, first = _crop(counts.reshape(tall, wide), first.astype(np.int64), track=trajectory.position / side)
     if options.resolution is None:
         wanted = next((s for s in _SIDES if s >= side and max(grid.shape) * side / s <= _ACROSS), _SIDES[-1])
         grid, first = _coarser(grid, first, factor=round(wanted / side))
@@ -84,7 +82,7 @@ def coverage(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> D
     return _drawn(grid, corner=first.astype(float) * side, side=side, trajectory=trajectory, names=names)
 
 
-def _cropped(grid: Counts, first: Ints, *, track: Float) -> tuple[Counts, Ints]:
+def _crop(grid: Counts, first: Ints, *, track: Float) -> tuple[Counts, Ints]:
     """The part of counts (h, w) that holds all of them and a track (n, 2 or more), and its first cell (x, y).
 
     first : cell (2,) of the grid's first column and row
@@ -137,7 +135,7 @@ def _drawn(grid: Counts, *, corner: Float, side: float, trajectory: Trajectory, 
         (float(south), float(north)),
         scale=by_density,
         square=True,
-        lines=[Series("path of the vehicle", thinned(*trajectory.position[:, :2].T), color=(200, 40, 30))],
+        lines=[Series("path of the vehicle", thin(*trajectory.position[:, :2].T), color=(200, 40, 30))],
     )
     wide, tall = float(east - west), float(north - south)
     width = min(820, round(820 * wide / tall)) if tall > wide else 820

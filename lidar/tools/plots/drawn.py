@@ -42,7 +42,7 @@ def whole(value: float) -> str:
     return f"{value:g}" if value == round(value) else ""
 
 
-def counted(value: float) -> str:
+def format_count(value: float) -> str:
     """The text of a count on an axis."""
     return f"{value:,.0f}" if value >= 1 else f"{value:g}"
 
@@ -52,7 +52,7 @@ def class_name(code: int) -> str:
     return Class(code).name.lower().replace("_", " ")
 
 
-def thinned(x: NDArray[np.floating], y: NDArray[np.floating]) -> list[tuple[float, float]]:
+def thin(x: NDArray[np.floating], y: NDArray[np.floating]) -> list[tuple[float, float]]:
     """Points (n,) of a line; of a long one the lowest and highest of each of 2000 parts, in order."""
     if len(x) > 4 * _MOST:
         edges = np.linspace(0, len(x), _MOST + 1).astype(np.int64)

@@ -15,7 +15,7 @@ from lidar.dataset.navigation_files import read_fixes
 from lidar.errors import DatasetError, InputError
 from lidar.options import PlotOptions
 from lidar.sensors.navigation.gnss import Fixes, fix_variances
-from lidar.tools.plots.drawn import WIDE, Drawn, plain, thinned
+from lidar.tools.plots.drawn import WIDE, Drawn, plain, thin
 
 _DIRECTIONS = ("east", "north", "up")
 
@@ -46,14 +46,14 @@ def gnss(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn
         parts.append(
             Panel(
                 Axes(title, "time since the start, s", f"{direction}, m", plain),
-                [Series(f"error {direction}", thinned(seconds, error[:, k]), color=COLORS[k])],
+                [Series(f"error {direction}", thin(seconds, error[:, k]), color=COLORS[k])],
                 x_log=False,
                 y_log=False,
                 bands=[ShadedBand("± 1 sigma, as stated", band)],
                 x_ends=ends,
             )
         )
-    used = Series("satellites used", thinned(seconds, fixes.satellites.astype(float)), color=COLORS[5])
+    used = Series("satellites used", thin(seconds, fixes.satellites.astype(float)), color=COLORS[5])
     axes = Axes("", "time since the start, s", "satellites", plain)
     parts.append(Panel(axes, [used], x_log=False, y_log=False, x_ends=ends))
     numbers: dict[str, object] = {"receiver": name, "epochs": len(fixes), "fixes": int(known.sum())}

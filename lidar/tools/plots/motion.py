@@ -9,7 +9,7 @@ from geoscene.drawing.panels import Panel, Series, figure
 from geoscene.support.progress import Progress
 from lidar.dataset.layout import Dataset
 from lidar.options import PlotOptions
-from lidar.tools.plots.drawn import WIDE, Drawn, plain, thinned
+from lidar.tools.plots.drawn import WIDE, Drawn, plain, thin
 
 _SMOOTHED_S = 0.1
 """Seconds over which accelerations are differences."""
@@ -37,14 +37,14 @@ def speed(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Draw
     parts = [
         Panel(
             Axes(f"Speed: {about}", "time since the start, s", "m/s", plain),
-            [Series("speed", thinned(seconds, fast), color=COLORS[1])],
+            [Series("speed", thin(seconds, fast), color=COLORS[1])],
             x_log=False,
             y_log=False,
             x_ends=ends,
         ),
         Panel(
             Axes("Acceleration of the vehicle's reference point", "time since the start, s", "m/s^2", plain),
-            [Series("forward", thinned(seconds, along)), Series("to the left", thinned(seconds, across))],
+            [Series("forward", thin(seconds, along)), Series("to the left", thin(seconds, across))],
             x_log=False,
             y_log=False,
             x_ends=ends,

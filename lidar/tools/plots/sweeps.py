@@ -29,7 +29,7 @@ from lidar.tools.plots.drawn import (
     WIDE,
     Drawn,
     class_name,
-    counted,
+    format_count,
     most_frequent,
     outline,
     plain,
@@ -206,7 +206,7 @@ def intensity(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> 
         f"Intensities of {about}",
         "intensity (0 to 100: diffuse reflectivity in per cent; above: retro-reflectors)",
         "returns per sweep and unit",
-        counted,
+        format_count,
     )
     panel = Panel(axes, series, x_log=False, x_ends=(0, 256), floor=True)
     named = ", ".join(f"{name} {mean:.0f}" for name, mean in list(means.items())[:5])
@@ -243,7 +243,7 @@ def returns(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Dr
     about = f"{clouds.name}, {sweeps} sweeps, {total / sweeps:,.0f} returns per sweep"
 
     def panel(title: str, series: list[Series]) -> Panel:
-        axes = Axes(title, "range, m", f"returns per sweep in {step:g} m", counted)
+        axes = Axes(title, "range, m", f"returns per sweep in {step:g} m", format_count)
         return Panel(axes, series, x_log=False, x_ends=(0.0, float(edges[-1])), floor=True)
 
     parts = [panel(f"Returns by range of {about}", _by_class(counts, edges=edges, per=sweeps))]

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar.geometry.random_streams import generator
 from lidar.tools.defences.calibration import Calibration, tail_of
-from lidar.tools.defences.fusion import FUSED, fused
+from lidar.tools.defences.fusion import FUSED, fuse_verdicts
 from lidar.tools.defences.scores import Score, SuspicionCounts, score, threshold_at
 from lidar.tools.defences.verdict import Verdict
 from lidar.tools.redteam.measure import FEWEST, is_attacked
@@ -147,10 +147,10 @@ class Matrix:
         )
 
 
-def evaluated(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure: Measure) -> Matrix:
+def evaluate(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure: Measure) -> Matrix:
     """The matrix of drives with and without attack; attacks by goal, the most successful first."""
     found = Matrix([], [], [], [])
-    figures = _with_fused(figures, block=measure.block)
+    figures = _add_fused(figures, block=measure.block)
     thresholds = _thresholds(figures, measure=measure)
     for setting, scene, drives in _groups(figures):
         plain = [one for one in drives if one.run.attack is None]
@@ -215,7 +215,7 @@ def _clear(figures: Iterable[Figures]) -> dict[str, list[Figures]]:
     }
 
 
-def _with_fused(figures: Sequence[Figures], *, block: float) -> list[Figures]:
+def _add_fused(figures: Sequence[Figures], *, block: float) -> list[Figures]:
     """The drives with the verdict of all defences together as one more, if there are several."""
     calibrations = {}
     for key, drives in _clear(figures).items():
@@ -243,7 +243,7 @@ def _fused_frame(frame: Mapping[str, Any], calibration: Calibration) -> dict[str
             verdicts[name] = Verdict(None, None if objects is None else np.array(objects, float), suspicion)
     if len(verdicts) < 2:
         return dict(frame)
-    found = fused(verdicts, calibration, rule="harmonic")
+    found = fuse_verdicts(verdicts, calibration, rule="harmonic")
     objects = {} if found.objects is None else {FUSED: found.objects.tolist()}
     return {
         **frame,

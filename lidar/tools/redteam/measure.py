@@ -68,7 +68,7 @@ class AttackCase:
     detector: str = RULES.name
 
 
-def measured(case: AttackCase) -> dict[str, Any]:
+def measure_drive(case: AttackCase) -> dict[str, Any]:
     """The figures of a drive; from the file if it has them of the same drive, twin and defences.
 
     ``frames`` has a row for each frame of each scanner; in a drive with an attack, those that it leaves as
@@ -159,9 +159,9 @@ def _frames(
             figures |= changes[row]
         if rows is None or row in rows:
             users = _users(dataset, name, frame=frame.number)
-            matched = _matched(frame, users)
+            matched = _match(frame, users)
             truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
-            forged = truth.objects(frame.members) | _near(frame, _placed(users))
+            forged = truth.objects(frame.members) | _near(frame, _place(users))
             figures["objects"] = _objects(frame, forged=forged, matched=matched)
             if twin is None:
                 figures["users"] = _found(frame, users)
@@ -179,7 +179,7 @@ def is_attacked(frame: Mapping[str, Any]) -> bool:
 def _change(scans: RecordedScans, twin: RecordedScans, *, row: int) -> dict[str, Any]:
     """What an attack did to the returns, the images and the fixes of a frame, against its twin without it."""
     frame, other, name = scans.frame(row), twin.frame(row), scans.sensor.name
-    placed = _placed(_users(scans.dataset, name, frame=frame.number))
+    placed = _place(_users(scans.dataset, name, frame=frame.number))
     truth, before = (
         frame_truth(of.dataset, name, frame=frame.number, count=len(each))
         for of, each in ((scans, frame), (twin, other))
@@ -193,7 +193,7 @@ def _change(scans: RecordedScans, twin: RecordedScans, *, row: int) -> dict[str,
     }
 
 
-def _placed(users: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _place(users: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Objects that an attacker placed and that the scanner sees."""
     return [user for user in users if user["kind"] == PLACED and user["points"] > 0]
 
@@ -222,7 +222,7 @@ def _hidden(
     """
     name, number = scans.sensor.name, int(scans.frames[row])
     users = _users(twin.dataset, name, frame=number)
-    taken, before = (_removed(of.dataset.paths.truth(name, number)) for of in (scans, twin))
+    taken, before = (_remove(of.dataset.paths.truth(name, number)) for of in (scans, twin))
     robbed = set()
     for user in users:
         returns, feature = int(user["points"]), int(user["instance"])
@@ -232,11 +232,11 @@ def _hidden(
     if not robbed:
         return {"targets": 0, "hidden": 0}
     frame = twin.frame(row)
-    targets = robbed & set(_matched(frame, users)[frame.objects.score >= score].tolist())
+    targets = robbed & set(_match(frame, users)[frame.objects.score >= score].tolist())
     return {"targets": len(targets), "hidden": len(targets - found)}
 
 
-def _removed(path: Path) -> NDArray[np.int32]:
+def _remove(path: Path) -> NDArray[np.int32]:
     """Features (k,) of the returns that stages removed or moved."""
     if not path.exists():
         return np.empty(0, np.int32)
@@ -263,7 +263,7 @@ def _users(dataset: Dataset, sensor: str, *, frame: int) -> list[dict[str, Any]]
     return read_boxes(path, _COLUMNS) if path.exists() else []
 
 
-def _matched(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Ints:
+def _match(frame: Observation, users: Sequence[Mapping[str, Any]]) -> Ints:
     """Number of the road user that each box of the detector is of; -1 for none.
 
     A box is of the nearest road user of its kind that no better one is of. Both are compared at the time of

@@ -14,11 +14,11 @@ from geoscene.support.progress import Progress, silent
 from lidar.errors import InputError, LidarError
 from lidar.tools.detection import RULES
 from lidar.tools.detection.registry import read_detector
-from lidar.tools.redteam.evaluate import Figures, Matrix, evaluated
-from lidar.tools.redteam.measure import AttackCase, measured
+from lidar.tools.redteam.evaluate import Figures, Matrix, evaluate
+from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import RedteamPlan, Run, read_plan
 from lidar.tools.redteam.report import write_report
-from lidar.tools.sweep.run import recorded
+from lidar.tools.sweep.run import record_drives
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +58,7 @@ def redteam(
         raise InputError(f"{folder}: is not empty and no matrix; give another directory")
     with exclusive(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        swept = recorded(
+        swept = record_drives(
             [run.drive for run in plan.runs],
             folder / "drives",
             source=Path(file).name,
@@ -73,7 +73,7 @@ def redteam(
                 failed[run.drive.name] = result
             else:
                 figures.append(result)
-        matrix = evaluated(figures, plan.attacks, measure=plan.measure)
+        matrix = evaluate(figures, plan.attacks, measure=plan.measure)
         summary = RedTeamSummary(
             folder, tuple(dict.fromkeys(one.run.drive.name for one in figures)), failed, matrix
         )
@@ -99,7 +99,7 @@ def _results(
     several = len(plan.measure.detector) > 1
     found: dict[int, Figures | str] = {}
     progress("defences", 0, total=len(tasks))
-    for row, frames, absent, error in run_tasks(_measured, tasks, workers=workers):
+    for row, frames, absent, error in run_tasks(_measure, tasks, workers=workers):
         run, name = both[row]
         found[row] = error or Figures(run, frames, absent, name if several else "")
         progress("defences", len(found), total=len(tasks))
@@ -129,10 +129,10 @@ def _case(run: Run, detector: str, *, plan: RedteamPlan, folder: Path) -> Attack
     )
 
 
-def _measured(task: _Task) -> tuple[int, list[dict[str, object]], list[str], str]:
+def _measure(task: _Task) -> tuple[int, list[dict[str, object]], list[str], str]:
     """Number, rows of the frames, defences without data, and the error of a drive. Run by workers."""
     try:
-        document = measured(task.case)
+        document = measure_drive(task.case)
     except (GeosceneError, LidarError, OSError) as error:
         return task.row, [], [], " ".join(str(error).split())
     except Exception as error:  # one drive's defect must not end the others

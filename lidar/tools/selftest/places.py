@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pyproj import Geod, Transformer
 
-from geoscene.geometry.frames import Frame, utm_crs, wrapped
+from geoscene.geometry.frames import Frame, utm_crs, wrap_longitude
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
@@ -170,7 +170,9 @@ def write_hamlet(frame: Frame, path: Path, *, reach: float) -> None:
 
     def place(x: float, y: float) -> int:
         lon, lat = frame.to_geographic(x, y)
-        nodes.append(f'<node id="{len(nodes) + 1}" lon="{wrapped(float(lon)):.9f}" lat="{float(lat):.9f}"/>')
+        nodes.append(
+            f'<node id="{len(nodes) + 1}" lon="{wrap_longitude(float(lon)):.9f}" lat="{float(lat):.9f}"/>'
+        )
         return len(nodes)
 
     def way(corners: list[int], **tags: str) -> None:

@@ -118,7 +118,7 @@ def leaks(count: int) -> float:
     return lost
 
 
-def pierced(count: int) -> float:
+def pierce(count: int) -> float:
     """Rays from outside, at vertices and edges of a ball, that hit a second ball 0.5 m within."""
     vertices, faces = ball(5, radius=10.0)
     inner, more = ball(5, radius=9.5)
@@ -256,7 +256,7 @@ CASES = (
         "leaks into a solid at edges and vertices, origin 0 to 10 km away",
         0,
         "rays",
-        pierced,
+        pierce,
         "rays",
         90_000,
         10**7,

@@ -12,7 +12,7 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.random_streams import generator, normal_of, uniform_of
 from lidar.sensors.navigation.gnss import gauss_markov
 from lidar.sensors.navigation.imu import inertial_noise
-from lidar.sensors.physics.detector import Deviates, detected, measured_range, received
+from lidar.sensors.physics.detector import Deviates, detect_echoes, measured_range, receive
 from lidar.sensors.physics.echoes import Echoes, artificial_echoes
 from lidar.sensors.physics.link import daylight_noise, detection_probability, noise_of
 from lidar.sensors.physics.range_error import signal_sigma, stretch_sigma
@@ -180,7 +180,7 @@ def constant_range_noise(count: int) -> float:
 
 def signal_range_noise(count: int) -> float:
     """Moments of the range noise that depends on the received power."""
-    power = float(received(_SENSOR, _echoes(1, apparent=_APPARENT))[0])
+    power = float(receive(_SENSOR, _echoes(1, apparent=_APPARENT))[0])
     sigma = float(np.hypot(_SENSOR.range_sigma, signal_sigma(max(power, 1.0), _SENSOR.weak_sigma)))
     return _noisy_ranges(count, settings=ScannerSettings(range_noise="signal"), sigma=sigma)
 
@@ -193,7 +193,7 @@ def slant_range_noise(count: int) -> float:
 
 def detection_rate(count: int) -> float:
     """Deviation of the share of detected echoes from its probability, within 2 sigmas of the threshold."""
-    settings, unit = ScannerSettings(detection=True), float(received(_SENSOR, _echoes(1, apparent=1.0))[0])
+    settings, unit = ScannerSettings(detection=True), float(receive(_SENSOR, _echoes(1, apparent=1.0))[0])
     noise, worst = daylight_noise(_SENSOR.noise_ratio, settings.daylight_lux), 0.0
     steps = np.arange(-2.0, 3.0) * float(noise_of(1.0, noise, signal_noise=_SENSOR.signal_noise))
     for row, power in enumerate((1 + steps).tolist()):
@@ -201,7 +201,7 @@ def detection_rate(count: int) -> float:
         seen, drawn = 0, 0
         for k, size in batches(count // len(steps)):
             sent = _echoes(size, apparent=power / unit)
-            seen += len(detected(_SENSOR, sent, settings=settings, deviates=_deviates(row, k)))
+            seen += len(detect_echoes(_SENSOR, sent, settings=settings, deviates=_deviates(row, k)))
             drawn += size
         worst = max(worst, abs(seen - chance * drawn) / float(np.sqrt(drawn * chance * (1 - chance))))
     return worst

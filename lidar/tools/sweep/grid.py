@@ -141,7 +141,7 @@ def _drive(
         if not isinstance(scene, str):
             raise InputError("scene: give the directory of a scene, a map, or the name of a table [[map]]")
         words = [word for key, value in values.items() for word in words_of(key, value)]
-        options, wanted = _parsed(words)
+        options, wanted = _parse(words)
         _check(options)
         options = _with_absolute_paths(options)
         if wanted.profile_cache:
@@ -161,7 +161,7 @@ def _slug(text: str) -> str:
     return f"{plain}-{hashlib.blake2b(text.encode(), digest_size=3).hexdigest()}"
 
 
-def _parsed(words: list[str]) -> tuple[DriveOptions, AccuracyOptions]:
+def _parse(words: list[str]) -> tuple[DriveOptions, AccuracyOptions]:
     """Options from words of a command line."""
     app = App(default_parameter=DEFAULTS, help_flags=(), version_flags=())
 

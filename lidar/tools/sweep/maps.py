@@ -129,7 +129,7 @@ def _map(name: str, table: dict[str, Any]) -> MapScene:
             raise InputError("bbox: give [W, S, E, N] in degrees")
         bounds = (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))
     words = [word for key, value in table.items() for word in words_of(key, value)]
-    options = _parsed(words)
+    options = _parse(words)
     along = options.along if len(options.along) == 1 else ()  # several are waypoints
     dem = () if options.elevation_tiles else options.dem
     for file in (*files, *dem, *along):
@@ -141,7 +141,7 @@ def _map(name: str, table: dict[str, Any]) -> MapScene:
     return MapScene(name, tuple(Path(file).absolute() for file in files), bounds, options)
 
 
-def _parsed(words: list[str]) -> BuildOptions:
+def _parse(words: list[str]) -> BuildOptions:
     """Options of a build from words of a command line."""
     app = App(default_parameter=DEFAULTS, help_flags=(), version_flags=())
 

@@ -18,7 +18,7 @@ from geoscene import __version__
 from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
-from geoscene.support.cluster import DaskCluster, connected
+from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import digest_of, exclusive, write_json
 from geoscene.support.processes import run_tasks
@@ -28,7 +28,7 @@ from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError, LidarError
 from lidar.options import DriveOptions
 from lidar.tools.sweep.grid import GridDrive, read_grid
-from lidar.tools.tradeoff.accuracy import Pick, driven, picked
+from lidar.tools.tradeoff.accuracy import Pick, driven, pick_settings
 
 log = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ def sweep(
 
     Raises InputError for a file with an error, before the first drive starts.
     """
-    return recorded(
+    return record_drives(
         read_grid(Path(file)),
         Path(out),
         source=Path(file).name,
@@ -117,7 +117,7 @@ def sweep(
     )
 
 
-def recorded(
+def record_drives(
     drives: Sequence[GridDrive],
     folder: Path,
     *,
@@ -135,7 +135,7 @@ def recorded(
         raise InputError(f"`workers` {workers}: give 1 to 256")
     if folder.exists() and not (folder.is_dir() and (_is_sweep(folder) or not any(folder.iterdir()))):
         raise InputError(f"{folder}: is not empty and no sweep; give another directory")
-    with connected(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
+    with connect(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
         folder.mkdir(parents=True, exist_ok=True)
         if cluster is not None:
             inputs = dict.fromkeys(path for planned in drives for path in planned.inputs)
@@ -221,7 +221,7 @@ def _with_pick(task: _Task, *, progress: Progress) -> _Task:
     options = replace(planned.options, workers=task.threads)
     out = None if task.overwrite else task.folder / planned.name
     with using(open_scene(planned.scene), known=LidarError) as scene:
-        pick = picked(scene, options, wanted=planned.wanted, out=out, progress=progress)
+        pick = pick_settings(scene, options, wanted=planned.wanted, out=out, progress=progress)
     return replace(task, pick=pick and replace(pick, planned=None))
 
 
@@ -230,11 +230,11 @@ def _results(
 ) -> Iterator[tuple[int, DriveRow]]:
     """Rows of the table as the drives end, with their numbers."""
     if cluster is not None:
-        yield from cluster.run_tasks(_recorded, tasks)
+        yield from cluster.run_tasks(_record_drive, tasks)
         return
     waiting = {task.row: task for task in tasks}
     try:
-        for row, result in run_tasks(_recorded, tasks, workers=workers):
+        for row, result in run_tasks(_record_drive, tasks, workers=workers):
             del waiting[row]
             yield row, result
     except (
@@ -242,12 +242,12 @@ def _results(
     ):  # one at a time needs the least memory, and shows which drives cannot be recorded
         for task in waiting.values():
             try:
-                yield from run_tasks(_recorded, [task], workers=1)
+                yield from run_tasks(_record_drive, [task], workers=1)
             except WorkersLostError as error:
                 yield task.row, DriveRow(task.drive.name, "failed", str(error))
 
 
-def _recorded(task: _Task) -> tuple[int, DriveRow]:
+def _record_drive(task: _Task) -> tuple[int, DriveRow]:
     """Record a drive; its row of the table. Run by workers."""
     name, out = task.drive.name, task.folder / task.drive.name
     options = replace(task.drive.options, workers=task.threads)

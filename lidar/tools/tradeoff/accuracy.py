@@ -177,7 +177,7 @@ class CheckedDrive:
         return lines
 
 
-def picked(
+def pick_settings(
     scene: Scene,
     options: DriveOptions,
     *,
@@ -210,15 +210,15 @@ def picked(
     by = Wanted(asked, workers=options.workers, given=given, free=free)
     planned = None
     if wanted.budget:
-        planned = _planned(scene, options, profile=profile, progress=progress)
+        planned = _plan(scene, options, profile=profile, progress=progress)
         by = replace(by, budget=wanted.budget, pace=pace_of(planned, wanted.budget))
     chosen = choice(profile, by)
     percent = asked.percent if asked else _PERCENT
     expected = stated(chosen.errors, percent=percent, kinds=kinds_of(asked))
-    return Pick(_asked(wanted), chosen.settings, expected, chosen, profile, planned)
+    return Pick(_request(wanted), chosen.settings, expected, chosen, profile, planned)
 
 
-def _planned(scene: Scene, options: DriveOptions, *, profile: Profile, progress: Progress) -> Planned:
+def _plan(scene: Scene, options: DriveOptions, *, profile: Profile, progress: Progress) -> Planned:
     """The plan of a drive, and what it and loading cost."""
     began, cpu_began = time.perf_counter(), time.process_time()
     plan = plan_drive(scene, options, progress=progress)
@@ -326,7 +326,7 @@ def driven(
     return CheckedDrive(summary, wanted, pick, found[0] if found else None)
 
 
-def _asked(wanted: AccuracyOptions) -> dict[str, str]:
+def _request(wanted: AccuracyOptions) -> dict[str, str]:
     texts = {"accuracy": wanted.accuracy.strip(), "budget": wanted.budget.strip()}
     return {name: text for name, text in texts.items() if text}
 
@@ -336,7 +336,7 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
     if not Paths(out).manifest.exists():
         return None
     notes = open_dataset(out).manifest.get("accuracy", {})
-    if notes.get("asked") != _asked(wanted):
+    if notes.get("asked") != _request(wanted):
         return None
     try:
         settings = {str(name): int(value) for name, value in notes["picked"].items()}

@@ -210,12 +210,12 @@ def estimates(
     frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
 ) -> dict[str, ErrorEstimate]:
     """All figures of an error, with intervals by resampling frames; none without frames."""
-    return resampled(
+    return resample(
         frames, seed=seed, figures=lambda of: {name: figure(of) for name, figure in statistics.items()}
     )
 
 
-def resampled(
+def resample(
     frames: Sequence[E], *, seed: int, figures: Callable[[Sequence[E]], Mapping[str, float]]
 ) -> dict[str, ErrorEstimate]:
     """Figures of frames with 95 % intervals by resampling these; not those that are NaN.

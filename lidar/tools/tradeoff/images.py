@@ -89,7 +89,7 @@ def coarse(camera: CameraSpec, resolution: int) -> CameraSpec:
 
 def image(shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1) -> CameraImage:
     """The whole frame."""
-    return _rendered(shot, coarse(shot.camera.spec, resolution), world=world, settings=settings)
+    return _render(shot, coarse(shot.camera.spec, resolution), world=world, settings=settings)
 
 
 def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) -> Ints:
@@ -109,7 +109,7 @@ def strip(shot: Shot, *, world: World, settings: CameraSettings, top: int, heigh
     """The rows of a frame from ``top`` on."""
     spec = shot.camera.spec
     window = replace(spec, height=height, cy=spec.cy - top)
-    return _rendered(shot, window, world=world, settings=settings, top=top)
+    return _render(shot, window, world=world, settings=settings, top=top)
 
 
 def pixels(
@@ -125,7 +125,7 @@ def pixels(
         width = min(left + size + beside, spec.width) - x
         height = min(top + size + beside, spec.height) - y
         window = replace(spec, width=width, height=height, cx=spec.cx - x, cy=spec.cy - y)
-        frame = _rendered(shot, window, world=world, settings=settings, top=y)
+        frame = _render(shot, window, world=world, settings=settings, top=y)
         own = np.s_[top - y : top - y + size, left - x : left - x + size]
         rgb.append(np.zeros((size, size, 3), np.uint8) if frame.rgb is None else frame.rgb[own])
         depth.append(frame.depth[own])
@@ -133,7 +133,7 @@ def pixels(
     return Pixels(np.stack(rgb), np.stack(depth), np.stack(klass))
 
 
-def _rendered(
+def _render(
     shot: Shot, spec: CameraSpec, *, world: World, settings: CameraSettings, top: int = 0
 ) -> CameraImage:
     """A frame of a camera, or of the part of it that begins at its row ``top``."""
@@ -166,7 +166,7 @@ def image_error(found: Pixels, exact: Pixels) -> ImageError:
     )
 
 
-def encoded(frame: CameraImage, camera: Camera) -> int:
+def encode_images(frame: CameraImage, camera: Camera) -> int:
     """Bytes of the images of a frame as PNG, as a drive writes them; optical flow is left out."""
     images: dict[str, NDArray[np.uint8] | NDArray[np.uint16] | None] = {
         "rgb": frame.rgb,
@@ -183,5 +183,5 @@ def image_cost(
 ) -> tuple[float, int]:
     """CPU seconds of rendering and encoding a whole frame, and the bytes of its images."""
     began = time.process_time()
-    size = encoded(image(shot, world=world, settings=settings, resolution=resolution), shot.camera)
+    size = encode_images(image(shot, world=world, settings=settings, resolution=resolution), shot.camera)
     return time.process_time() - began, size

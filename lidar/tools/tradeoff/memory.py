@@ -16,7 +16,7 @@ from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.tools.tradeoff.images import Shot, encoded, image
+from lidar.tools.tradeoff.images import Shot, encode_images, image
 from lidar.world.actors import Actors, actor_shapes, actor_transforms
 from lidar.world.settings import WorldSettings
 from lidar.world.world import Region, World
@@ -75,7 +75,7 @@ def _growth(task: Task) -> int:
         world.place_actors(shape, transform, feature=feature)
     if isinstance(sensor, Camera) and isinstance(task.settings, CameraSettings):
         shot = Shot(sensor, frame, task.trajectory, task.sun)
-        encoded(image(shot, world=world, settings=task.settings, resolution=task.resolution), sensor)
+        encode_images(image(shot, world=world, settings=task.settings, resolution=task.resolution), sensor)
     elif isinstance(sensor, Scanner) and isinstance(task.settings, ScannerSettings):
         cloud_table(
             scan(

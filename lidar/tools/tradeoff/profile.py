@@ -178,12 +178,12 @@ def profile_of(
         except InputError:  # no room for a drive of this length
             plans = []
         if plans:
-            return _measured(folder, key, ladders=ladders, plans=plans, frames=_FRAMES, progress=progress)
+            return _measure(folder, key, ladders=ladders, plans=plans, frames=_FRAMES, progress=progress)
     key = _key(scene, options, ladders=ladders, own_course=True)
     if stored := _read(folder, key):
         return stored
     plans = [plan_drive(scene, bare, progress=progress)]
-    return _measured(folder, key, ladders=ladders, plans=plans, frames=_DRIVES * _FRAMES, progress=progress)
+    return _measure(folder, key, ladders=ladders, plans=plans, frames=_DRIVES * _FRAMES, progress=progress)
 
 
 def _stands_for(options: DriveOptions) -> bool:
@@ -250,7 +250,7 @@ def _profile(path: Path, document: dict[str, Any]) -> Profile:
     return Profile(path, scanners, cameras, int(document["drives"]), load)
 
 
-def _measured(
+def _measure(
     folder: Path,
     key: dict[str, Any],
     *,

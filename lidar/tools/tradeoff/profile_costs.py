@@ -118,7 +118,7 @@ class _Timing:
             swept(self._plan, scanner, frame=self._frame, world=world, settings=one, pulses=pulses)
 
         return [
-            _timed(partial(sweep, one, rows), warm=partial(sweep, one, rows[:64])) for one in settings
+            _measure_time(partial(sweep, one, rows), warm=partial(sweep, one, rows[:64])) for one in settings
         ], len(rows) / count
 
     def _strips(self, camera: Camera, settings: Sequence[CameraSettings]) -> tuple[list[float], float]:
@@ -131,9 +131,9 @@ class _Timing:
             for top in tops:
                 strip(shot, world=world, settings=one, top=top, height=1)
 
-        return [_timed(partial(rows, one, tops), warm=partial(rows, one, tops[:1])) for one in settings], len(
-            tops
-        ) / height
+        return [
+            _measure_time(partial(rows, one, tops), warm=partial(rows, one, tops[:1])) for one in settings
+        ], len(tops) / height
 
     def _world(self) -> World:
         if isinstance(self._sensor, Scanner):
@@ -144,7 +144,7 @@ class _Timing:
         return seconds * 1e9 / self._sensor.period_ns
 
 
-def _timed(work: Callable[[], None], *, warm: Callable[[], None]) -> float:
+def _measure_time(work: Callable[[], None], *, warm: Callable[[], None]) -> float:
     """CPU seconds of some work after a smaller part of it."""
     warm()
     began = time.process_time()

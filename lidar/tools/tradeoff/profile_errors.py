@@ -14,7 +14,7 @@ from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.errors import E, ErrorEstimate, next_drive, resampled
+from lidar.tools.tradeoff.errors import E, ErrorEstimate, next_drive, resample
 from lidar.tools.tradeoff.sampled_images import image_errors_of, image_figures
 from lidar.tools.tradeoff.sampling import errors_of, places, range_figures
 
@@ -114,7 +114,7 @@ def drive_estimates(
     """
     drives = [[sample for _, sample in of] for _, of in groupby(samples, key=lambda pair: pair[0])]
     if len(drives) == 1:
-        return resampled(drives[0], seed=0, figures=figures)
+        return resample(drives[0], seed=0, figures=figures)
     every = [figures(frames) for frames in drives]
     known = {name: [f[name] for f in every if not math.isnan(f[name])] for name in every[0]}
     return {

@@ -43,7 +43,7 @@ def frame_records(frame: Frame, start: Float, *, end: Float, ranges: Float) -> l
     utm = Frame.at(lon, lat, crs="utm", vertical=frame.vertical)
     rows = [_record("ranges as simulated", ranges, exact=exact)]
     for label, other in ((f"scene ({frame.name})", frame), (f"UTM ({utm.name})", utm)):
-        place = _moved(frame, other)
+        place = _move(frame, other)
         rows.append(_record(label, np.linalg.norm(place(end) - place(start), axis=1), exact=exact))
     east_north_up = _tangent(frame, at=(lon, lat))
     there = east_north_up(end)
@@ -79,7 +79,7 @@ def _space(frame: Frame) -> Placing:
     return place
 
 
-def _moved(frame: Frame, other: Frame) -> Placing:
+def _move(frame: Frame, other: Frame) -> Placing:
     """From points of a frame to those of another; heights stay."""
 
     def place(points: Float) -> Float:

@@ -114,7 +114,7 @@ def errors_of(
         screened = chosen_pulses(count, _SCREENED, frame=frame, seed=seed)
         looks = [frame_returns(settings=replace(plain, rays=rays), pulses=screened) for rays in _SCREENS]
         rng = np.random.default_rng([seed, frame, 1])
-        pulses, weights = _stratified(screened, looks, count=count, rng=rng)
+        pulses, weights = _stratify(screened, looks, count=count, rng=rng)
         exact = reference(plain, rays=REFERENCE_RAYS)
         truth = frame_returns(settings=exact, pulses=pulses, backend=EXACT)
         yield [
@@ -146,7 +146,7 @@ def _returns(
     )
 
 
-def _stratified(
+def _stratify(
     pulses: NDArray[np.int64], looks: Sequence[PulseReturns], *, count: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], Float]:
     """Pulses to compare of some that were cast with different rays, and weights (count,) by row of a pulse.

@@ -53,10 +53,10 @@ class SensorErrors:
         """All of them, in one line; ``are`` is the verb: are, or should be."""
         below = f"{self.percent:g} % of the"
         texts = [
-            f"{below} range errors {are} below {_listed(self.ranges)}" if self.ranges else "",
-            f"{below} depth errors {are} below {_listed(self.depths)}" if self.depths else "",
-            f"colour errors (rms) {are} {_listed(self.colours, size=levels)}" if self.colours else "",
-            f"missed and extra returns {are} {_listed(self.lost, size=share)}" if self.lost else "",
+            f"{below} range errors {are} below {_list_all(self.ranges)}" if self.ranges else "",
+            f"{below} depth errors {are} below {_list_all(self.depths)}" if self.depths else "",
+            f"colour errors (rms) {are} {_list_all(self.colours, size=levels)}" if self.colours else "",
+            f"missed and extra returns {are} {_list_all(self.lost, size=share)}" if self.lost else "",
         ]
         return ", ".join(filter(None, texts)) or "no errors are known"
 
@@ -78,7 +78,7 @@ def error_text(error: ErrorEstimate, *, size: Callable[[float], str] = metres) -
     return f"{size(error.value)} ({size(error.low)} to {size(error.high)})"
 
 
-def _listed(errors: Mapping[str, ErrorEstimate], *, size: Callable[[float], str] = metres) -> str:
+def _list_all(errors: Mapping[str, ErrorEstimate], *, size: Callable[[float], str] = metres) -> str:
     return ", ".join(f"{error_text(error, size=size)} for {name}" for name, error in errors.items())
 
 

@@ -224,11 +224,11 @@ def frame_cost(
     return time.process_time() - began, int(records(table).nbytes)
 
 
-def sampled(plan: DrivePlan, frames: int) -> dict[str, tuple[int, ...]]:
+def sample_frames(plan: DrivePlan, frames: int) -> dict[str, tuple[int, ...]]:
     """Frames spread over a drive, by sensor."""
     return {s.name: spread_frames(plan.frames[s.name], frames) for s in plan.sensors}
 
 
 def bench_of(plan: DrivePlan, others: Sequence[Scene] = (), *, frames: int) -> Bench:
     """The bench of a plan."""
-    return Bench(plan, (plan.scene, *others), sampled(plan, frames))
+    return Bench(plan, (plan.scene, *others), sample_frames(plan, frames))

@@ -10,7 +10,7 @@ from typing import Any
 from geoscene.support.progress import Progress, silent
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.errors import ErrorEstimate, resampled
+from lidar.tools.tradeoff.errors import ErrorEstimate, resample
 from lidar.tools.tradeoff.profile_errors import blocks_of, measuring
 from lidar.tools.tradeoff.sampled_images import image_errors_of, image_figures
 from lidar.tools.tradeoff.sampling import errors_of, places, range_figures
@@ -90,5 +90,5 @@ def spot_check(
     figures = {s.name: range_figures for s in scanners} | {
         c.name: partial(image_figures, camera=c) for c in cameras
     }
-    estimates = {name: resampled(of, seed=0, figures=figures[name]) for name, of in found.items()}
+    estimates = {name: resample(of, seed=0, figures=figures[name]) for name, of in found.items()}
     return SpotCheck(percent, kinds, estimates, {name: len(of) for name, of in found.items()})

@@ -143,10 +143,10 @@ class Basis(Generic[S]):
         values = dict(changes)
         return SettingVariant(
             changes,
-            _changed(self.used, values),
-            _changed(self.exact, values),
-            world=_changed(self.world, values),
-            alone_world=_changed(WHOLE, values),
+            _change(self.used, values),
+            _change(self.exact, values),
+            world=_change(self.world, values),
+            alone_world=_change(WHOLE, values),
             scene=scene,
             traffic=traffic,
         )
@@ -176,7 +176,7 @@ class Basis(Generic[S]):
 _Any = TypeVar("_Any", ScannerSettings, CameraSettings, WorldSettings)
 
 
-def _changed(settings: _Any, values: Mapping[str, Any]) -> _Any:
+def _change(settings: _Any, values: Mapping[str, Any]) -> _Any:
     """Settings with those values that they have."""
     own = {f.name for f in fields(settings)}
     return replace(settings, **{name: value for name, value in values.items() if name in own})

@@ -11,7 +11,7 @@ from typing import IO, Any
 from geoscene.export.files import compact_json
 from geoscene.support.files import atomic_file, exclusive, spool
 from geoscene.support.progress import Progress, silent
-from geoscene.view.assembly import check_page, linked, part, script_text, write_blob, write_page
+from geoscene.view.assembly import check_page, link_credits, part, script_text, write_blob, write_page
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import PlaybackOptions
@@ -103,7 +103,7 @@ def write_player(
     """
     words = {
         "title": html.escape(f"{head['name']}, {', '.join(one['name'] for one in head['scanners'])}"),
-        "credit": linked(str(drive.dataset.manifest.get("attribution", ""))),
+        "credit": link_credits(str(drive.dataset.manifest.get("attribution", ""))),
         "connect": "'self'" if served else "'none'",
         "style": part("page.css", package="lidar.tools.view"),
         "head": script_text(compact_json(head | {"served": served}).decode()),

@@ -100,7 +100,7 @@ def pack_slots(slots: Slots) -> bytes:
         "count": len(slots.time),
         "planes": [n for n, _ in packed],
     }
-    return gzip(_joined(head, b"".join(data for _, data in packed)))
+    return gzip(_join(head, b"".join(data for _, data in packed)))
 
 
 def pack_sweep(
@@ -138,7 +138,7 @@ def pack_sweep(
         sorted_values = values[name][order]
         packed.append(planes(_differences(sorted_values) if name in _DIFFERENCES else sorted_values))
     about = {"count": len(ring), "planes": [n for n, _ in packed], "instances": palette.tolist(), **head}
-    return gzip(_joined(about, b"".join(data for _, data in packed)))
+    return gzip(_join(about, b"".join(data for _, data in packed)))
 
 
 def planes(values: Ints) -> tuple[int, bytes]:
@@ -158,7 +158,7 @@ def _differences(values: Ints) -> Ints:
     return found
 
 
-def _joined(head: dict[str, Any], data: bytes) -> bytes:
+def _join(head: dict[str, Any], data: bytes) -> bytes:
     text = compact_json(head)
     return struct.pack("<I", len(text)) + text + data
 

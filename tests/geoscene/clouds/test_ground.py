@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from geoscene.clouds.ground import (
     MARGIN,
     CloudGrid,
-    bridged,
+    bridge,
     bridged_by_blocks,
     ground_heights,
     ground_returns,
@@ -90,7 +90,7 @@ def test_gaps_in_a_plane_are_bridged_by_the_plane(a, b):
     plane = a * east + b * north
     gappy = plane.copy()
     gappy[20:60, 30:50] = np.nan
-    assert np.abs(bridged(gappy) - plane).max() < 1e-6
+    assert np.abs(bridge(gappy) - plane).max() < 1e-6
 
 
 def test_gaps_that_cross_blocks_are_bridged_as_if_there_were_none():

@@ -19,7 +19,7 @@ from geoscene.ground import (
     drape,
     ground_tile,
     ground_tiles,
-    joined,
+    join_tiles,
     partition,
     partition_tile,
     plan_ground,
@@ -75,7 +75,7 @@ def test_the_ground_is_one_surface_across_joined_tiles_and_the_others_do_not_cha
     polygons = [shapely.affinity.scale(b, 0.2, 0.2) for b in blobs(seed, 4)]
     ruled = [tuple(square) for square in rng.integers(-4, 6, (3, 2)).tolist()]
     apart = plan_ground(EXTENT, layers_of(polygons, rng), tile_size=4.0, lines=1.0, ruled=ruled, coarse=lines)
-    plan = joined(apart, {(2, 3)})
+    plan = join_tiles(apart, {(2, 3)})
     tiles = ground_tiles(plan)
     assert len(tiles) < len(apart.tiles)
     meshes = {tile: ground_tile(plan, tile[0], j=tile[1], height=rolling) for tile in tiles}
@@ -114,7 +114,7 @@ def test_a_tile_that_nothing_crosses_has_the_vertices_that_noding_gives_it():
 def test_outlines_along_the_border_of_the_extent_do_not_keep_squares_apart():
     sea = shapely.box(0, 0, 1500, 1600) - shapely.box(500, 500, 520, 520)
     layers = Layers.of([sea], klass=Class.WATER, material=GRASS, priority=0)
-    plan = joined(plan_ground((0, 0, 1500, 1600), layers, tile_size=100.0), set())
+    plan = join_tiles(plan_ground((0, 0, 1500, 1600), layers, tile_size=100.0), set())
     spans = {tile: tile_span(plan, tile[0], j=tile[1]) for tile in ground_tiles(plan)}
     assert sorted(spans.values()) == [1] * 4 + [2] * 3 + [4] * 3 + [8] * 3
     mesh = concatenate([ground_tile(plan, i, j=j) for i, j in spans])
@@ -124,7 +124,7 @@ def test_outlines_along_the_border_of_the_extent_do_not_keep_squares_apart():
 def test_squares_with_forest_keep_their_size():
     wood = shapely.box(-1000, -1000, 300, 3000)
     layers = Layers.of([wood], klass=Class.FOREST_FLOOR, material=GRASS, priority=0)
-    plan = joined(plan_ground((0, 0, 1600, 1600), layers, tile_size=100.0), {(12, 12)})
+    plan = join_tiles(plan_ground((0, 0, 1600, 1600), layers, tile_size=100.0), {(12, 12)})
     spans = {tile: tile_span(plan, tile[0], j=tile[1]) for tile in ground_tiles(plan)}
     assert all(spans[i, j] == 1 for i in range(4) for j in range(16))
     assert spans[8, 0] == 8

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import concatenate
-from geoscene.ground import Layers, ground_tile, ground_tiles, joined, plan_ground, tile_box, tile_span
+from geoscene.ground import Layers, ground_tile, ground_tiles, join_tiles, plan_ground, tile_box, tile_span
 from geoscene.ground.partition import follows_relief, tile_lattice
 from geoscene.ground.relief import Relief
 
@@ -34,7 +34,7 @@ def bare_plan(extent, relief, *, houses=(), size=100.0):
         [shapely.Point(xy).buffer(20) for xy in houses], klass=Class.GRASS, material=GRASS, priority=0
     )
     lines = {"lines": 10.0, "ruled": [(3, 4), (4, 4)], "coarse": relief.spacing}
-    return joined(plan_ground(extent, layers, tile_size=size, relief=relief, **lines), {(2, 2)})
+    return join_tiles(plan_ground(extent, layers, tile_size=size, relief=relief, **lines), {(2, 2)})
 
 
 @given(st.integers(0, 2**32), st.sampled_from(EXTENTS), st.sampled_from([0.05, 0.5, 5.0]))
@@ -106,7 +106,7 @@ def test_still_water_is_level_and_has_no_vertices_within():
         [shapely.box(-1e4, -1e4, 1e4, 1e4)], klass=Class.WATER, material=GRASS, priority=0, body="sea"
     )
     relief = Relief(waves(1), 0.1, 14.0)
-    plan = joined(plan_ground(EXTENTS[0], sea, tile_size=100.0, coarse=14.0, ruled=(), relief=relief), ())
+    plan = join_tiles(plan_ground(EXTENTS[0], sea, tile_size=100.0, coarse=14.0, ruled=(), relief=relief), ())
     for i, j in ground_tiles(plan):
         xmin, ymin, xmax, ymax = tile_box(plan, i, j=j)
         x, y = ground_tile(plan, i, j=j).vertices[:, :2].T

@@ -4,7 +4,7 @@ import pytest
 
 from geoscene.objects.furniture import shape_of
 from geoscene.objects.shapes import shapes
-from geoscene.objects.signs import directed, sign_codes, sign_face, sign_shape
+from geoscene.objects.signs import select_direction, sign_codes, sign_face, sign_shape
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_the_form_of_a_plate_follows_from_its_face_with_relief_alone():
 
 def test_a_sign_for_one_direction_counts_for_that_direction():
     tags = {"traffic_sign:forward": "maxspeed", "maxspeed:forward": "50", "highway": "x"}
-    assert sign_face(directed(tags)) == "limit 50"
-    assert directed(tags)["traffic_sign:direction"] == "forward"
+    assert sign_face(select_direction(tags)) == "limit 50"
+    assert select_direction(tags)["traffic_sign:direction"] == "forward"
     both = {**tags, "traffic_sign:backward": "maxspeed"}
-    assert directed(both) is both
+    assert select_direction(both) is both

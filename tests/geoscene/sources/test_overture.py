@@ -15,7 +15,7 @@ from pyproj import CRS
 from geoscene.buildings import read_buildings
 from geoscene.errors import InputError, MissingExtraError, SourceNotFoundError
 from geoscene.geometry.frames import Frame
-from geoscene.sources import SOURCES, credits_of, demo_path, merged, read_osm, read_source
+from geoscene.sources import SOURCES, credits_of, demo_path, merge_sources, read_osm, read_source
 from geoscene.sources.registry import reader_of
 from geoscene.sources.tags import is_building
 
@@ -54,7 +54,7 @@ def test_real_buildings_are_read_as_from_openstreetmap(osm, demo):
 
 
 def test_buildings_replace_those_of_a_map(osm, demo):
-    both = merged(osm, read_source("overture", demo, bounds=osm.bounds))
+    both = merge_sources(osm, read_source("overture", demo, bounds=osm.bounds))
     assert both.bounds == osm.bounds
     assert both.ways == osm.ways
     built = [a.osm_id for a in both.areas if is_building(a.tags)]

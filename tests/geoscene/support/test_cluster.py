@@ -13,7 +13,7 @@ from geoscene.errors import InputError
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
-from geoscene.support.cluster import connected
+from geoscene.support.cluster import connect
 
 OPTIONS = BuildOptions(name="demo", tile_size=50.0)
 
@@ -43,7 +43,7 @@ def test_build_of_which_a_worker_is_killed_has_the_bytes_of_one_process(address,
             done.append(count)
             os.kill(victim, signal.SIGKILL)
 
-    with connected(address) as cluster:
+    with connect(address) as cluster:
         build(osm, tmp_path / "many", options=OPTIONS, cluster=cluster, progress=kill)
     assert done
     same_files(tmp_path / "one", tmp_path / "many")
@@ -52,7 +52,7 @@ def test_build_of_which_a_worker_is_killed_has_the_bytes_of_one_process(address,
 def test_rebuild_on_a_cluster_reuses_tiles(address, osm, tmp_path):
     build(osm, tmp_path / "one", options=BuildOptions(lod=1))
     build(osm, tmp_path / "many", options=BuildOptions(lod=2))
-    with connected(address) as cluster:
+    with connect(address) as cluster:
         build(osm, tmp_path / "many", options=BuildOptions(lod=1), cluster=cluster, overwrite=True)
     same_files(tmp_path / "one", tmp_path / "many")
 
@@ -61,7 +61,7 @@ def test_a_worker_that_does_not_see_the_folder_is_named_before_planning(address,
     monkeypatch.setattr("geoscene.pipeline.build.make_plan", lambda *_, **__: pytest.fail("planned"))
     monkeypatch.setattr("geoscene.support.cluster.digest_of", lambda _: "what this process sees")
     with (
-        connected(address) as cluster,
+        connect(address) as cluster,
         pytest.raises(InputError, match=r"scene\.part: worker tcp.* does not see"),
     ):
         build(osm, tmp_path / "scene", cluster=cluster)
@@ -71,7 +71,7 @@ def test_a_worker_that_does_not_see_the_folder_is_named_before_planning(address,
 def test_workers_with_other_sources_are_refused_before_planning(address, osm, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.support.cluster.sources_digest", lambda _: "of this process")
     with (
-        connected(address) as cluster,
+        connect(address) as cluster,
         pytest.raises(InputError, match=r"tcp.* are not those of this program"),
     ):
         build(osm, tmp_path / "scene", cluster=cluster)

@@ -11,7 +11,7 @@ from helpers.scenes import same_files
 from geoscene.errors import InputError, MissingExtraError, SceneFormatError, StorageError
 from geoscene.scene import open_scene
 from geoscene.scene.layout import changed_files
-from geoscene.support.storage import StoredFolder, cache_folder, published, url_of
+from geoscene.support.storage import StoredFolder, cache_folder, publish, url_of
 
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.usefixtures("home")]
 BOX = "--bbox=24.9425,60.1665,24.9465,60.1690"
@@ -152,7 +152,7 @@ def test_folder_of_others_is_refused(memory):
     memory.pipe_file("/bucket/data/notes.txt", b"of others")
     with (
         pytest.raises(InputError, match=r"memory://bucket/data: is not empty and holds no scene\.json"),
-        published("memory://bucket/data", last="scene.json", replaces=True),
+        publish("memory://bucket/data", last="scene.json", replaces=True),
     ):
         pass
 
@@ -213,7 +213,7 @@ def test_url_without_a_folder_is_refused_before_any_work(words, tmp_path):
 
 
 def test_local_folders_are_written_as_they_are(tmp_path):
-    with published(tmp_path / "scene", last="scene.json", replaces=False) as folder:
+    with publish(tmp_path / "scene", last="scene.json", replaces=False) as folder:
         assert folder == tmp_path / "scene"
     with pytest.raises(SceneFormatError, match="no such scene directory"):
         open_scene(tmp_path / "scene")

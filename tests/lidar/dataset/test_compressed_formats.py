@@ -15,7 +15,7 @@ from pypcd4 import Encoding, PointCloud
 
 from geoscene.errors import MissingExtraError
 from lidar.dataset.formats import FORMATS, npz, parquet, pcd_compressed, read_table
-from lidar.dataset.formats.lzf import compressed, decompressed
+from lidar.dataset.formats.lzf import compress, decompress
 from lidar.dataset.formats.table import FrameInfo
 from lidar.errors import FormatError
 from lidar.settings import RecordingSettings
@@ -45,12 +45,12 @@ TEXTS = st.one_of(
 @settings(deadline=None, max_examples=100)
 @given(TEXTS)
 def test_lzf_is_read_by_liblzf_and_reads_what_liblzf_writes(data):
-    packed = compressed(as_array(data))
-    assert decompressed(packed, len(data)).tobytes() == data
+    packed = compress(as_array(data))
+    assert decompress(packed, len(data)).tobytes() == data
     if data:
         assert reference.decompress(packed.tobytes(), len(data)) == data
         theirs = reference.compress(data, 2 * len(data) + 16)
-        assert decompressed(as_array(theirs), len(data)).tobytes() == data
+        assert decompress(as_array(theirs), len(data)).tobytes() == data
         assert len(packed) <= len(data) + len(data) // 32 + 1
 
 
@@ -59,7 +59,7 @@ def test_lzf_is_read_by_liblzf_and_reads_what_liblzf_writes(data):
 def test_no_bytes_make_lzf_read_or_write_outside_its_memory(data, size):
     """Either they stand for exactly so many bytes, as LibLZF says too, or they are refused."""
     try:
-        ours = decompressed(as_array(data), size).tobytes()
+        ours = decompress(as_array(data), size).tobytes()
     except ValueError:
         ours = None
     if not data or not size:

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class, class_codes
 from geoscene.scene import open_scene
-from lidar.dataset.deskew import MOMENTS, deskewed
+from lidar.dataset.deskew import MOMENTS, deskew
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.kitti import semantic_kitti_labels
 from lidar.dataset.formats.table import PointLabels, placed_returns
@@ -256,7 +256,7 @@ def test_a_static_wall_is_straight_after_deskewing_while_the_vehicle_turns():
     assert bend(cloud.xyz.astype(float)) > 0.3
     for share in MOMENTS.values():
         moment = sensor.frame_start_ns(7) + int(share * 1e8)
-        points = deskewed(where, trajectory, mount=mount, time_ns=moment)
+        points = deskew(where, trajectory, mount=mount, time_ns=moment)
         assert bend(points.astype(float)) < 2e-5
         pose = trajectory.at([moment]).mounted(mount.translation, mount.rotation)
         np.testing.assert_allclose(pose.place(points.astype(float)), where, atol=1e-4)

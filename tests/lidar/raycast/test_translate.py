@@ -64,7 +64,7 @@ def everything(i, x, y, out):
     out[8] = first_of(swapped(x, y)) + first_of((x, y))
     out[9] = looped(i, x)
     out[10] = int(x) if x > 0 and 1 / x > 0.1 else 0
-    out[11] = texture.noise(x, y, 3) + math.pi * texture.hashed(math.floor(x), i, 1)
+    out[11] = texture.noise(x, y, 3) + math.pi * texture.hash_place(math.floor(x), i, 1)
     out[12] = texture.detail(i % 8, i % 2, x, y, x - y, y, 0.02)
     out[13] = ground_texture.ground(i % 7, i > 3, x, y, 0.6, 0.8, 0.01, 0.08)
 

@@ -9,7 +9,7 @@ from helpers.sensor_worlds import box, driven, world
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import firings, load_sensor
-from lidar.signal.recorded_pulses import completed, recorded_pulses
+from lidar.signal.recorded_pulses import complete, recorded_pulses
 
 ROAD = box((-60, -60, -1), (60, 60, 0))
 WALLS = [box((20, -60, 0), (22, 60, 30)), box((-60, 12, 0), (20, 14, 5))]
@@ -75,7 +75,7 @@ def test_returns_of_pulses_that_were_not_fired_keep_pulses_of_their_own():
 def test_gaps_of_azimuth_are_filled_in_steps_of_the_scanner(name, columns, share):
     sensor = load_sensor(name)
     real = thinned(recorded(sensor), share)
-    cloud = completed(real, sensor, columns=columns)
+    cloud = complete(real, sensor, columns=columns)
     pulses, row = recorded_pulses(cloud, sensor, sent=None)
     assert np.array_equal(np.sort(row), row)
     assert len(np.unique(row)) == len(cloud)
@@ -95,7 +95,7 @@ def test_added_pulses_lie_among_their_neighbours_in_the_file():
     cloud = thinned(recorded(sensor), 0.7)
     by_ring = cloud.take(np.lexsort((cloud.column, cloud.ring)))
     for order in (cloud, by_ring):
-        found = completed(order, sensor, columns=("x", "y", "z", "intensity", "ring"))
+        found = complete(order, sensor, columns=("x", "y", "z", "intensity", "ring"))
         pulses, row = recorded_pulses(found, sensor, sent=None)
         added = np.ones(len(pulses), bool)
         added[row] = False
@@ -109,6 +109,6 @@ def test_added_pulses_lie_among_their_neighbours_in_the_file():
 def test_only_spinning_scanners_have_pulses_without_returns_where_directions_are_derived():
     sensor = load_sensor("lms111")
     cloud = thinned(recorded(sensor), 0.5)
-    pulses, row = recorded_pulses(completed(cloud, sensor, columns=()), sensor, sent=None)
+    pulses, row = recorded_pulses(complete(cloud, sensor, columns=()), sensor, sent=None)
     assert len(pulses) == len(cloud)
     assert np.array_equal(row, np.arange(len(cloud)))

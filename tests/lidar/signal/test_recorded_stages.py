@@ -16,7 +16,7 @@ from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.sensors.camera.png import read_png
 from lidar.sensors.physics.echoes import Origin
-from lidar.signal.registry import NamedStage, numbered, read_stage, read_stages
+from lidar.signal.registry import NamedStage, number_stages, read_stage, read_stages
 from lidar.signal.stage import Stage, parameter
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation import frame_loop
@@ -155,7 +155,7 @@ def test_no_return_is_added_while_scanners_are_off(plain, tmp_path):
     manifest["scanners_on_ns"] = [[0, 150_000_000]]
     (tmp_path / "in" / "dataset.json").write_text(json.dumps(manifest))
     snow = read_weather("snow=10")
-    stages = numbered(read_stage(one.table()) for one in snow)
+    stages = number_stages(read_stage(one.table()) for one in snow)
     apply_stages(tmp_path / "in", tmp_path / "a", options=ApplyOptions(stages))
     for frame, cloud in enumerate(sorted((tmp_path / "a" / "top" / "pcd").glob("*.pcd"))):
         with np.load(tmp_path / "a" / "top" / "truth" / f"{cloud.stem}.npz") as truth:

@@ -14,7 +14,7 @@ from lidar.geometry.mounts import Mount
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast, scan
-from lidar.sensors.physics.echoes import Origin, joined
+from lidar.sensors.physics.echoes import Origin, join
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.dropped_packets import DroppedPackets
@@ -47,7 +47,7 @@ class Injected(Stage):
         number = np.arange(len(pulses))
         distance = np.full(len(pulses), self.distance)
         apparent = pulses.apparent(np.full(len(pulses), self.power), distance)
-        return joined(echoes, added_echoes(number, distance, apparent=apparent, origin=Origin.INJECTED))
+        return join(echoes, added_echoes(number, distance, apparent=apparent, origin=Origin.INJECTED))
 
 
 @dataclass(frozen=True)

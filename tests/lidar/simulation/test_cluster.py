@@ -15,7 +15,7 @@ from helpers.scenes import same_files
 
 import geoscene.support.cluster
 from geoscene.errors import InputError, MissingExtraError
-from geoscene.support.cluster import connected
+from geoscene.support.cluster import connect
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.sweep import sweep
@@ -92,13 +92,13 @@ def test_sweep_of_which_a_worker_is_killed_has_the_bytes_of_one_process(cluster,
 
 
 def test_a_worker_that_sees_other_files_is_named_before_the_start(cluster, tmp_path):
-    with connected(cluster) as connection, pytest.raises(InputError, match="/proc/self/stat: worker tcp"):
+    with connect(cluster) as connection, pytest.raises(InputError, match="/proc/self/stat: worker tcp"):
         connection.check(tmp_path, inputs=[Path("/proc/self/stat")])
     assert not list(tmp_path.iterdir())
 
 
 def test_errors_of_tasks_are_raised_as_they_are(cluster):
-    with connected(cluster) as connection, pytest.raises(ValueError, match="invalid literal"):
+    with connect(cluster) as connection, pytest.raises(ValueError, match="invalid literal"):
         list(connection.run_tasks(int, ["1", "x"]))
 
 
@@ -125,6 +125,6 @@ def test_missing_dask_names_its_extra(monkeypatch):
     with (
         suppress(KeyError),
         pytest.raises(MissingExtraError, match=r"geoscene\[cluster\]"),
-        connected("tcp://x:1"),
+        connect("tcp://x:1"),
     ):
         pass

@@ -159,14 +159,14 @@ def test_receivers_and_units_measure_the_same_along_parts_of_a_trajectory(path, 
 def test_long_lines_are_smoothed_in_windows(monkeypatch):
     along = np.arange(0.0, 2000.0, 0.5)
     line = np.column_stack([along, 30.0 * np.floor(along / 40.0) % 2])  # jumps that no car can follow
-    whole = steering.relaxed(line, 0.17, reach=2.6)
+    whole = steering.relax(line, 0.17, reach=2.6)
     monkeypatch.setattr(steering, "_SOLVED", 500)
     monkeypatch.setattr(steering, "_OVERLAP", 400)
-    assert np.abs(steering.relaxed(line, 0.17, reach=2.6) - whole).max() < 1e-6
+    assert np.abs(steering.relax(line, 0.17, reach=2.6) - whole).max() < 1e-6
     monkeypatch.setattr(steering, "_OVERLAP", 100)
-    plain = steering.relaxed(line, 1e9, reach=2.6)
+    plain = steering.relax(line, 1e9, reach=2.6)
     monkeypatch.setattr(steering, "_SOLVED", 1 << 17)
-    assert np.abs(steering.relaxed(line, 1e9, reach=2.6) - plain).max() < 1e-9
+    assert np.abs(steering.relax(line, 1e9, reach=2.6) - plain).max() < 1e-9
 
 
 def test_the_ground_is_loaded_in_regions_around_the_vehicle(monkeypatch):

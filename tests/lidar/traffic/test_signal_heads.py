@@ -20,7 +20,7 @@ from lidar.traffic.signal_heads import (
     RED,
     SignalHeads,
     SignalStates,
-    heads_served,
+    find_served_heads,
     signal_states,
 )
 from lidar.traffic.simulation import ego_motion, green_windows
@@ -64,7 +64,7 @@ def test_a_head_serves_the_junction_ahead_of_the_traffic_it_faces(before, aside,
     graph = replace(graph, geometry=lines, node_xyz=nodes)
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     place, heading = beside(graph, before=before, aside=aside)
-    zone, group = heads_served(place, heading + off, graph=graph, plan=plan)
+    zone, group = find_served_heads(place, heading + off, graph=graph, plan=plan)
     course, junction = courses(graph), zone_at(plan.zones, graph.node_xyz[graph.head, :2])
     crossing = junction >= 0  # corners of the grid are bends of one street
     np.testing.assert_array_equal(zone[crossing], junction[crossing])
@@ -85,7 +85,7 @@ def test_signals_of_a_crossing_far_from_junctions_stop_nobody_and_rest_in_green(
     )
     plan = junction_plan(far, lanes_of(far), seed=1)
     place, heading = beside(far, before=100.0, aside=4.0)
-    zone, group = heads_served(place, heading, graph=far, plan=plan)
+    zone, group = find_served_heads(place, heading, graph=far, plan=plan)
     assert (zone == -1).all()
     states = SignalStates(SignalHeads(np.arange(len(far)), place, heading, zone, group), plan.signals)
     assert {state for s in np.arange(0.0, 60.0, 5.0) for state in states.at(s).tolist()} == {GREEN}
@@ -104,7 +104,7 @@ def test_an_edge_that_ends_between_the_signal_and_the_junction_is_followed_strai
         control_kind=np.array(["traffic_signals"]),
     )
     plan = junction_plan(graph, lanes_of(graph), seed=1)
-    zone, group = heads_served(np.array([[92.0, -4.0, 0.0]]), np.array([np.pi]), graph=graph, plan=plan)
+    zone, group = find_served_heads(np.array([[92.0, -4.0, 0.0]]), np.array([np.pi]), graph=graph, plan=plan)
     z = int(zone_at(plan.zones, np.array([[100.0, 0.0]]))[0])
     assert (zone[0], group[0]) == (z, signal_group(plan, z, heading=0.0))
 
@@ -113,7 +113,7 @@ def test_a_head_beside_a_road_without_mapped_signals_serves_the_junction_at_hand
     graph = replace(grid(3, 3, 120.0), signals=np.full(9, True))
     plan = junction_plan(graph, lanes_of(graph), seed=1)
     place = np.array([[112.0, 115.0, 0.0], [60.0, 120.0, 0.0]])
-    zone, group = heads_served(place, np.array([np.pi, np.pi]), graph=graph, plan=plan)
+    zone, group = find_served_heads(place, np.array([np.pi, np.pi]), graph=graph, plan=plan)
     z = int(zone_at(plan.zones, np.array([[120.0, 120.0]]))[0])
     assert (zone[0], group[0]) == (z, signal_group(plan, z, heading=0.0))
     assert zone[1] == -1  # 50 m away
@@ -124,7 +124,7 @@ def test_crossing_streets_never_both_show_green_or_amber(seed, time_s):
     graph = signalised(grid(3, 3, 120.0), before=8.0)
     plan = junction_plan(graph, lanes_of(graph), seed=seed)
     place, heading = beside(graph, before=8.0, aside=4.0)
-    zone, group = heads_served(place, heading, graph=graph, plan=plan)
+    zone, group = find_served_heads(place, heading, graph=graph, plan=plan)
     heads = SignalHeads(np.arange(len(graph), dtype=np.int32), place, heading, zone, group)
     state = SignalStates(heads, plan.signals).at(time_s)
     for z in np.unique(zone[zone >= 0]).tolist():
@@ -142,7 +142,7 @@ def test_each_head_goes_from_green_over_amber_of_three_seconds_to_red():
         np.arange(len(graph), dtype=np.int32),
         place,
         heading,
-        *heads_served(place, heading, graph=graph, plan=plan),
+        *find_served_heads(place, heading, graph=graph, plan=plan),
     )
     step = 0.1
     shown = np.stack([SignalStates(heads, plan.signals).at(t) for t in np.arange(0.0, 60.0, step)])
@@ -169,7 +169,7 @@ def test_a_vehicle_on_a_fixed_way_meets_green_heads():
     )
     signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, BOX, graph=graph)))
     place, heading = beside(graph, before=8.0, aside=4.0)
-    zone, group = heads_served(place, heading, graph=graph, plan=plan)
+    zone, group = find_served_heads(place, heading, graph=graph, plan=plan)
     heads = SignalHeads(np.arange(len(graph), dtype=np.int32), place, heading, zone, group)
     middle = int(zone_at(plan.zones, np.array([[120.0, 120.0]]))[0])
     ahead = (zone == middle) & (np.abs(np.cos(heading) + 1) < 0.1)

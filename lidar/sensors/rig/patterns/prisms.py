@@ -59,18 +59,18 @@ def _steer(incident: Any, faces: Any, sine: Any, cosine: Any, direction: Any) ->
                 side, up, n = faces[k]
                 nx, ny, nz = side * sine[i, k], -up, side * cosine[i, k]
                 if side > 0:
-                    x, y, z = _refracted(x, y, z, nx, ny, nz, 1 / n)
-                    x, y, z = _refracted(x, y, z, 0.0, -1.0, 0.0, n)
+                    x, y, z = _refract(x, y, z, nx, ny, nz, 1 / n)
+                    x, y, z = _refract(x, y, z, 0.0, -1.0, 0.0, n)
                 else:
-                    x, y, z = _refracted(x, y, z, 0.0, -1.0, 0.0, 1 / n)
-                    x, y, z = _refracted(x, y, z, nx, ny, nz, n)
+                    x, y, z = _refract(x, y, z, 0.0, -1.0, 0.0, 1 / n)
+                    x, y, z = _refract(x, y, z, nx, ny, nz, n)
             # The prisms' axis y is forward, their x is up.
             direction[ray, 0], direction[ray, 1], direction[ray, 2] = y, z, x
             ray += 1
 
 
 @njit(cache=True, nogil=True)
-def _refracted(x: Any, y: Any, z: Any, nx: Any, ny: Any, nz: Any, ratio: Any) -> Any:
+def _refract(x: Any, y: Any, z: Any, nx: Any, ny: Any, nz: Any, ratio: Any) -> Any:
     """Unit vector behind a boundary by Snell's law; ``ratio`` of the indices before and behind."""
     c = -(x * nx + y * ny + z * nz)
     s2 = ratio * ratio * (1 - c * c)

@@ -8,13 +8,13 @@ from geoscene.objects.shapes import shapes
 from geoscene.objects.signs import sign_codes
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.appearance import SIGN_HEIGHT, colors
-from lidar.sensors.camera.sign_faces import OF_SHAPE, face_levels, known, plate_levels, sampled
+from lidar.sensors.camera.sign_faces import OF_SHAPE, face_levels, known, plate_levels, sample
 from lidar.world.actor_shapes import CLOTHES, PAINTS, catalogue
 from lidar.world.actor_solids import WHITE
 
 
 def at(face, x, y, *, width=0.0):
-    return sampled(face_levels(face), np.array([[x, y]]), width=np.array([width]))[0].astype(int)
+    return sample(face_levels(face), np.array([[x, y]]), width=np.array([width]))[0].astype(int)
 
 
 def red(color):
@@ -116,7 +116,7 @@ def test_number_plates_read_from_left_to_right_in_front_and_behind():
         start = np.column_stack([np.full(200, sign * 5.0), sign * across, np.full(200, height)])
         found, row = street.shot(start, (-sign, 0.0, 0.0), feature=77)
         assert plate[row].all()
-        drawn = sampled(
+        drawn = sample(
             plate_levels(77), np.column_stack([across, np.zeros(200)]), width=np.full(200, 0.001), side=0.52
         )
         np.testing.assert_allclose(found.astype(int), drawn.astype(int), atol=3)

@@ -20,7 +20,7 @@ from lidar.sensors.camera.ground_texture import (
     LOOSE,
     PAVING,
     SETTS,
-    cracked,
+    draw_cracks,
     ground,
 )
 from lidar.sensors.camera.render import RenderOptions, render
@@ -101,10 +101,10 @@ def test_asphalt_is_speckled_by_its_stones_and_not_blotchy():
 
 def test_cracks_are_rare_narrow_and_as_wide_from_along_as_from_across():
     x, y = np.random.default_rng(1).uniform(-300, 300, (2, 60_000))
-    share = [cracked(a, b, 1.0, 0.0, 0.002, 0.002, ASPHALT) for a, b in zip(x, y, strict=True)]
+    share = [draw_cracks(a, b, 1.0, 0.0, 0.002, 0.002, ASPHALT) for a, b in zip(x, y, strict=True)]
     assert 0.003 < np.mean(share) < 0.010
-    aside = [cracked(a, b, 0.0, 1.0, 0.002, 0.05, ASPHALT) for a, b in zip(x, y, strict=True)]
-    along = [cracked(a, b, 1.0, 0.0, 0.002, 0.05, ASPHALT) for a, b in zip(x, y, strict=True)]
+    aside = [draw_cracks(a, b, 0.0, 1.0, 0.002, 0.05, ASPHALT) for a, b in zip(x, y, strict=True)]
+    along = [draw_cracks(a, b, 1.0, 0.0, 0.002, 0.05, ASPHALT) for a, b in zip(x, y, strict=True)]
     assert np.mean(aside) == pytest.approx(np.mean(share), rel=0.2)
     assert np.mean(along) == pytest.approx(np.mean(share), rel=0.2)
 

@@ -13,7 +13,7 @@ from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import RenderOptions, render
-from lidar.sensors.camera.signal_lamps import APART, LENSES, RADIUS, Lamps, emitted
+from lidar.sensors.camera.signal_lamps import APART, LENSES, RADIUS, Lamps, emit
 from lidar.sensors.rig.specs import CameraSpec
 
 CAMERA = CameraSpec("c", Mount(), 200, 160, 400.0, 400.0, 99.5, 79.5)
@@ -95,7 +95,7 @@ def test_light_of_a_lens_is_kept_when_pixels_grow():
     state = np.zeros(len(place), np.uint8)
     exposure = daylight(NOON).exposure
     near, far = (
-        emitted(state, place=place, width=np.full(len(place), width), exposure=exposure).mean(axis=0)
+        emit(state, place=place, width=np.full(len(place), width), exposure=exposure).mean(axis=0)
         for width in (0.001, 1.0)
     )
     np.testing.assert_allclose(near, far, rtol=0.02)

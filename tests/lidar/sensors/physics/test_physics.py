@@ -8,15 +8,15 @@ from hypothesis import strategies as st
 from geoscene.classes import materials
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator, normal_of
-from lidar.sensors.physics.echoes import Echoes, joined, merged, mixed, numbered, reported
+from lidar.sensors.physics.echoes import Echoes, join, merge, mix, number_echoes, select_reported
 from lidar.sensors.physics.footprint import bundle
 from lidar.sensors.physics.fresnel import (
     WATER,
     film,
     fresnel,
     glint,
-    mirrored,
     pane_reflection,
+    reflect,
     surface_reflection,
     through_water,
     under_film,
@@ -30,7 +30,7 @@ from lidar.sensors.physics.link import (
     false_alarm_probability,
     transmission,
 )
-from lidar.sensors.physics.range_error import quantised, signal_sigma, stretch_sigma, walk
+from lidar.sensors.physics.range_error import quantise, signal_sigma, stretch_sigma, walk
 from lidar.sensors.physics.reflect import apparent, covered_reflectance, reflectance_table
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import WEAK_SIGMA, load_sensor
@@ -114,10 +114,10 @@ def test_a_mirror_keeps_length_and_angle():
     rng = np.random.default_rng(1)
     d, n = rng.normal(size=(2, 50, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    m = mirrored(d, n)
+    m = reflect(d, n)
     assert np.linalg.norm(m, axis=1) == pytest.approx(np.linalg.norm(d, axis=1))
     assert np.einsum("ij,ij->i", m, n) == pytest.approx(-np.einsum("ij,ij->i", d, n))
-    assert mirrored(m, n) == pytest.approx(d)
+    assert reflect(m, n) == pytest.approx(d)
 
 
 def test_maximum_range_is_proportional_to_the_root_of_reflectance():
@@ -186,11 +186,11 @@ def test_a_slanted_surface_stretches_the_pulse():
 @pytest.mark.parametrize("quantum", [0.001, 0.002, 0.0025, 0.004, 0.005, 0.007])
 def test_quantisation_rounds_and_its_error_is_uniform(quantum):
     x = np.random.default_rng(0).uniform(1, 100, 20_000)
-    q = quantised(x, quantum)
+    q = quantise(x, quantum)
     assert np.abs(q - x).max() <= quantum / 2 * (1 + 1e-9)
     assert np.abs(q / quantum - np.round(q / quantum)).max() < 1e-6
     assert np.std(q - x) == pytest.approx(quantum / np.sqrt(12), rel=0.02)
-    assert quantised(x, 0.0) is x
+    assert quantise(x, 0.0) is x
 
 
 def test_range_walk_shortens_the_range_of_bright_echoes():
@@ -266,16 +266,16 @@ def surfaces(rows):
 
 def test_close_surfaces_merge_into_one_echo_and_distant_ones_give_two():
     """5 ns resolve 0.75 m: 10.0 and 10.4 m merge, 10 and 12 m do not."""
-    close = merged(surfaces([(0, 10.0, 0.5, True), (0, 10.4, 0.5, False)]), 0.75)
+    close = merge(surfaces([(0, 10.0, 0.5, True), (0, 10.4, 0.5, False)]), 0.75)
     assert len(close) == 1
     assert 10.0 < close.range[0] < 10.2  # the nearer is brighter by the square of the ranges
-    apart = merged(surfaces([(0, 12.0, 0.5, True), (0, 10.0, 0.5, False)]), 0.75)
+    apart = merge(surfaces([(0, 12.0, 0.5, True), (0, 10.0, 0.5, False)]), 0.75)
     assert apart.range == pytest.approx([10.0, 12.0])
 
 
 def test_the_range_changes_monotonically_as_an_edge_crosses_the_beam():
     at = [
-        merged(surfaces([(0, 10.0, 1 - w, w < 0.5), (0, 10.4, w, w >= 0.5)]), 0.75).range[0]
+        merge(surfaces([(0, 10.0, 1 - w, w < 0.5), (0, 10.4, w, w >= 0.5)]), 0.75).range[0]
         for w in np.linspace(0, 1, 21)
     ]
     assert at[0] == pytest.approx(10.0)
@@ -285,7 +285,7 @@ def test_the_range_changes_monotonically_as_an_edge_crosses_the_beam():
 
 def test_an_echo_has_the_label_on_the_beams_axis_else_of_the_brightest():
     rows = [(0, 10.0, 0.2, True), (0, 10.1, 0.5, False), (1, 8.0, 0.1, False), (1, 8.2, 0.6, False)]
-    echoes = merged(surfaces(rows), 0.75)
+    echoes = merge(surfaces(rows), 0.75)
     assert echoes.feature.tolist() == [0, 3]
     assert echoes.true_range.tolist() == [10.0, 8.2]
 
@@ -299,11 +299,11 @@ def test_an_echo_has_the_label_on_the_beams_axis_else_of_the_brightest():
 )
 def test_merging_keeps_power_and_separates_echoes(rows, separation):
     given_rows = surfaces([(p, r, a, False) for p, r, a in sorted(rows, key=lambda row: row[0])])
-    echoes = merged(given_rows, separation)
+    echoes = merge(given_rows, separation)
     power = np.bincount(given_rows.pulse, given_rows.apparent / given_rows.range**2)
     kept = np.bincount(echoes.pulse, echoes.apparent / echoes.range**2, minlength=len(power))
     assert kept == pytest.approx(power)
-    number, count = numbered(echoes)
+    number, count = number_echoes(echoes)
     same = np.diff(echoes.pulse) == 0
     assert (np.diff(echoes.range)[same] > 0).all() or separation == 0
     assert (number <= count).all()
@@ -322,12 +322,12 @@ def test_merging_keeps_power_and_separates_echoes(rows, separation):
 def test_pulses_with_new_echoes_are_merged_and_others_stay_as_they_are(rows, separation):
     echoes = surfaces([(p, r, a, False) for p, r, a, _ in rows])
     is_new = np.array([new for *_, new in rows], bool)
-    found = mixed(echoes, is_new, pulses=6, separation=separation)
+    found = mix(echoes, is_new, pulses=6, separation=separation)
     assert np.all(np.diff(found.pulse) >= 0)
     for p in range(5):
         own, of = found.where(found.pulse == p), echoes.where(echoes.pulse == p)
         if is_new[echoes.pulse == p].any():
-            of = merged(of.take(np.argsort(of.range, kind="stable")), separation)
+            of = merge(of.take(np.argsort(of.range, kind="stable")), separation)
         for name, column in of.columns().items():
             np.testing.assert_array_equal(own.columns()[name], column, err_msg=name)
 
@@ -339,7 +339,7 @@ def test_return_modes_select_the_echoes_that_they_name():
     power = np.array([0.1, 0.9, 0.2, 0.5, 0.5])
 
     def chosen(mode, **options):
-        return reported(echoes, power, mode=mode, most=options.pop("most", 5), **options).tolist()
+        return select_reported(echoes, power, mode=mode, most=options.pop("most", 5), **options).tolist()
 
     assert chosen("strongest") == [1, 3]  # of equal echoes the nearer one
     assert chosen("first") == [0, 3]
@@ -352,17 +352,17 @@ def test_return_modes_select_the_echoes_that_they_name():
 def test_dual_mode_with_one_echo_that_is_strongest_and_last():
     echoes = surfaces([(0, 5, 0.1, True), (0, 10, 0.9, False)])
     power = np.array([0.1, 0.9])
-    assert reported(echoes, power, mode="dual", most=2).tolist() == [1]
-    assert reported(echoes, power, mode="dual", most=2, second=True).tolist() == [0, 1]
+    assert select_reported(echoes, power, mode="dual", most=2).tolist() == [1]
+    assert select_reported(echoes, power, mode="dual", most=2, second=True).tolist() == [0, 1]
 
 
 def test_empty_echoes_are_accepted():
     empty = surfaces([(0, 1, 1, True)]).take(np.empty(0, np.int64))
-    assert len(merged(empty, 1.0)) == 0
-    assert len(numbered(empty)[0]) == 0
+    assert len(merge(empty, 1.0)) == 0
+    assert len(number_echoes(empty)[0]) == 0
     for mode in ("strongest", "first", "last", "dual", "all"):
-        assert len(reported(empty, np.empty(0), mode=mode, most=3, second=True)) == 0
-    assert len(joined(empty, empty)) == 0
+        assert len(select_reported(empty, np.empty(0), mode=mode, most=3, second=True)) == 0
+    assert len(join(empty, empty)) == 0
 
 
 def test_random_numbers_depend_on_their_key_alone():

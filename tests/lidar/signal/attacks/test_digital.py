@@ -19,7 +19,7 @@ from lidar.sensors.navigation.gnss import Fixes
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.registry import stages_of
-from lidar.signal.run import Altered, altered_cloud, cloud_truth, unaltered
+from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered
 from lidar.signal.situation import Situation
 
 CAMERA = CameraSpec("front", Mount(), 80, 60, 40.0, 40.0, 39.5, 29.5)
@@ -52,7 +52,7 @@ def cloud(n=4000, *, seed=0):
 
 def attacked(original, *, start_ns=0, **table):
     stages, at = stages_of([table], seed=5), Situation("top", 3, start_ns=start_ns)
-    return Altered(altered_cloud(unaltered(original).cloud, stages, at=at), original)
+    return Altered(altered_cloud(trace_unaltered(original).cloud, stages, at=at), original)
 
 
 def restored(altered):

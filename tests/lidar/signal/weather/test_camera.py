@@ -16,7 +16,7 @@ from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
-from lidar.signal.weather.camera import falling, linear_of, weathered
+from lidar.signal.weather.camera import add_weather, falling, linear_of
 from lidar.signal.weather.media import medium_of
 from lidar.signal.weather.setting import WeatherSetting
 from lidar.signal.weather.streaks import FallingParticles, streak_cover
@@ -53,7 +53,7 @@ def picture(depth, value=0, camera=CAMERA):
 
 
 def seen(image, setting, at=None, seed=1):
-    return weathered(image, setting, at=at or situation(), rng=np.random.default_rng(seed))
+    return add_weather(image, setting, at=at or situation(), rng=np.random.default_rng(seed))
 
 
 def test_light_and_bytes_of_an_image_convert_into_each_other():

@@ -13,7 +13,7 @@ from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import Origin, traced
+from lidar.sensors.physics.echoes import Origin, trace
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import stages_of
@@ -98,7 +98,7 @@ def test_an_even_field_gives_what_even_air_does():
     )  # fmt: skip
     pulses = pulses_of(sensor, sweep.sent)
     at = replace(SITUATION, sensor="hdl64e_s2")
-    echoes = traced(sweep.echoes, Origin.SURFACE, source=np.arange(len(sweep.echoes)))
+    echoes = trace(sweep.echoes, Origin.SURFACE, source=np.arange(len(sweep.echoes)))
     field = Field((-400.0, -400.0), np.ones((401, 401)), 0.0, np.inf)
     for medium in (medium_of("fog", 40, wavelength_nm=905, medium="kim"), rain(100, 905.0)):
         even, general = (
@@ -206,7 +206,7 @@ def test_what_needs_poses_says_so(text):
 
 def dimming(drops=0.0, dirt=0.0, second=0.0):
     pulses = pulses_of(SENSOR, SWEEP.sent)
-    echoes = traced(SWEEP.echoes, Origin.SURFACE, source=np.arange(len(SWEEP.echoes)))
+    echoes = trace(SWEEP.echoes, Origin.SURFACE, source=np.arange(len(SWEEP.echoes)))
     at = replace(SITUATION, start_ns=int(second * 1e9))
     return through_glass(pulses, echoes, drops=drops, dirt=dirt, at=at).apparent / echoes.apparent
 

@@ -12,11 +12,11 @@ from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import stages_of
-from lidar.signal.run import Altered, altered_cloud, cloud_truth, unaltered
+from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered
 from lidar.signal.situation import Situation
 from lidar.signal.weather import hahner
 from lidar.signal.weather.hahner import (
-    _snowed,
+    _snow,
     flake_disks,
     fog_response,
     hahner_fog,
@@ -214,11 +214,11 @@ def test_a_flake_wins_where_it_returns_more_than_what_it_leaves_of_the_target():
         # A disk of this share of the beam of 3 mrad, 5 m away, in the middle.
         radius = 5 * np.sin(share * 1.5e-3)
         disks = np.zeros(1), np.array([5.0]), np.array([radius])
-        _snowed(beams, disks, 1.5e-3, found)
+        _snow(beams, disks, 1.5e-3, found)
         flake, target = 0.9 * 255 * share / 25, 20 * (1 - share)
         assert found[2, 0] == (SCATTERED if flake > target else TARGET)
         assert found[1, 0] == pytest.approx(max(flake, target), rel=0.01)
-    _snowed(beams, (np.zeros(1), np.array([0.5]), np.array([0.01])), 1.5e-3, found)
+    _snow(beams, (np.zeros(1), np.array([0.5]), np.array([0.01])), 1.5e-3, found)
     assert found[2, 0] == LOST
 
 
@@ -237,7 +237,7 @@ ROOM = scan(
 def modelled(text, *, seed=0):
     original = ROOM
     stages = stages_of([s.table() for s in read_weather(text)], seed=seed)
-    cloud = altered_cloud(unaltered(original).cloud, stages, at=Situation("vlp16", 0))
+    cloud = altered_cloud(trace_unaltered(original).cloud, stages, at=Situation("vlp16", 0))
     return original, cloud
 
 

@@ -20,7 +20,7 @@ from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.registry import stages_of
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
-from lidar.signal.weather.camera import weathered
+from lidar.signal.weather.camera import add_weather
 from lidar.signal.weather.setting import read_weather
 
 GROUND = box((-90, -90, -1), (90, 90, 0))
@@ -72,7 +72,7 @@ def image(text, around):
     at = Situation(
         "front", 0, 10**9, poses=poses, camera=CAMERA, light=light, world=around, geo=GeoFrame.at(7.0, 50.0)
     )
-    found = weathered(black, read_weather(text)[0], at=at, rng=np.random.default_rng(1)).rgb
+    found = add_weather(black, read_weather(text)[0], at=at, rng=np.random.default_rng(1)).rgb
     assert found is not None
     return found[75:100, 135:185].astype(int)  # 6.7 by 3.3 m of the wall
 

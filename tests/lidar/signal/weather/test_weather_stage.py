@@ -24,7 +24,7 @@ from lidar.signal.situation import Situation
 from lidar.signal.weather.backscatter import (
     _strongest_gate,
     drawn_particles,
-    noticed,
+    notice,
     particles,
     response_ranges,
     soft_target,
@@ -200,7 +200,7 @@ def test_the_echo_of_fog_is_the_strongest_of_noisy_gates(most, fall, gates, seed
 def test_particles_that_are_left_out_are_part_of_no_echo_that_is_noticed(seed, least):
     rng, n, separation = np.random.default_rng(seed), 60, 1.0
     found = np.sort(rng.integers(0, 10, n)), rng.uniform(1, 8, n), rng.uniform(0, 0.6, n)
-    kept = noticed(found, least=least, separation=separation)
+    kept = notice(found, least=least, separation=separation)
     for p in range(10):
         of = found[0] == p
         order = np.flatnonzero(of)[np.argsort(found[1][of])]

@@ -20,7 +20,7 @@ from lidar.tools.defences.map import Map
 from lidar.tools.defences.navigation import NavigationDefence as Consistency
 from lidar.tools.defences.observation import NavigationMeasurements, Picture
 from lidar.tools.defences.occlusion import Occlusion
-from lidar.tools.defences.overlay import Overlay, projected
+from lidar.tools.defences.overlay import Overlay, project_returns
 from lidar.tools.defences.physics import Physics
 from lidar.tools.defences.registry import read_defences
 from lidar.tools.defences.run import able
@@ -308,7 +308,7 @@ def drawn(path, *boxes):
 
 
 def bounds(frame, rows, picture):
-    pixels = projected(frame, rows, picture=picture)
+    pixels = project_returns(frame, rows, picture=picture)
     return *np.floor(pixels.min(axis=0)).astype(int), *np.ceil(pixels.max(axis=0)).astype(int)
 
 

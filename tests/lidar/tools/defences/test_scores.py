@@ -8,7 +8,7 @@ from scipy.stats import norm
 
 from lidar.errors import InputError
 from lidar.tools.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
-from lidar.tools.defences.fusion import FUSIONS, fused, fused_threshold, joint_of
+from lidar.tools.defences.fusion import FUSIONS, fuse_verdicts, fused_threshold, joint_of
 from lidar.tools.defences.registry import defence_names, defence_rows, read_defences
 from lidar.tools.defences.scores import FALSE_ALARMS, SuspicionCounts, score, threshold_at
 from lidar.tools.defences.verdict import Verdict
@@ -87,14 +87,17 @@ def test_fused_verdicts_of_independent_defences_alarm_as_often_as_they_say(rule)
     calibration = calibrated(rng)
     n = 200_000
     verdicts = {name: Verdict(rng.random(n), None, float(rng.random())) for name in ("one", "other")}
-    found = fused(verdicts, calibration, rule=rule)
+    found = fuse_verdicts(verdicts, calibration, rule=rule)
     assert found.objects is None
     for level in ("objects", "frames"):  # 1 % and 5 %; 0.1 % is at the end of the tail
         alarms = np.mean(found.returns > fused_threshold(calibration, list(verdicts), level=level, rule=rule))
         assert alarms == pytest.approx(FALSE_ALARMS[level], rel=0.1)
     both = {name: Verdict(np.array([0.97]), None, 0.97) for name in ("one", "other")}
     one = {"one": both["one"], "other": Verdict(np.array([0.3]), None, 0.3)}
-    assert fused(both, calibration, rule="fisher").frame > fused(one, calibration, rule="fisher").frame
+    assert (
+        fuse_verdicts(both, calibration, rule="fisher").frame
+        > fuse_verdicts(one, calibration, rule="fisher").frame
+    )
 
 
 NAMES = ("one", "other", "third", "silent")
@@ -129,10 +132,10 @@ def test_a_harmonic_fusion_alarms_as_often_as_it_says_whatever_defences_have_in_
     calibration = jointly_calibrated(rng)
     rows = list(dependent(rng, 1000))
     verdicts = {name: Verdict(None, np.concatenate([row[name] for row in rows]), 0.0) for name in names}
-    objects = fused(verdicts, calibration, rule="harmonic").objects
+    objects = fuse_verdicts(verdicts, calibration, rule="harmonic").objects
     limit = fused_threshold(calibration, names, level="objects", rule="harmonic")
     assert np.mean(objects > limit) == pytest.approx(FALSE_ALARMS["objects"], rel=0.3)
-    bound = fused(verdicts, calibration, rule="max").objects
+    bound = fuse_verdicts(verdicts, calibration, rule="max").objects
     known = fused_threshold(calibration, names, level="objects", rule="max")
     if "silent" in names:
         assert np.mean(bound > known) < 0.8 * np.mean(objects > limit), "Bonferroni's bound is too careful"
@@ -156,7 +159,7 @@ def test_a_fused_suspicion_grows_with_each(rule):
         verdicts = {
             other: Verdict(None, steps if other == name else np.full(50, 0.3), 0.0) for other in NAMES
         }
-        assert (np.diff(fused(verdicts, calibration, rule=rule).objects) >= -1e-12).all()
+        assert (np.diff(fuse_verdicts(verdicts, calibration, rule=rule).objects) >= -1e-12).all()
 
 
 def test_defences_are_read_from_text():
@@ -191,7 +194,7 @@ def test_a_suspicion_that_most_genuine_samples_have_is_not_unusual():
     assert (share >= true / 2.5).all(), "as exact as the stored shares are apart"
     assert (share[1:] < 2.5 * true[1:]).all()
     calibration = Calibration({("one", level): tail for level in ("returns", "frames")})
-    verdict = fused({"one": Verdict(column, None, 0.0)}, calibration, rule="max")
+    verdict = fuse_verdicts({"one": Verdict(column, None, 0.0)}, calibration, rule="max")
     for level in FALSE_ALARMS:
         limit = fused_threshold(calibration, ["one"], level=level, rule="max")
         assert np.mean(verdict.returns > limit) <= FALSE_ALARMS[level]

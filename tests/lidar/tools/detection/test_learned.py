@@ -26,7 +26,7 @@ from lidar.tools.detection.forest import forest_of, read_forest
 from lidar.tools.detection.learned import CLASSES, Learned, read_model, scores_of
 from lidar.tools.detection.registry import MODEL, read_detector
 from lidar.tools.redteam.evaluate import accuracies
-from lidar.tools.redteam.measure import AttackCase, measured
+from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure
 from lidar.tools.train import examples_of, train
 from lidar.traffic.populate import TrafficOptions
@@ -202,7 +202,7 @@ def _f1(folder: Path, out: Path, detector: str) -> float:
     """Of road users within 40 m that have ten returns or more."""
     measure = Measure()
     case = AttackCase(folder, None, out / f"{detector}.json", (), measure.score, detector)
-    frames = [(k, frame) for k, frame in enumerate(measured(case)["frames"])]
+    frames = [(k, frame) for k, frame in enumerate(measure_drive(case)["frames"])]
     rows = [
         row
         for row in accuracies(frames, measure=measure, known={"setting": {}, "scene": ""})

@@ -22,7 +22,7 @@ from lidar.geometry.time_scales import posix_ns
 from lidar.options import EvaluateOptions
 from lidar.tools.evaluation.figures import qualities
 from lidar.tools.evaluation.intervals import correlation_time, statistics
-from lidar.tools.evaluation.matching import PosePairs, alignment, matched
+from lidar.tools.evaluation.matching import PosePairs, alignment, match_poses
 from lidar.tools.evaluation.pose_errors import (
     absolute,
     by_axis,
@@ -73,7 +73,7 @@ def evo_aligned(estimate, truth, kind):
 
 
 def aligned(estimate, truth, kind):
-    pairs = matched(estimate, truth, how="nearest")
+    pairs = match_poses(estimate, truth, how="nearest")
     return PosePairs(alignment(pairs, kind).of(pairs.estimate), pairs.truth, pairs.left_out)
 
 
@@ -102,7 +102,7 @@ def test_absolute_errors_are_those_of_evo(kind, seed):
 def test_relative_errors_are_those_of_evo(delta, unit, stops):
     truth = walk(300, seed=4, stops=stops)
     estimate = wrong(truth, seed=5)
-    pairs = matched(estimate, truth, how="nearest")
+    pairs = match_poses(estimate, truth, how="nearest")
     found = over_frames(pairs, delta) if unit == "frames" else over_metres(pairs, delta)
     for relation, ours in (("translation_part", found.shift), ("rotation_angle_rad", found.turn)):
         rpe = metrics.RPE(
@@ -128,7 +128,7 @@ def test_the_nearest_poses_in_time_are_those_of_evo(seed, fewer, jitter):
     close = np.abs(shifted - truth.time_ns[rows]) <= 10_000_000
     assume(close.sum() >= 2)
     # evo compares seconds as floats, which do not hold nanoseconds: at the limit itself they differ.
-    pairs = matched(estimate, truth, how="nearest", gap_s=0.010001)
+    pairs = match_poses(estimate, truth, how="nearest", gap_s=0.010001)
     theirs = sync.associate_trajectories(evo_of(truth), evo_of(estimate), max_diff=0.010001)
     np.testing.assert_array_equal(pairs.truth.position, theirs[0].positions_xyz)
     np.testing.assert_array_equal(pairs.estimate.position, theirs[1].positions_xyz)
@@ -165,7 +165,7 @@ def test_segments_are_those_of_kitti_s_development_kit(count, lengths):
     truth = walk(count, seed=8)
     estimate = wrong(truth, seed=9)
     expected = devkit(truth, estimate, lengths, step=10 if lengths[0] >= 100 else 1)
-    found = segments(matched(estimate, truth, how="nearest"), lengths)
+    found = segments(match_poses(estimate, truth, how="nearest"), lengths)
     np.testing.assert_array_equal(np.column_stack([found.first, found.length]), expected[:, [0, 3]])
     np.testing.assert_allclose(found.shift, expected[:, 2], atol=1e-12)
     np.testing.assert_allclose(found.turn, expected[:, 1], atol=1e-7)  # an arc cosine near 1
@@ -196,7 +196,7 @@ def test_alignment_undoes_any_motion_of_its_kind(seed, kind):
 def test_a_straight_way_tells_no_roll():
     truth = walk(30, seed=0)
     straight = Path3D(truth.time_ns, np.outer(np.arange(30), [1.0, 2, 0.5]), np.tile(np.eye(3), (30, 1, 1)))
-    pairs = matched(straight, straight, how="nearest")
+    pairs = match_poses(straight, straight, how="nearest")
     with pytest.raises(InputError, match="on a line"):
         alignment(pairs, "se3")
     assert absolute(aligned(straight, straight, "yaw-position"))[0].max() < 1e-9
@@ -217,12 +217,12 @@ def test_the_truth_between_its_poses_is_interpolated():
     true = trajectory()
     full = Path3D(true.time_ns, true.position, Rotation.from_quat(true.quat_xyzw).as_matrix())
     coarse = full.take(slice(None, None, 10))  # every 0.1 s on a circle of 33 m at 10 m/s
-    pairs = matched(full, coarse, how="interpolated")
+    pairs = match_poses(full, coarse, how="interpolated")
     assert len(pairs) == len(full)
     chord = 1 / 8 / (10 / 0.3)  # sagitta of a metre
     assert absolute(pairs)[0].max() == pytest.approx(chord, rel=0.01)
     with pytest.raises(InputError, match="common times"):
-        matched(full, coarse, how="interpolated", gap_s=0.05)
+        match_poses(full, coarse, how="interpolated", gap_s=0.05)
 
 
 def correlated(rng, count, strength):
@@ -442,7 +442,7 @@ def test_what_cannot_be_compared_ends_with_a_line(tmp_path, words, told):
 def test_evo_and_this_program_agree_on_umeyama():
     truth = walk(50, seed=1)
     estimate = wrong(truth, seed=2)
-    found = alignment(matched(estimate, truth, how="nearest"), "sim3")
+    found = alignment(match_poses(estimate, truth, how="nearest"), "sim3")
     rotation, shift, scale = geometry.umeyama_alignment(
         estimate.position.T, truth.position.T, with_scale=True
     )

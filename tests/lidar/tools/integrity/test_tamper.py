@@ -14,7 +14,7 @@ from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.sensors.camera.png import read_png
 from lidar.sensors.camera.render import CameraImage
-from lidar.signal.registry import numbered, read_stage, read_stages
+from lidar.signal.registry import number_stages, read_stage, read_stages
 from lidar.signal.run import image_past
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
@@ -95,7 +95,7 @@ def test_shifted_time_stamps_are_later_and_named(signed, tmp_path):
     assert (finding.what, finding.place) == ("changed", "lidar_top/timestamps.csv")
 
 
-SNOW = numbered(read_stage(one.table()) for one in read_weather("snow=10"))
+SNOW = number_stages(read_stage(one.table()) for one in read_weather("snow=10"))
 BLIND = read_stages(["camera_blind:power=30"]).stages
 
 

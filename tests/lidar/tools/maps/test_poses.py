@@ -21,7 +21,7 @@ from lidar.options import MapOptions
 from lidar.tools.maps.aggregate import aggregate
 from lidar.tools.maps.aligned_motion import aligned_motion
 from lidar.tools.maps.measured_poses import MeasuredPositions, RelativeMotion, measured_motion, poses_by_fixes
-from lidar.tools.maps.pose_graph import fitted
+from lidar.tools.maps.pose_graph import fit_poses
 
 LEVER = np.array([0.6, 0.2, 1.6])
 
@@ -67,7 +67,7 @@ def rms(values):
 def test_exact_fixes_and_motion_give_the_true_poses(count):
     true = circle(count)
     fixes = fixes_of(true, sigma=0.0, rng=np.random.default_rng(0))
-    found = fitted(motion_of(true), fixes)
+    found = fit_poses(motion_of(true), fixes)
     assert errors(found, true).max() < 1e-4
     assert (
         Rotation.from_matrix(np.swapaxes(found[:, :3, :3], 1, 2) @ true[:, :3, :3]).magnitude().max() < 1e-5
@@ -79,7 +79,7 @@ def test_a_graph_is_nearer_to_the_truth_than_fixes_and_motion(outliers):
     true, rng = circle(60), np.random.default_rng(1)
     fixes = fixes_of(true, sigma=1.0, rng=rng, outliers=outliers)
     motion = motion_of(true, longer=0.002, turned=0.001)
-    found = errors(fitted(motion, fixes), true)
+    found = errors(fit_poses(motion, fixes), true)
     by_motion = errors(true[0] @ motion.poses(), true)
     by_fixes = errors(poses_by_fixes(fixes, fixes.time_ns), true[:-1])
     assert rms(found) < 0.6 * rms(by_fixes)
@@ -95,7 +95,7 @@ def test_a_drive_on_a_hill_is_not_levelled(slope):
     true[:, 2, 3] = slope * 6.0 * np.arange(60)
     motion = motion_of(true)
     motion.sigma[:] = [0.0006] * 3 + [0.006] * 3
-    found = fitted(motion, fixes_of(true, sigma=0.02, rng=np.random.default_rng(0)))
+    found = fit_poses(motion, fixes_of(true, sigma=0.02, rng=np.random.default_rng(0)))
     assert errors(found, true).max() < 0.1
 
 
@@ -107,7 +107,7 @@ def test_precise_fixes_before_an_outage_place_the_poses_within_it():
     fixes.sigma[30:] = 1.0
     motion = motion_of(true)
     motion.sigma[:] = [0.0006] * 3 + [0.006] * 3
-    assert errors(fitted(motion, fixes), true).max() < 0.3
+    assert errors(fit_poses(motion, fixes), true).max() < 0.3
 
 
 def test_poses_by_exact_fixes_are_the_true_ones():

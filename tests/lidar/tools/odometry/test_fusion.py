@@ -13,7 +13,7 @@ from lidar.options import OdometryOptions
 from lidar.sensors.navigation.gnss import NAMES, Fixes
 from lidar.sensors.navigation.imu import Inertial
 from lidar.sensors.rig.imu_grades import PRESETS
-from lidar.tools.odometry.fusion import Fixed, Unit, fixes_of, fused
+from lidar.tools.odometry.fusion import Fixed, Unit, fixes_of, fuse_measurements
 from lidar.tools.odometry.run import estimate_motion
 from lidar.tools.odometry.settings import OdometrySettings
 
@@ -85,7 +85,7 @@ def errors(found):
 
 def run(given, **words):
     words = {"unit": None, "steps": None, "step_sigma": None} | words
-    return fused(KNOTS, given, settings=SETTINGS, **words)
+    return fuse_measurements(KNOTS, given, settings=SETTINGS, **words)
 
 
 @pytest.mark.parametrize("how", ["imu", "odometry", "both"])
@@ -119,7 +119,7 @@ def test_fixes_on_both_sides_carry_a_unit_through_an_outage():
 def test_short_drives_with_any_unit_have_poses_and_deviations(grade, stated):
     """Biases are known to 1e-5 rad/s and places to metres: normal equations of both have no digits left."""
     time_ns = np.arange(0, 41) * 50_000_000
-    found = fused(
+    found = fuse_measurements(
         time_ns,
         fixes(seconds=2.0, stated=stated),
         unit=unit(seconds=2.0, grade=grade),

@@ -16,7 +16,7 @@ from lidar.geometry.trajectory_tum import read_tum
 from lidar.motion.replay import read_replay
 from lidar.options import OdometryOptions
 from lidar.tools.odometry.deskewing import still
-from lidar.tools.odometry.estimate import propagated
+from lidar.tools.odometry.estimate import propagate
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.run import estimate_motion
 from lidar.tools.odometry.scans import scans_of
@@ -94,7 +94,7 @@ def test_errors_of_heading_grow_to_errors_across_the_way():
     poses[:, 0, 3] = np.arange(101)
     covariance = np.zeros((100, 6, 6))
     covariance[:, 2, 2] = 1e-6
-    sigma = propagated(poses, covariance)
+    sigma = propagate(poses, covariance)
     assert sigma[-1, 4] == pytest.approx(1e-3 * np.sqrt((np.arange(100.0) ** 2).sum()))
     assert sigma[-1, 2] == pytest.approx(1e-2)
     assert sigma[-1, 3] == 0

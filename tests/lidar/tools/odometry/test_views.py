@@ -21,7 +21,7 @@ from lidar.tools.odometry.view_geometry import (
     moved_back,
     pose_of,
     scaled_motion,
-    triangulated,
+    triangulate,
     two_view_pose,
 )
 from lidar.tools.odometry.visual_tracking import _at_start
@@ -163,7 +163,7 @@ def test_two_views_tell_turn_and_direction_and_their_distance_the_rest(camera):
     length = np.linalg.norm(true[:3, 3])
     assert difference(pose([0, 0, 0], true[:3, 3] / length), pose([0, 0, 0], found[:3, 3]))[1] < 1e-3
     found[:3, 3] *= length
-    distance, _ = triangulated(first, second, pose=found, sigma=np.full(150, 1e-3))
+    distance, _ = triangulate(first, second, pose=found, sigma=np.full(150, 1e-3))
     known = np.isfinite(distance)
     assert known.mean() > 0.9
     np.testing.assert_allclose(distance[known], np.linalg.norm(points, axis=1)[known], rtol=0.02)

@@ -30,7 +30,7 @@ from lidar.geometry.mounts import Mount
 from lidar.options import DriveOptions
 from lidar.tools.plots import FIGURES, plot
 from lidar.tools.plots.coverage import _coarser
-from lidar.tools.plots.drawn import thinned
+from lidar.tools.plots.drawn import thin
 from lidar.tools.plots.sweeps import _image_sides
 
 SCANNER = "lidar_top"
@@ -239,7 +239,7 @@ def test_long_lines_keep_their_peaks_and_gaps():
     x = np.linspace(0, 1, 100_000)
     y = np.sin(40 * x)
     y[5000], y[70_000:70_200] = 9.0, np.nan
-    points = thinned(x, y)
+    points = thin(x, y)
     assert len(points) < 7000
     assert max(v for _, v in points if math.isfinite(v)) == 9.0
     assert any(math.isnan(v) for _, v in points)

@@ -16,7 +16,7 @@ from geoscene.classes import Class
 from geoscene.scene import Scene
 from lidar.errors import InputError
 from lidar.tools.redteam import redteam
-from lidar.tools.redteam.evaluate import Figures, evaluated
+from lidar.tools.redteam.evaluate import Figures, evaluate
 from lidar.tools.redteam.measure import KIND_OF
 from lidar.tools.redteam.plan import Attack, Measure, Run, read_plan
 from lidar.tools.redteam.report import setting_tables
@@ -132,7 +132,7 @@ def test_known_figures_give_known_rates(written: Callable[..., Path]) -> None:
     changed = [_frame(k / 10, suspicion=0.99 if k >= 40 else 0.5, forged=1) for k in range(80)]
     untouched = [_frame(8 + k / 10, suspicion=0.1) for k in range(20)]
     conditions = {"scene": "city"}
-    found = evaluated(
+    found = evaluate(
         [
             Figures(Run(drives[0], None, conditions, drives[0].name), plain, []),
             Figures(Run(drives[1], attack, conditions, drives[0].name), changed + untouched, []),
@@ -163,7 +163,7 @@ def test_a_hidden_road_user_counts_while_no_alarm_is_raised(written: Callable[..
     attack = Attack("dazzle", "remove", "hide")
     plain = [_frame(k / 10, suspicion=0.1) for k in range(40)]
     changed = [_frame(k / 10, suspicion=0.9 * (k % 2), targets=2, hidden=1) | {"lost": 50} for k in range(40)]
-    found = evaluated(
+    found = evaluate(
         [
             Figures(Run(drives[0], None, {}, drives[0].name), plain, []),
             Figures(Run(drives[1], attack, {}, drives[0].name), changed, []),
@@ -192,7 +192,7 @@ def test_defences_together_notice_what_each_notices(written: Callable[..., Path]
             found.append(frame | {"suspicion": values, "object_suspicion": {}})
         return found
 
-    found = evaluated(
+    found = evaluate(
         [
             Figures(Run(drives[0], None, {}, drives[0].name), frames(attacked=False), []),
             Figures(Run(drives[1], attack, {}, drives[0].name), frames(attacked=True), []),
@@ -211,7 +211,7 @@ def test_a_fix_that_is_off_misleads(written: Callable[..., Path]) -> None:
     attack = Attack("drift", "gnss_spoof", "mislead")
     plain = [_frame(k / 10, suspicion=0.1) for k in range(40)]
     changed = [_frame(k / 10, suspicion=0.9 * (k >= 30)) | {"fix_error": k / 20} for k in range(40)]
-    found = evaluated(
+    found = evaluate(
         [
             Figures(Run(drives[0], None, {}, drives[0].name), plain, []),
             Figures(Run(drives[1], attack, {}, drives[0].name), changed, []),
@@ -236,7 +236,7 @@ def test_settings_stand_side_by_side_and_attacks_are_ordered(written: Callable[.
         for attack, forged in ((weak, k), (strong, 1)):
             changed = [_frame(j / 10, suspicion=0.9, forged=forged) | {"lost": 50} for j in range(40)]
             figures.append(Figures(Run(drives[1], attack, conditions, "plain"), changed, []))
-    found = evaluated(figures, [weak, strong], measure=Measure())
+    found = evaluate(figures, [weak, strong], measure=Measure())
     assert list(dict.fromkeys(row.attack for row in found.success)) == ["strong", "weak"]
     tables = {title: (texts, shares) for title, texts, shares in setting_tables(found)}
     texts, shares = tables["Success by setting"]
@@ -258,7 +258,7 @@ def test_areas_of_one_block_have_no_interval(written: Callable[..., Path]) -> No
             Figures(Run(drives[0], None, {}, drives[0].name), plain, []),
             Figures(Run(drives[1], attack, {}, drives[0].name), changed, []),
         ]
-        found[seconds] = evaluated(figures, [attack], measure=Measure()).detection[0].score.auc
+        found[seconds] = evaluate(figures, [attack], measure=Measure()).detection[0].score.auc
     assert np.isfinite(found[1][0])
     assert np.isnan(found[1][1:]).all()
     assert np.isfinite(found[3]).all()

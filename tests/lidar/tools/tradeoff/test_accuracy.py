@@ -18,9 +18,9 @@ from lidar.simulation.drive import DriveSummary, drive
 from lidar.simulation.plan import plan_drive
 from lidar.tools.sweep import sweep
 from lidar.tools.tradeoff import accuracy, profile
-from lidar.tools.tradeoff.accuracy import CheckedDrive, Planned, driven, pace_of, picked
+from lidar.tools.tradeoff.accuracy import CheckedDrive, Planned, driven, pace_of, pick_settings
 from lidar.tools.tradeoff.choice import Wanted, choice, worst
-from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, next_drive, resampled
+from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, next_drive, resample
 from lidar.tools.tradeoff.profile import Candidate, Profile, profile_of
 from lidar.tools.tradeoff.profile_errors import drive_estimates
 from lidar.tools.tradeoff.sampling import SampledError, range_figures, sampled_error
@@ -258,7 +258,7 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
         weight = np.r_[np.ones(120), np.full(120, (5000 - 120) / 120)]
         return SampledError(errors[np.r_[hard, easy]], weight, missed=0.0, extra=0.0, returns=5000.0)
 
-    found = resampled([sampled(errors) for errors in every], seed=0, figures=range_figures)
+    found = resample([sampled(errors) for errors in every], seed=0, figures=range_figures)
     for percent, tolerance in ((50, 0.2), (90, 0.2), (99, 0.1), (99.9, 0.01)):
         true, one = np.quantile(every, percent / 100), found[f"range_{percent}_m"]
         assert one.value == pytest.approx(true, rel=tolerance)
@@ -324,11 +324,11 @@ def measured_before(monkeypatch):
     def again(*_args, **_options):
         raise AssertionError("measured again")
 
-    monkeypatch.setattr(profile, "_measured", again)
+    monkeypatch.setattr(profile, "_measure", again)
 
 
 def accurate(scene, out, *, options=DRIVE, by):
-    pick = picked(scene, options, wanted=by, out=out)
+    pick = pick_settings(scene, options, wanted=by, out=out)
     return driven(scene, out, options=options, wanted=by, pick=pick)
 
 
@@ -459,7 +459,7 @@ def test_units_that_no_sensor_has_are_refused(scene, tmp_path, images, accuracy,
     rig = tmp_path / "eye.toml"
     rig.write_text(EYE.replace("IMAGES", images))
     with pytest.raises(InputError, match=line):
-        picked(scene, replace(DRIVE, rig=str(rig)), wanted=AccuracyOptions(accuracy))
+        pick_settings(scene, replace(DRIVE, rig=str(rig)), wanted=AccuracyOptions(accuracy))
 
 
 def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
@@ -480,9 +480,9 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
         assert 0 < notes[f"{kind}_depth_error_m"]["front"]["value"] <= 0.0021
     assert "levels) for front" in done.to_text()
     depths = AccuracyOptions("5mm", profile_cache=tmp_path)
-    assert picked(scene, options, wanted=depths).settings == {}
+    assert pick_settings(scene, options, wanted=depths).settings == {}
     with pytest.raises(InputError, match="`settings` supersample=2: `accuracy` picks it"):
-        picked(scene, replace(options, settings=(("supersample", "2"),)), wanted=by)
+        pick_settings(scene, replace(options, settings=(("supersample", "2"),)), wanted=by)
 
 
 @pytest.mark.usefixtures("measured_before")
@@ -552,7 +552,7 @@ def test_a_budget_leaves_time_for_planning_and_loading(scene, cache):
     with pytest.raises(InputError, match=r"allows 0.25 s for a drive of 0.5 s, and planning took 0.2 CPU s"):
         pace_of(planned, "2x-realtime")
     by = AccuracyOptions(budget="0.01x-realtime", profile_cache=cache)
-    pick = picked(scene, DRIVE, wanted=by)
+    pick = pick_settings(scene, DRIVE, wanted=by)
     assert pick.planned.plan.options == DRIVE
     assert pick.costs(1)["expected_speed"] < pick.costs(1)["expected_cpu_s"]["value"] ** -1
 
@@ -567,7 +567,7 @@ def test_a_drive_within_a_budget_is_planned_once(scene, cache, tmp_path, monkeyp
     monkeypatch.setattr(accuracy, "plan_drive", counted)
     monkeypatch.setattr("lidar.simulation.drive.plan_drive", counted)
     by = AccuracyOptions(budget="0.001x-realtime", profile_cache=cache)
-    pick = picked(scene, DRIVE, wanted=by)
+    pick = pick_settings(scene, DRIVE, wanted=by)
     done = driven(scene, tmp_path / "d", options=DRIVE, wanted=by, pick=pick)
     assert len(plans) == 1
     assert done.speed < done.summary.duration / done.summary.recording
