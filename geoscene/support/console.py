@@ -182,7 +182,8 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
 def _ended_by_interruptions(app: App) -> Iterator[None]:
     """Let the first interruption of the block raise KeyboardInterrupt, and end the program soon after.
 
-    What the block raises then counts as that: compiled code turns a KeyboardInterrupt into other errors.
+    Any exception of the block counts as an interruption once a signal has arrived: compiled code turns a
+    KeyboardInterrupt into other errors. The former signal handlers are restored at the end of the block.
     """
     arrived: list[int] = []
 
@@ -195,8 +196,9 @@ def _ended_by_interruptions(app: App) -> Iterator[None]:
             signal.setitimer(signal.ITIMER_REAL, _GRACE)
         raise KeyboardInterrupt
 
-    for interruption in _INTERRUPTIONS:
-        if signal.getsignal(interruption) != signal.SIG_IGN:  # as of SIGINT in the background of a script
+    former = {interruption: signal.getsignal(interruption) for interruption in _INTERRUPTIONS}
+    for interruption, handler in former.items():
+        if handler != signal.SIG_IGN:  # as of SIGINT in the background of a script
             signal.signal(interruption, interrupt)
     try:
         yield
@@ -204,6 +206,10 @@ def _ended_by_interruptions(app: App) -> Iterator[None]:
         if arrived:
             _exit_interrupted(app, arrived[0])
         raise
+    finally:
+        for interruption, handler in former.items():
+            if handler is not None:  # None: installed by other than Python
+                signal.signal(interruption, handler)
 
 
 def _exit_interrupted(app: App, number: int) -> NoReturn:

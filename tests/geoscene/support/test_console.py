@@ -36,7 +36,6 @@ def flat(number: int):
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    kept = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     thresholds = gc.get_threshold()
 
     def run(*words):
@@ -46,8 +45,6 @@ def run(monkeypatch, capsys):
         return ended.value.code, capsys.readouterr().err
 
     yield run
-    for number, handler in kept.items():
-        signal.signal(number, handler)
     gc.set_threshold(*thresholds)
 
 
@@ -73,6 +70,13 @@ def test_wrong_usage_is_one_line(run, words, message):
     assert code == 2
     assert message in text
     assert (text.startswith("program: "), text.count("\n")) == (True, 1)
+
+
+@pytest.mark.parametrize("words", [("detector", "train", "d"), ("flat", "3"), ("flat", "three")])
+def test_signal_handlers_are_those_of_before_the_program(run, words):
+    former = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    run(*words)
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == former
 
 
 def test_failures_have_another_exit_code(run):
