@@ -3,9 +3,9 @@
     python benchmarks/detector.py EXTRACTS [--folder DIR] [--write]
 
 EXTRACTS is a folder with the extracts of `PLACES`. Builds them, records 8 drives to train with and 12 to
-measure on, trains a model, and prints the tables of docs/security.md for the rules, for the model, and for
-one that was trained without the two places that are measured on. ``--write`` writes the model to
-lidar/tools/detection/learned.npz.
+measure on, trains a model, and prints the tables of docs/measurements/security.md for the rules, for the
+model, and for one that was trained without the two places that are measured on. ``--write`` writes the
+model to lidar/tools/detection/learned.npz.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """What the watermark and the hash chain make of noise, other encodings and tampering, on a recorded drive.
 
-python benchmarks/watermark.py DRIVE prints tables as in docs/integrity.md; DRIVE has PCD clouds of a scanner.
+python benchmarks/watermark.py DRIVE prints tables as in docs/measurements/integrity.md; DRIVE has
+PCD clouds of a scanner.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     python benchmarks/weather.py SCENE [--frames 10] [--repetitions 5] [--fidelity standard] [--json]
 
-Prints the table of docs/weather.md. Frames of a random drive are simulated in turn in clear air and in each
-weather, in one thread: the rays, the echoes, the detector and the truth, without writing files. The cost is
-the CPU time of the thread over that of the same frame in clear air with the threshold on, the median over
-frames and repetitions.
+Prints the table of docs/measurements/weather.md. Frames of a random drive are simulated in turn in clear
+air and in each weather, in one thread: the rays, the echoes, the detector and the truth, without writing
+files. The cost is the CPU time of the thread over that of the same frame in clear air with the threshold
+on, the median over frames and repetitions.
 """
 
 from __future__ import annotations

@@ -854,7 +854,7 @@ class OdometryOptions:
         tuple[tuple[str, str], ...],
         Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
     ] = ()
-    """One setting of the method; repeat for more. docs/odometry.md lists them."""
+    """One setting of the method; repeat for more. docs/reference/odometry.md lists them."""
 
     settings_file: Path | None = None
     """TOML file of settings; --set goes before it."""
@@ -1103,8 +1103,8 @@ class DefendOptions:
     --out, for --calibration."""
 
     calibration: Path | None = None
-    """TOML file of thresholds and suspicions of genuine data; by default those of docs/defences.md, for
-    the detector rules."""
+    """TOML file of thresholds and suspicions of genuine data; by default those of
+    docs/reference/defences.md, for the detector rules."""
 
     seed: Annotated[int, Parameter(converter=whole)] = 0
     """Seed of the defences' random numbers and of the intervals."""
@@ -1143,7 +1143,7 @@ class DenoiseOptions:
 
     methods: Annotated[tuple[str, ...], Parameter(name="--method"), NAMED]
     """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE:KEY=VALUE.
-    docs/weather.md lists their parameters."""
+    docs/reference/weather.md lists their parameters."""
 
 
 def classes_of(names: Iterable[str], *, option: str = "without") -> list[int]:

@@ -121,7 +121,8 @@ def inputs(tmp_path_factory):
     write_overture(folder / "buildings.parquet", rows)
     write_slope(folder / "heights.tif", BOX, rise=0.3)
     write_survey(folder / "survey.laz", BOX)
-    pages = [(ROOT / "docs" / f"{name}.md").read_text("utf-8") for name in ("stages", "sweeps", "security")]
+    reference = ROOT / "docs" / "reference"
+    pages = [(reference / f"{name}.md").read_text("utf-8") for name in ("stages", "sweeps", "security")]
     stages, sweep, matrix = (page.split("```toml")[1].split("```")[0] for page in pages)
     texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
     texts |= {"sweep.toml": brief(sweep), "matrix.toml": brief(matrix)}
@@ -241,7 +242,7 @@ def test_documented_commands_succeed(source, folder):
         SUCCEEDED.add(named)
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/python.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/guide/python.md"])
 def test_examples_in_python_succeed(page, folder, monkeypatch):
     """The blocks of a page, one after the other; simulated drives are as short as recorded ones."""
     examples = [part.split("```")[0] for part in (ROOT / page).read_text("utf-8").split("```python")[1:]]

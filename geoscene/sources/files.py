@@ -163,7 +163,7 @@ def read_osm(
 
     The first bytes tell the format, not the name. Ids may be negative and in any order, and relations may
     come before ways: the result does not depend on the order in the file. Defects are repaired or dropped by
-    the rules of docs/sources.md and listed in ``problems``.
+    the rules of docs/reference/sources.md and listed in ``problems``.
 
     Parameters
     ----------

@@ -192,7 +192,7 @@ def sweep(
     ----------
     file
         TOML file with the options of all drives in [drive], lists of values in [grid], and maps to build in
-        [[map]]; docs/sweeps.md has an example.
+        [[map]]; docs/reference/sweeps.md has an example.
     out
         Directory to write to: a dataset for each drive, and the table sweep.json, also as sweep.csv.
     workers
@@ -244,7 +244,7 @@ def redteam(
     ----------
     file
         TOML file with drives as for lidar sweep, attacks in [[attack]] and defences in [defences];
-        docs/security.md has an example.
+        docs/reference/security.md has an example.
     out
         Directory to write to: drives, redteam.json, CSV tables and the page redteam.html.
     workers

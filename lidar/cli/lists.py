@@ -35,8 +35,8 @@ def stages(*, json: JsonFlag = False) -> int:
     print(
         "\nEvery stage also takes seed (of its random numbers; the drive's by default) and sensor (the only"
         "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE"
-        "\n(docs/stages.md). Attacks, from inject to patch, are also values of --attack (docs/attacks.md);"
-        "\nweather has shorter texts for --weather (docs/weather.md)."
+        "\n(docs/reference/stages.md). Attacks, from inject to patch, are also values of --attack"
+        "\n(docs/reference/attacks.md); weather has shorter texts for --weather (docs/reference/weather.md)."
     )
     return 0
 
@@ -60,7 +60,9 @@ def rigs(*, json: JsonFlag = False) -> int:
         scanners = " ".join(row["lidars"].values())
         cells.append([row["name"], row["vehicle"], scanners, str(len(row["cameras"])), row["source"]])
     print(columns(cells))
-    print("\nA rig of your own is a TOML file: lidar drive SCENE --rig FILE.toml (see docs/sensors.md).")
+    print(
+        "\nA rig of your own is a TOML file: lidar drive SCENE --rig FILE.toml (docs/reference/sensors.md)."
+    )
     return 0
 
 
@@ -86,7 +88,8 @@ def sensors(*, json: JsonFlag = False) -> int:
         cells.append([row["name"], model, row["kind"], *figures, f"{row['wavelength_nm']:g}"])
     print(columns(cells))
     print(
-        "\n--json adds the source of every number; a sensor of your own is a TOML file (see docs/sensors.md)."
+        "\n--json adds the source of every number; a sensor of your own is a TOML file"
+        "\n(docs/reference/sensors.md)."
     )
     return 0
 
@@ -151,7 +154,7 @@ def selftest(
     """Check on this machine that errors stay within documented bounds in extreme cases.
 
     Such as grazing rays, ranges of 100 km, places near the poles and zone borders, long drives and large
-    scenes; docs/extremes.md lists them. Takes about 10 s. Exits with 1 if a bound does not hold.
+    scenes; docs/measurements/extremes.md lists them. Takes about 10 s. Exits with 1 if a bound does not hold.
 
     For example:
 
@@ -166,7 +169,7 @@ def selftest(
     json
         Print the table and the machine as JSON.
     markdown
-        Print the table as in docs/extremes.md.
+        Print the table as in docs/measurements/extremes.md.
     quiet
         Show no progress bars.
     """

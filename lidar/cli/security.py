@@ -189,7 +189,7 @@ def defences(*, json: JsonFlag = False) -> int:
     print(columns(cells))
     print(
         "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE:KEY=VALUE judges recorded data"
-        "\n(docs/defences.md)."
+        "\n(docs/reference/defences.md)."
     )
     return 0
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from geoscene.scene import Scene
 
 _FAR = 10_000.0
-"""Metres from their origin up to which rays at edges are tested (docs/extremes.md)."""
+"""Metres from their origin up to which rays at edges are tested (docs/measurements/extremes.md)."""
 
 ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""

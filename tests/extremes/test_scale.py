@@ -13,7 +13,7 @@ from lidar.tools.selftest.cases import CASES, GROUPS
 from lidar.tools.selftest.regions import CASES as REGIONS
 from lidar.tools.selftest.scale import CASES as SCALE
 
-PAGE = ROOT / "docs" / "extremes.md"
+PAGE = ROOT / "docs" / "measurements" / "extremes.md"
 
 
 @pytest.mark.parametrize("case", [*SCALE, *REGIONS], ids=lambda case: case.name)

@@ -8,7 +8,7 @@ from helpers.programs import ENVIRONMENT, command
 
 from geoscene.classes import Class, class_rows, materials
 
-DOCUMENT = ROOT / "docs" / "classes.md"
+DOCUMENT = ROOT / "docs" / "reference" / "classes.md"
 
 
 def test_every_class_and_material_is_documented_with_its_codes():

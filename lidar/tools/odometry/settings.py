@@ -19,7 +19,7 @@ def _setting(default: float, meaning: str, *, low: float, high: float) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class OdometrySettings:
-    """Settings of odometry; docs/odometry.md lists them."""
+    """Settings of odometry; docs/reference/odometry.md lists them."""
 
     min_range: float = _setting(
         3.0, "metres from a scanner, below which points are left out", low=0, high=1000

@@ -131,7 +131,7 @@ def print_table(done: Sequence[Outcome]) -> None:
 
 
 def markdown(done: Sequence[Outcome]) -> str:
-    """The tables of docs/extremes.md, one for each group."""
+    """The tables of docs/measurements/extremes.md, one for each group."""
     lines = ["Measured on: " + "; ".join(f"{name} {value}" for name, value in machine().items()) + "."]
     for group in dict.fromkeys(one.case.group for one in done):
         lines += ["", f"## {group.capitalize()}", "", "| case | samples | bound | measured | limited by |"]

@@ -1,4 +1,4 @@
-"""Media against published and computed values; the sources are in docs/weather.md."""
+"""Media against published and computed values; the sources are in docs/reference/weather.md."""
 
 import numpy as np
 import pytest
