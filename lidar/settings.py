@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from typing import Any, NamedTuple
 
 from lidar.dataset.deskew import MOMENTS
-from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
+from lidar.dataset.formats import FORMATS, LABELS, REMOVED, Format, LabelFormat
 from lidar.errors import InputError
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera import settings as camera_settings
@@ -164,7 +164,8 @@ class RecordingSettings:
         if not self.formats:
             raise InputError(f"`formats`: give one or more of {', '.join(FORMATS)}")
         if unknown := sorted(set(self.formats) - set(FORMATS)):
-            raise InputError(f"`formats` {','.join(unknown)}: unknown; there are {', '.join(FORMATS)}")
+            why = REMOVED.get(unknown[0], f"unknown; there are {', '.join(FORMATS)}")
+            raise InputError(f"`formats` {','.join(unknown)}: {why}")
         for form in self.cloud_formats:
             form.require()
         if unknown := sorted(set(self.labels) - set(LABELS)):

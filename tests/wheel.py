@@ -38,7 +38,7 @@ BOX = "--bbox=24.940,60.168,24.944,60.171"
 USES = (
     ("geoscene", "build", "--demo", BOX, "--relief=full", "-o=scene", "--quiet"),
     ("geoscene", "export", "scene", "-o=surface.tif"),
-    (*ROAD, "--traffic=on", "--format=csv,laz,pcd-compressed", "--deskew=middle", "-o=town"),
+    (*ROAD, "--traffic=on", "--format=csv,laz,npz", "--deskew=middle", "-o=town"),
     (*ROAD, "--weather=rain=10mm/h", "--road=by-weather", "-o=rain"),
     (*ROAD, "--rig=vlp16", "--fidelity=survey", "--weather=fog=80m", "-o=fog"),
     (*DRIVE, "--rig=drone", "--survey=all", "--altitude=80", "--turns", "--weather=snow=2mm/h", "-o=snow"),

@@ -77,7 +77,6 @@ def _others(folder: Path, *, world: Table, local: Table, info: LasInfo) -> Itera
     names = tuple(world)
     colored = world | {name: np.zeros(rows(world), np.uint8) for name in ("red", "green", "blue")}
     theirs = {
-        "pcd-compressed": ("pypcd4", pypcd4_written, "same columns; pypcd4: liblzf"),
         "npz": ("numpy", numpy_npz, "same bytes"),
         "parquet": (
             "pyarrow",
@@ -110,16 +109,6 @@ def map_written(path: Path, table: Table, *, info: LasInfo, columns: tuple[str, 
     colors = ("red", "green", "blue")
     with MAPS["copc"].open_map(path, info=info, columns=(*columns, *colors)) as append:
         append(table)
-
-
-def pypcd4_written(path: Path, table: Table) -> None:
-    """Write a table as compressed PCD by pypcd4 alone."""
-    from pypcd4 import Encoding, PointCloud  # noqa: PLC0415 - for development only
-
-    cloud = PointCloud.from_points(
-        list(table.values()), tuple(table), tuple(column.dtype.type for column in table.values())
-    )
-    cloud.save(path, encoding=Encoding.BINARY_COMPRESSED)
 
 
 def numpy_npz(path: Path, table: Table) -> None:

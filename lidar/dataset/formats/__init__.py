@@ -146,7 +146,6 @@ FORMATS = {
     for row in (
         Format("pcd", "pcd", ".pcd", maps=True),
         Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
-        Format("pcd-compressed", "pcd_compressed", ".compressed.pcd"),
         Format("ply", "ply", ".ply", maps=True),
         Format("csv", "text", ".csv", exact=False),
         Format("npz", "npz", ".npz"),
@@ -169,6 +168,9 @@ FORMATS = {
     )
 }
 """Point-cloud formats by name."""
+
+REMOVED = {"pcd-compressed": "no longer written; use pcd, or npz or parquet, which are compressed"}
+"""Names of former formats, and what to use instead."""
 
 MAPS = {
     row.name: row

@@ -1,4 +1,4 @@
-"""PCD 0.7 as PCL, Open3D and ROS tools read it: written as binary, read in all three encodings."""
+"""PCD 0.7 as PCL, Open3D and ROS tools read it: written as binary, read as binary and ASCII."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ import io
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
-from lidar.dataset.formats.lzf import decompress
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
 from lidar.errors import FormatError
 
@@ -26,7 +23,7 @@ def pcd_header(table: Table, points: int, *, data: str = "binary", comment: str 
     """The header of a PCD file with the columns of a table.
 
     points  : number of points in the file
-    data    : encoding of the points: ``binary``, ``ascii`` or ``binary_compressed``
+    data    : encoding of the points: ``binary`` or ``ascii``
     comment : a line after the format's own comment line
     """
     fields = [column.dtype for column in table.values()]
@@ -53,9 +50,9 @@ def write(path: Path, table: Table, *, comment: str = "") -> None:
 
 
 def read(path: Path) -> Table:
-    """The table of a PCD file, whatever its encoding; ``t`` comes back as ``time_ns``.
+    """The table of a binary or ASCII PCD file; its field ``t`` is the column ``time_ns``.
 
-    Raises FormatError for several values a field and damaged files.
+    Raises FormatError for compressed and damaged files, and for fields of several values.
     """
     head, marker, rest = path.read_bytes().partition(b"\nDATA ")
     encoding, _, body = rest.partition(b"\n")
@@ -66,10 +63,11 @@ def read(path: Path) -> Table:
     }
     if not marker or "FIELDS" not in entries:
         raise FormatError(f"{path}: not a PCD file (no FIELDS and DATA lines)")
-    if encoding.strip() not in (b"binary", b"ascii", b"binary_compressed"):
+    if encoding.strip() not in (b"binary", b"ascii"):
+        stated = encoding.decode("ascii", "replace").strip()[:40]
         raise FormatError(
-            f"{path}: DATA {encoding.decode('ascii', 'replace').strip()[:40]} is none of binary, ascii and"
-            " binary_compressed"
+            f"{path}: DATA {stated} is not supported; write it again as binary or ascii"
+            " (pcl_convert_pcd_ascii_binary)"
         )
     if set(entries.get("COUNT", ["1"])) != {"1"}:
         raise FormatError(f"{path}: has fields of several values (COUNT {' '.join(entries['COUNT'])})")
@@ -79,8 +77,6 @@ def read(path: Path) -> Table:
         kinds, points = np.dtype(list(zip(names, types, strict=True))), int(entries["POINTS"][0])
         if encoding.strip() == b"binary":
             data = np.frombuffer(body, kinds, points)
-        elif encoding.strip() == b"binary_compressed":
-            return _decompress(body, kinds, points=points)
         else:
             data = np.loadtxt(io.BytesIO(body), kinds, ndmin=1) if points else np.empty(0, kinds)
     except (KeyError, ValueError, TypeError, IndexError) as error:
@@ -88,19 +84,6 @@ def read(path: Path) -> Table:
     if len(data) != points:
         raise FormatError(f"{path}: holds {len(data)} points, and its header states {points}")
     return {name: data[name] for name in names}
-
-
-def _decompress(body: bytes, kinds: np.dtype[np.void], *, points: int) -> Table:
-    """The columns of a compressed body; raises ValueError if it is damaged."""
-    packed, size = (int(word) for word in np.frombuffer(body, "<u4", 2))
-    if size != points * kinds.itemsize:
-        raise ValueError(f"{size} bytes stated for {points} points of {kinds.itemsize} bytes")
-    data = decompress(np.frombuffer(body, np.uint8, packed, 8) if packed else np.empty(0, np.uint8), size)
-    table, start = dict[str, NDArray[Any]](), 0
-    for name in kinds.names or ():
-        table[name] = np.frombuffer(data, kinds[name], points, start) if points else np.empty(0, kinds[name])
-        start += points * kinds[name].itemsize
-    return table
 
 
 def count(path: Path) -> int:

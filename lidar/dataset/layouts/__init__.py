@@ -184,15 +184,7 @@ EXPORTERS = {
             "ros2",
             "a ROS 2 recording (rosbag2) in MCAP",
             mark="metadata.yaml",
-            names=r"metadata\.yaml|drive\.(mcap|db3)",
-            hint="play it with ros2 bag play {quoted}",
-        ),
-        Exporter(
-            "ros2-sqlite3",
-            "ros2_sqlite3",
-            "a ROS 2 recording (rosbag2) in SQLite",
-            mark="metadata.yaml",
-            names=r"metadata\.yaml|drive\.(mcap|db3)",
+            names=r"metadata\.yaml|drive\.mcap",
             hint="play it with ros2 bag play {quoted}",
         ),
         Exporter(
@@ -214,3 +206,6 @@ EXPORTERS = {
     )
 }
 """Exporters by name."""
+
+REMOVED = {"ros2-sqlite3": "no longer written; use ros2 (MCAP), which ros2 bag convert turns into SQLite"}
+"""Names of former layouts, and what to use instead."""

@@ -18,7 +18,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """
-    topics = write_recording(dataset, folder, storage="MCAP", progress=progress)
+    topics = write_recording(dataset, folder, progress=progress)
     (folder / "metadata.yaml").unlink()
     write_json(folder / "foxglove.json", layout(topics))
     return message_counts(topics)

@@ -1,4 +1,4 @@
-"""A recorded drive as a ROS 2 recording: ``metadata.yaml`` and one file of messages, MCAP by default."""
+"""A recorded drive as a ROS 2 recording: ``metadata.yaml`` and one MCAP file of messages."""
 
 from __future__ import annotations
 
@@ -28,20 +28,19 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """
-    return message_counts(write_recording(dataset, folder, storage="MCAP", progress=progress))
+    return message_counts(write_recording(dataset, folder, progress=progress))
 
 
-def write_recording(dataset: Dataset, folder: Path, *, storage: str, progress: Progress) -> list[Topic]:
-    """Write the topics of a dataset, one message after the other, into an empty folder; return them.
+def write_recording(dataset: Dataset, folder: Path, *, progress: Progress) -> list[Topic]:
+    """Write the topics of a dataset, ordered by time, into an empty folder; return the topics.
 
-    storage : of rosbags: MCAP, with chunks compressed by zstd, or SQLITE3
+    The file of messages is MCAP with chunks compressed by zstd.
     """
     rosbag2 = need("rosbags.rosbag2", "ros")
     drive = RosDrive(dataset)
     topics = topics_of(drive)
-    bag = rosbag2.Writer(folder / NAME, version=_VERSION, storage_plugin=rosbag2.StoragePlugin[storage])
-    if storage == "MCAP":
-        bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
+    bag = rosbag2.Writer(folder / NAME, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP)
+    bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
     for key, text in _about(drive).items():
         bag.set_custom_data(key, text)
     total = sum(topic.count for topic in topics)

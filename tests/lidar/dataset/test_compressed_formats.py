@@ -1,23 +1,20 @@
-"""Compressed PCD, NPZ and Parquet against the readers of others."""
+"""NPZ and Parquet against the readers of others."""
 
 import io
 import sys
 import zipfile
 
-import lzf as reference
 import numpy as np
 import pyarrow.dataset
 import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pypcd4 import Encoding, PointCloud
 
 from geoscene.errors import MissingExtraError
-from lidar.dataset.formats import FORMATS, npz, parquet, pcd_compressed, read_table
-from lidar.dataset.formats.lzf import compress, decompress
+from lidar.dataset.formats import FORMATS, npz, parquet, read_table
 from lidar.dataset.formats.table import FrameInfo
-from lidar.errors import FormatError
+from lidar.errors import FormatError, InputError
 from lidar.settings import RecordingSettings
 
 
@@ -29,77 +26,6 @@ def table(n=400, seed=0):
         "ring": np.tile(np.arange(16, dtype=np.uint16), n // 16 + 1)[:n],
         "instance": rng.integers(-1, 9, n).astype(np.int32),
     }
-
-
-def as_array(data):
-    return np.frombuffer(data, np.uint8)
-
-
-TEXTS = st.one_of(
-    st.binary(max_size=2000),
-    st.builds(lambda word, times: word * times, st.binary(min_size=1, max_size=40), st.integers(1, 400)),
-    st.lists(st.sampled_from([b"abc", b"abcd", bytes(300), b"\xff"]), max_size=60).map(b"".join),
-)
-
-
-@settings(deadline=None, max_examples=100)
-@given(TEXTS)
-def test_lzf_is_read_by_liblzf_and_reads_what_liblzf_writes(data):
-    packed = compress(as_array(data))
-    assert decompress(packed, len(data)).tobytes() == data
-    if data:
-        assert reference.decompress(packed.tobytes(), len(data)) == data
-        theirs = reference.compress(data, 2 * len(data) + 16)
-        assert decompress(as_array(theirs), len(data)).tobytes() == data
-        assert len(packed) <= len(data) + len(data) // 32 + 1
-
-
-@settings(deadline=None, max_examples=150)
-@given(st.binary(max_size=80), st.integers(0, 2000))
-def test_no_bytes_make_lzf_read_or_write_outside_its_memory(data, size):
-    """Either they stand for exactly so many bytes, as LibLZF says too, or they are refused."""
-    try:
-        ours = decompress(as_array(data), size).tobytes()
-    except ValueError:
-        ours = None
-    if not data or not size:
-        assert ours is None or (not data and size == 0)
-        return
-    try:
-        theirs = reference.decompress(data, size)
-    except ValueError:
-        theirs = None
-    assert ours == (theirs if theirs is not None and len(theirs) == size else None)
-
-
-def test_pypcd4_reads_our_compressed_pcd_and_we_read_that_of_pypcd4(tmp_path):
-    cloud = table()
-    pcd_compressed.write(tmp_path / "a.compressed.pcd", cloud)
-    other = PointCloud.from_path(tmp_path / "a.compressed.pcd")
-    for name, column in cloud.items():
-        np.testing.assert_array_equal(other.pc_data["t" if name == "time_ns" else name], column)
-    other.save(tmp_path / "b.pcd", encoding=Encoding.BINARY_COMPRESSED)
-    for name, column in read_table(tmp_path / "b.pcd").items():
-        np.testing.assert_array_equal(column, cloud[name])
-
-
-@pytest.mark.parametrize(
-    ("at", "value", "says"),
-    [
-        (0, 10**6, "damaged"),
-        (0, 3, "3 compressed bytes cannot hold"),
-        (4, 10**6, "stated for"),
-        (4, 0, "stated for"),
-    ],
-)
-def test_compressed_pcd_with_sizes_that_cannot_be_is_refused(tmp_path, at, value, says):
-    path = tmp_path / "a.compressed.pcd"
-    pcd_compressed.write(path, table())
-    whole = path.read_bytes()
-    place = whole.index(b"binary_compressed\n") + 18 + at
-    path.write_bytes(whole[:place] + value.to_bytes(4, "little") + whole[place + 4 :])
-    with pytest.raises(FormatError, match=says):
-        read_table(path)
 
 
 def test_numpy_reads_our_npz_without_pickles(tmp_path):
@@ -163,7 +89,7 @@ def test_parquet_of_other_tables_is_refused(tmp_path):
         parquet.read(path)
 
 
-@pytest.mark.parametrize("name", ["pcd-compressed", "npz", "parquet"])
+@pytest.mark.parametrize("name", ["npz", "parquet"])
 @settings(deadline=None, max_examples=40)
 @given(seed=st.integers(0, 2**32))
 def test_changed_bytes_are_read_or_refused_in_one_line(tmp_path_factory, name, seed):
@@ -188,3 +114,8 @@ def test_a_drive_names_the_extra_that_its_format_needs_before_it_starts(monkeypa
     monkeypatch.setitem(sys.modules, FORMATS[name].extra.split()[0], None)
     with pytest.raises(MissingExtraError, match=rf"geoscene\[{extra}\]"):
         RecordingSettings(formats=("pcd", name))
+
+
+def test_a_removed_format_names_its_successors():
+    with pytest.raises(InputError, match="`formats` pcd-compressed: no longer written; use pcd"):
+        RecordingSettings(formats=("pcd-compressed",))

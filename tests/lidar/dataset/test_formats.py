@@ -213,7 +213,7 @@ HEAD = (
 @pytest.mark.parametrize(
     ("data", "count", "body", "says"),
     [
-        ("binary_compressed", "1 1", "", "damaged PCD"),
+        ("binary_compressed", "1 1", "", "binary_compressed is not supported; write it again"),
         ("ascii", "1 3", "", "several values"),
         ("ascii", "1 1", "1 2\n", "1 points, and its header states 2"),
         ("ascii", "1 1", "1 2\n3 four\n", "damaged"),
@@ -381,7 +381,7 @@ def test_laz_records_of_another_length_than_is_compressed_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("count", ["-1", "-2", "-999999999999"])
-@pytest.mark.parametrize("name", ["pcd", "pcd-ascii", "pcd-compressed", "ply"])
+@pytest.mark.parametrize("name", ["pcd", "pcd-ascii", "ply"])
 def test_fewer_than_no_points_are_refused(name, count, tmp_path):
     form = FORMATS[name]
     path = tmp_path / f"a{form.suffix}"

@@ -28,7 +28,7 @@ from lidar.dataset.layouts.ros_drive import RosDrive, ros_name
 from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
 from lidar.dataset.layouts.ros_topics import topics_of
 from lidar.dataset.navigation_files import FixHeights, read_fixes
-from lidar.errors import DatasetError, FormatError
+from lidar.errors import DatasetError, FormatError, InputError
 from lidar.options import DriveOptions
 from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png
 from lidar.sensors.navigation.gnss import fix_variances
@@ -36,6 +36,7 @@ from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.patterns.scanner2d import Scan2d
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive
+from lidar.tools.convert import convert
 from lidar.traffic.populate import TrafficOptions
 
 RIG = """
@@ -113,7 +114,7 @@ def recorded(scene_utm, tmp_path_factory):
 def bags(recorded, tmp_path_factory):
     """The drive by all exporters of ROS 2 messages, by their names."""
     folder = tmp_path_factory.mktemp("bags")
-    names = ("ros2", "ros2-sqlite3", "mcap")
+    names = ("ros2", "mcap")
     for name in names:
         EXPORTERS[name].export(recorded, folder / name)
     return {name: folder / name for name in names}
@@ -219,7 +220,7 @@ def test_clouds_are_the_recorded_ones_bit_for_bit(recorded, messages, name, topi
 
 
 def test_log_times_never_go_back_and_no_message_is_logged_before_it_is_complete(bags, messages):
-    for rows in (by_rosbags(bags["ros2"]), by_rosbags(bags["ros2-sqlite3"]), by_mcap(bags["mcap"])):
+    for rows in (by_rosbags(bags["ros2"]), by_mcap(bags["mcap"])):
         logged = [log_ns for _, log_ns, _ in rows]
         assert logged == sorted(logged)
     for log_ns, cloud in messages["/lidar_top/points"]:
@@ -466,12 +467,7 @@ def test_boxes_are_cubes_where_the_road_users_are(recorded, messages):
     assert "/front/boxes" not in messages, "40 times a second, and the same road users"
 
 
-def test_both_storages_and_the_lone_file_hold_the_same_messages(bags):
-    read = []
-    for name in ("ros2", "ros2-sqlite3"):
-        with Reader(bags[name]) as reader:
-            read.append([(c.topic, c.msgtype, t, bytes(data)) for c, t, data in reader.messages()])
-    assert read[0] == read[1]
+def test_the_recording_and_the_lone_file_hold_the_same_messages(bags):
     assert (bags["ros2"] / "drive.mcap").read_bytes() == (bags["mcap"] / "drive.mcap").read_bytes()
     with Reader(bags["ros2"]) as reader:
         (latched,) = (c for c in reader.connections if c.topic == "/tf_static")
@@ -480,6 +476,11 @@ def test_both_storages_and_the_lone_file_hold_the_same_messages(bags):
     about = metadata["rosbag2_bagfile_information"]["custom_data"]
     assert "OpenStreetMap" in about["attribution"]
     assert float(about["map_scale"]) == pytest.approx(0.9996, abs=1e-3)
+
+
+def test_the_removed_layout_names_its_successor(recorded, tmp_path):
+    with pytest.raises(InputError, match=r"`to` ros2-sqlite3: no longer written; use ros2"):
+        convert(recorded.path, tmp_path / "out", to="ros2-sqlite3")
 
 
 def test_the_layout_names_topics_of_the_recording(bags):
@@ -495,7 +496,7 @@ def test_the_layout_names_topics_of_the_recording(bags):
 
 
 def test_the_same_drive_gives_the_same_bytes(recorded, bags, tmp_path):
-    for name in ("ros2", "ros2-sqlite3", "mcap"):
+    for name in ("ros2", "mcap"):
         EXPORTERS[name].export(recorded, tmp_path / name)
         same_files(tmp_path / name, bags[name])
 
