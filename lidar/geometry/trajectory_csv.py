@@ -1,4 +1,4 @@
-"""A trajectory as CSV: ``trajectory.csv`` of a dataset, beside the manifest that holds its frame."""
+"""Trajectories as CSV: ``trajectory.csv`` of a dataset, whose manifest holds the frame."""
 
 from __future__ import annotations
 

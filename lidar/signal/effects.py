@@ -1,4 +1,4 @@
-"""What stages did to the frames of a run, counted by stage."""
+"""Counts of the changes that stages made to the frames of a run, by stage."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def row_changes(
     unit: str,
     columns: Sequence[str],
 ) -> dict[str, int]:
-    """How many rows of a table, called ``unit``, were added, removed, and changed in some columns."""
+    """Numbers of rows of a table of ``unit`` that were added, removed, and changed in some columns."""
     known, still = before.source >= 0, after.source >= 0
     most = max(before.source.max(initial=-1), after.source.max(initial=-1)) + 1
     row = np.full(most, -1)

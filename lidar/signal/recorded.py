@@ -147,7 +147,7 @@ def _step(distance: Float, recorded: Float, *, step: float) -> Float:
 
 
 def _encode(intensity: NDArray[np.float32], recorded: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Intensities (m,), each the nearest recorded value if there are few of these, as of whole codes."""
+    """Intensities (m,), rounded to the nearest recorded value if these are few (integer codes)."""
     values = np.unique(recorded)
     if not 0 < len(values) <= min(_CODES, len(recorded) // 2):
         return intensity

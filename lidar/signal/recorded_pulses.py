@@ -23,7 +23,7 @@ _SAME_RING = 0.5
 def recorded_pulses(
     cloud: Cloud, sensor: Sensor, *, sent: Firings | None
 ) -> tuple[Pulses, NDArray[np.int32]]:
-    """All pulses of a frame, and which of them (n,) each return is of, ascending.
+    """All pulses of a frame, and the row (n,) of the pulse of each return, ascending.
 
     Pulses with a return have its direction; the others have that of the firing pattern.
 
@@ -89,7 +89,7 @@ def _select_returned(cloud: Cloud, sensor: Sensor, *, first: Rows, nominal: Firi
 
 
 def _origins(nominal: Firings, *, ring: NDArray[Any], column: NDArray[Any], fired: Rows) -> Float:
-    """Where the beams (k, 3) of rings and columns start, metres, sensor frame."""
+    """Origins (k, 3) of the beams of rings and columns, metres, sensor frame."""
     if not nominal.origin.any():
         return np.zeros((len(ring), 3))
     # The first and last block of a frame may lack a pulse; that of the next block starts within 1 mm.

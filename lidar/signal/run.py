@@ -130,7 +130,7 @@ def link_truth(cloud: Cloud, echoes: TracedEchoes, *, first: TracedEchoes) -> Tr
 
 
 def _others(rows: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-    """The rows below ``count`` that are not among some rows, of which negative ones stand for none."""
+    """Rows below ``count`` that are not among the given rows; negative ones are ignored."""
     is_other = np.ones(count, bool)
     is_other[rows[rows >= 0]] = False
     return np.flatnonzero(is_other)
@@ -176,7 +176,7 @@ class _RepeatedNoise:
         return drawn
 
     def again(self, purpose: str, echoes: Echoes) -> Float:
-        """What was drawn for the same echoes, and other numbers for added ones."""
+        """The same random numbers for the same echoes, and others for added ones."""
         sweep = self._sweep
         rng = generator(sweep.seed, sweep.sensor.name, sweep.frame, purpose, "altered")
         known = self._known[purpose][cast("TracedEchoes", echoes).source]
@@ -211,14 +211,14 @@ def cloud_truth(
 
 
 def image_truth(image: CameraImage, original: CameraImage) -> dict[str, NDArray[Any]]:
-    """What stages did to the colours of an image, as `changed_pixels`."""
+    """Ground truth of the changes that stages made to an image, as `changed_pixels`."""
     assert image.rgb is not None  # noqa: S101
     assert original.rgb is not None  # noqa: S101
     return changed_pixels(image.rgb, original.rgb)
 
 
 def changed_pixels(rgb: NDArray[np.uint8], original: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """What stages did to colours (h, w, 3).
+    """Differences that stages made to colours (h, w, 3).
 
     changed : (h, w) bool
     removed : (k, 3) uint8, the colours of the changed pixels without stages, row by row
@@ -228,7 +228,7 @@ def changed_pixels(rgb: NDArray[np.uint8], original: NDArray[np.uint8]) -> dict[
 
 
 def image_past(image: CameraImage, truth: Mapping[str, NDArray[Any]] | None) -> CameraImage:
-    """A recorded image without the stages that its truth file tells of.
+    """A recorded image before the stages in its truth file.
 
     Raises ValueError for the truth of another image.
     """

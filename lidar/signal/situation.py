@@ -1,4 +1,4 @@
-"""What stages know of the frame that they act on, beside its echoes, its cloud or its image."""
+"""Context of a frame that stages act on: sensor, time, poses, surroundings."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from lidar.world.world import World
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Where and when a sensor takes a frame, as far as it is known.
+    """Context of a sensor's frame: name, time, poses, surroundings, as far as they are known.
 
     sensor   : its name
     frame    : number of the frame, 0 for a receiver or inertial unit, whose measurements are those of a whole

@@ -105,7 +105,7 @@ def mirror(mesh: Mesh) -> list[Mesh]:
 
 
 def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10) -> Mesh:
-    """A wheel about (x, y) that stands on the ground: a tyre with a disc of metal on both sides."""
+    """A wheel about (x, y) on the ground: a tyre with a metal disc on both sides."""
     turn = 2 * np.pi * np.arange(corners) / corners
     rings = []
     for side, share in ((-1, 0.64), (-1, 1.0), (1, 1.0), (1, 0.64)):
@@ -120,7 +120,7 @@ def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10)
 
 
 def hoop(x: float, radius: float, *, width: float, corners: int = 12) -> Mesh:
-    """A bicycle's wheel in the plane y = 0 that stands on the ground at x: a tyre, without spokes."""
+    """A bicycle wheel in the plane y = 0 on the ground at x: a tyre without spokes."""
     turn = 2 * np.pi * np.arange(corners) / corners
     ring = np.column_stack([np.cos(turn), np.zeros(corners), np.sin(turn)])
     side = np.array([0.0, width / 2, 0.0])

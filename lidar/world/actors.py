@@ -1,4 +1,4 @@
-"""Road users besides the ego vehicle, as columns, and their states at any time."""
+"""Road users other than the ego vehicle, as columns, and their states at any time."""
 
 from __future__ import annotations
 

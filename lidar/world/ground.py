@@ -25,7 +25,7 @@ _BORDER = 1e-3
 
 
 def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: float = _BELOW) -> Float:
-    """Height (n,) of the ground at points (n, 3), looked for near their own heights; NaN where there is none.
+    """Height (n,) of the ground near points (n, 3), metres in the scene frame; NaN without ground.
 
     One tile is held at a time.
     """
@@ -51,7 +51,7 @@ def ground_heights(scene: Scene, xyz: Float, *, above: float = _ABOVE, below: fl
 
 
 def ground_height(scene: Scene, *, x: float, y: float) -> float:
-    """Height of the ground at a place, whatever it is; NaN where there is none. Kept for the next call."""
+    """Height of the ground at a place, scene metres; NaN without ground. Cached."""
     key = scene.path, x, y
     if key not in _KNOWN:
         _KNOWN[key] = float(ground_heights(scene, np.array([[x, y, 0.0]]), above=_SKY, below=_SKY)[0])

@@ -1,4 +1,4 @@
-"""Settings of the world: what of the scene rays can reach, and the origin of its float32 coordinates."""
+"""Settings of the world: visible parts of the scene, and the origin of its float32 coordinates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What worlds read of scenes, read once for all worlds of a process that want it."""
+"""Data of a scene that all worlds of a process share and read once."""
 
 from __future__ import annotations
 

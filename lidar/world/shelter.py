@@ -29,7 +29,7 @@ _NEXT = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 @dataclass(frozen=True, slots=True)
 class Shelter:
-    """What is under cover: in each cell the air below the highest roof.
+    """Covered air: for each cell of a grid the height interval below the highest roof.
 
     corner : (2,) scene metres of the corner of the first cell
     roof   : (ny, nx) height of the underside, scene metres; -inf in the open
@@ -44,7 +44,7 @@ class Shelter:
 def shelter_of(
     parts: Iterable[Geometry], *, origin: Float, corner: tuple[float, float], count: int
 ) -> Shelter | None:
-    """The covered air in a square of ``count`` cells a side; None if there is none.
+    """Covered air in a square of ``count`` cells a side; None if nothing is covered.
 
     parts  : closed bodies and the ground, relative to the origin; undersides face down
     origin : (3,) scene metres
@@ -77,7 +77,7 @@ def shelter_of(
 
 
 def _up_to_walls(shelter: Shelter, top: Float) -> Shelter:
-    """With the cells whose middle is in a wall or pier beside covered air: the air before it is covered, too.
+    """Extend covered air to the walls and piers that bound it.
 
     top : (ny, nx) height of the highest surface
     """

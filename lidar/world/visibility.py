@@ -29,7 +29,7 @@ class Visibility:
         self._normal = np.stack([n for _, n in places]) if places else np.empty((0, _SAMPLES, 3))
 
     def seen_from(self, eye: ArrayLike, world: World, *, rows: NDArray[np.int64], time_ns: int) -> Float:
-        """Share (k,) of each of the actors ``rows`` that is seen from ``eye``, 0 to 1.
+        """Visible share (k,) of each of the actors ``rows`` from ``eye``, 0 to 1.
 
         It is the unoccluded share, by solid angle, of the side facing the eye. Ray time 0 of ``world``
         must be ``time_ns``.

@@ -133,7 +133,7 @@ class _Shapes:
 
 
 class World:
-    """The part of a scene that rays can reach; coordinates are scene metres.
+    """The loaded part of a scene, for ray casting; coordinates are scene metres.
 
     ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` returns the surfaces of their hits.
     `follow` loads another region and `place_actors` places moving actors, both in place: look up hits first.
@@ -206,7 +206,7 @@ class World:
         return world
 
     def follow(self, region: Region) -> None:
-        """Load another region in place; tiles of both regions are kept. Away from the scene there are none.
+        """Load another region in place; tiles of both regions are kept. Regions off the scene are empty.
 
         The hits depend on the region alone, not on earlier ones.
         """
@@ -263,7 +263,7 @@ class World:
         return surfaces_at(self._surfaces, hits.face, hits.instance, start=self._base, named=self._feature)
 
     def shelter(self, position: Float) -> Shelter | None:
-        """The air under roofs, bridges and in tunnels around a place; None if there is none.
+        """Covered air (under roofs, bridges, in tunnels) around a place; None if nothing is covered.
 
         It is known within the margin of the world, and at most within 160 m, whatever else is loaded. Trees,
         furniture and actors shelter nothing.
@@ -305,11 +305,11 @@ class World:
 
     @property
     def walls(self) -> WallRefiner:
-        """The openings of walls; without relief (see the settings) rays do not meet them."""
+        """Openings of walls; an empty table without relief (see the settings)."""
         return self._walls
 
     def _refiners(self) -> list[Refiner]:
-        """What lies behind the planes of faces of the loaded tiles.
+        """Refiners of the loaded tiles: they intersect rays with the surfaces behind the planes of faces.
 
         A kind of surface is one `lidar.raycast.refine.Refiner`. It finds its own faces by `Hits.face`, which
         is also the row in the table of surfaces of the world.

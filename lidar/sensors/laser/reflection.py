@@ -111,7 +111,7 @@ class SurfaceOptics:
 
 
 def _with_open(plain: Float, covered: Float) -> Float:
-    """A table by material code with the codes of `OPEN` replaced by what they are when covered."""
+    """Table by material code; codes from `OPEN` on hold the values of covered materials."""
     return np.concatenate([plain[:OPEN], covered[:OPEN]])
 
 

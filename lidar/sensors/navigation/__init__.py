@@ -1,1 +1,1 @@
-"""GNSS and IMU."""
+"""GNSS receivers and inertial units: satellite visibility, fixes, samples and their errors."""

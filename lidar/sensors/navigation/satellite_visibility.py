@@ -58,7 +58,7 @@ class Sky:
 
     @property
     def count(self) -> NDArray[np.int64]:
-        """Satellites in view (n,)."""
+        """Number (n,) of satellites in view."""
         count: NDArray[np.int64] = self.visible.sum(axis=1)
         return count
 

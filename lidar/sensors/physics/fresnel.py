@@ -58,7 +58,7 @@ def film(cosine: Any, reflectance: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def under_film(cosine: Float, reflectance: Float) -> Float:
-    """`film` of surfaces (n,)."""
+    """Factor (n,) that a water film applies to the reflectance of surfaces; see `film`."""
     factor = np.empty(len(cosine))
     for i in range(len(cosine)):
         factor[i] = film(cosine[i], reflectance[i])

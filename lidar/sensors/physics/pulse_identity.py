@@ -1,4 +1,4 @@
-"""How a scanner tells its own pulses from those of others: random delays, and codes."""
+"""How a scanner distinguishes its own pulses from others: random delays and pulse codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of measured ranges."""
+"""Range errors of a scanner: noise of weak signals, pulse stretching, range walk, quantisation."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def scanners(rig: Rig) -> list[Scanner]:
 
 
 def cameras(rig: Rig) -> list[Camera]:
-    """The rig's cameras."""
+    """Cameras of the rig, with their intrinsics and mounts."""
     return [Camera(s) for s in rig.cameras]
 
 

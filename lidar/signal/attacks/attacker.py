@@ -84,7 +84,7 @@ class Aim:
     power: Float
 
     def where(self, keep: NDArray[np.bool_]) -> Aim:
-        """Some of the pulses."""
+        """Subset of the pulses."""
         return Aim(self.row[keep], self.azimuth[keep], self.distance[keep], self.power[keep])
 
 
@@ -133,7 +133,7 @@ class Attacker(Stage):
         return (POSES,) if self.place else ()
 
     def aim(self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation) -> Aim | None:
-        """The pulses that the device reaches; None without a line of sight, or out of reach or view."""
+        """Pulses that the device can answer; None without line of sight, beyond its range or view."""
         if not len(pulses) or not self.may_reach(at):
             return None
         towards = self.towards(pulses.time_ns, at=at)
@@ -162,7 +162,7 @@ class Attacker(Stage):
         return Aim(row, azimuth[row], distance[row], power)
 
     def may_reach(self, at: Situation) -> bool:
-        """Whether the device attacks at the time of a frame and is not far out of reach."""
+        """Whether the device is active at the time of a frame and near enough to the sensor."""
         if not self.start <= at.start_ns * 1e-9 < self.stop:
             return False
         if not self.place:
@@ -172,7 +172,7 @@ class Attacker(Stage):
 
     @property
     def budget(self) -> int:
-        """Most pulses a frame."""
+        """Maximum number of pulses per frame."""
         return self.points or DEVICES[self.device].points
 
     def spent(self, aim: Aim, *, rng: np.random.Generator) -> Aim:
@@ -260,7 +260,7 @@ class TimedAttacker(Attacker):
 
 @dataclass(frozen=True)
 class SynchronisedAttacker(TimedAttacker):
-    """A device that knows when the sensor fires, and sends what it has prepared for each pulse.
+    """An attacker's device that knows when the sensor fires and answers each pulse.
 
     It cannot know a random delay or code of each pulse: see `lidar.sensors.physics.pulse_identity`.
     """

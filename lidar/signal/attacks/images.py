@@ -96,7 +96,7 @@ class Patch(Stage):
 
     @property
     def image_kinds(self) -> tuple[str, ...]:
-        """Depth, which tells what hides a patch in the world."""
+        """The depth image, from which occlusion of a patch in the world is computed."""
         return ("depth",) if self.on == "world" else ()
 
     def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
@@ -129,7 +129,7 @@ class Patch(Stage):
     def _in_world(
         self, frame: CameraImage, *, camera: CameraSpec, at: Situation, high: float
     ) -> tuple[Float, Float]:
-        """As `_on_image`, of what the pixels' rays meet; NaN where they miss the plane or it is hidden."""
+        """As `_on_image`, for the pixels' rays in the world; NaN where they miss the plane."""
         middle, right, up = self._plane(at)
         normal = np.cross(right, up)
         rays = pixel_rays(camera)
@@ -144,7 +144,7 @@ class Patch(Stage):
         return np.where(visible, u, np.nan), np.where(visible, v, np.nan)
 
     def _plane(self, at: Situation) -> tuple[Float, Float, Float]:
-        """Middle, direction to its right as one looks at it, and upwards (3,), in the camera frame."""
+        """Centre, right and up vectors (3,) of the patch as a viewer sees it, in the camera frame."""
         if not self.place:
             return np.array([-self.left, -self.up, self.ahead]), np.array([1.0, 0, 0]), np.array([0, -1.0, 0])
         if at.poses is None or at.geo is None:
@@ -181,7 +181,7 @@ def _sample(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uin
 
 
 def _encode(light: Float) -> NDArray[np.uint8]:
-    """The sRGB of linear light; what is over 1 is saturated."""
+    """sRGB values of linear light; values over 1 saturate."""
     c = np.clip(light, 0, 1)
     coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     rounded: NDArray[np.uint8] = np.rint(255 * coded).astype(np.uint8)

@@ -58,7 +58,7 @@ class Inject(SynchronisedAttacker):
 
     @property
     def requires(self) -> tuple[str, ...]:
-        """Poses, for a fixed device and for a phantom that stands in the scene."""
+        """Poses, for a fixed device and for a phantom at a fixed place in the scene."""
         return (POSES,) if self.place or self.standing else ()
 
     def echoes(

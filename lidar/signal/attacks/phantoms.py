@@ -61,7 +61,7 @@ def object_ranges(
     ground: float,
     part: tuple[float, float] = (0.0, 1.0),
 ) -> Float:
-    """Distance (k,) along beams to a road user that is seen from behind; infinite where they miss it.
+    """Range (k,) along beams to a road user seen from behind; infinite for beams that miss it.
 
     kind     : of `OBJECTS`
     azimuth  : degrees from forward to the left of its middle

@@ -1,4 +1,4 @@
-"""Objects that an attacker puts into the scene: meshes on the road, beside it, or before the vehicle."""
+"""Objects that an attacker places in the scene: meshes on the road, beside it, or ahead of the vehicle."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ class Move(TargetReturns):
 
 @dataclass(frozen=True)
 class Insert(Region):
-    """Returns of a box are inserted where beams with a return meet it."""
+    """Insert returns on a box where beams with a return intersect it."""
 
     noise: float = parameter(0.02, "standard deviation of their ranges, metres", low=0, high=1)
     intensity: float = parameter(40.0, "of them", low=0, high=255)

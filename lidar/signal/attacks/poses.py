@@ -83,6 +83,6 @@ class GnssSpoof(Stage):
 
 
 def _held(course: Float) -> Float:
-    """Courses (n,), where there is none the last one; north before the first."""
+    """Courses (n,) with NaN replaced by the last known value; north before the first."""
     last = np.maximum.accumulate(np.where(np.isnan(course), -1, np.arange(len(course))))
     return np.where(last < 0, 0.0, course[np.maximum(last, 0)])

@@ -1,4 +1,4 @@
-"""Removed returns: an attacker's light keeps the sensor from reporting what it sees."""
+"""Removal of returns: an attacker's light suppresses echoes of real surfaces."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ def check_sight(stages: Stages, frames: Iterable[tuple[Situation, Callable[[], S
 
 
 def sent_only(sensor: Sensor, at: Situation) -> Seen:
-    """A frame of a drive, whose world tells what is in between."""
+    """Pulses of a drive's frame without echoes, and the situation with the world between."""
     none = artificial_echoes(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
     nothing = trace(none, Origin.SURFACE, source=np.empty(0, np.int32))
     return pulses_of(sensor, firings(sensor, int(at.frame))), nothing, at

@@ -1,1 +1,1 @@
-"""Weather between a sensor and what it sees: media, echoes, published models, weather over time and place."""
+"""Weather between a sensor and surfaces: media, echoes, published models, variation in time and place."""

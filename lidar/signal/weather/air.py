@@ -83,7 +83,7 @@ def through_air(
 
 
 def _beam_ends(pulses: Pulses, echoes: TracedEchoes) -> Float:
-    """Range (n,) of the nearest surface of each pulse, metres; infinite where there is none."""
+    """Range (n,) of the nearest surface of each pulse, metres; infinite without one."""
     end = np.full(len(pulses), np.inf)
     np.minimum.at(end, echoes.pulse, echoes.range)
     return end

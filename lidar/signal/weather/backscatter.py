@@ -1,4 +1,4 @@
-"""Echoes of what is in the air: soft targets, and single drops and flakes drawn pulse by pulse."""
+"""Echoes of particles in the air: soft targets, and single drops and flakes drawn pulse by pulse."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ def scattering(sensor: Sensor, medium: Medium, *, lens: float) -> tuple[AirParti
 
 @dataclass(frozen=True, slots=True)
 class AirParticles:
-    """Single particles that a pulse may meet in clear air, by classes of range and size.
+    """Single particles that a pulse may hit in clear air, by classes of range and size.
 
     count     : (c,) mean number per pulse of each class
     near, far : (c,) metres, range of each class
@@ -250,7 +250,7 @@ class AirParticles:
 def particles(
     sensor: Sensor, medium: Medium, *, most: float = MOST, lens: float = LENS
 ) -> tuple[AirParticles, Float, Float]:
-    """What a pulse may meet, and the back-scatter (k,) of all the rest at distances (k,) in metres.
+    """Single particles, and the back-scatter (k,) of all others at distances (k,) in metres.
 
     A particle of the back-scatter cross-section s, off the axis of a Gaussian beam, sends back the power of
     a Lambertian target of reflectance s I / 4, where I is the irradiance there, over the pulse's power. With
@@ -311,7 +311,7 @@ def _on_axis(sensor: Sensor, medium: Medium, *, distance: Float, lens: float) ->
 def drawn_particles(
     some: AirParticles, end: Float, *, extinction: float = 0.0, rng: np.random.Generator
 ) -> Found:
-    """Particles that beams meet before their ends (n,), in metres, dimmed by even air (1/m); by pulse."""
+    """Particles that beams hit before their ends (n,), metres, attenuated by even air (1/m); by pulse."""
     sums = np.cumsum(some.count)
     if not len(sums):
         return np.empty(0, np.int64), np.empty(0), np.empty(0)
@@ -333,7 +333,7 @@ def _uniform(key: Any, number: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _meet(classes: Any, key: Any, end: Any, extinction: Any) -> Any:
-    """The columns of what is met."""
+    """Columns of the particles that are hit."""
     sums, first, near, far, strongest, weakest = classes
     mean, few = sums[-1], np.exp(-sums[-1])
     count = np.empty(len(end), np.int64)

@@ -136,7 +136,7 @@ def _expose(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]:
 
 
 def falling(setting: WeatherSetting, air: Medium) -> FallingParticles | None:
-    """Particles of a medium that are seen one by one; None for kinds without any.
+    """Particles of a medium that are drawn one by one; None for kinds without any.
 
     The fall speed of drops is that of Atlas, Srivastava and Sekhon (1973). Flakes fall at 1 m/s and swing by
     0.3 m/s (typical).
@@ -152,7 +152,7 @@ def falling(setting: WeatherSetting, air: Medium) -> FallingParticles | None:
 
 
 def _distance(image: CameraImage, camera: CameraSpec) -> NDArray[np.float32]:
-    """Metres (h, w) along each pixel's ray to the surface seen; inf for sky."""
+    """Distance (h, w) in metres along each pixel's ray to the visible surface; inf for sky."""
     depth = image.depth
     if camera.model == "pinhole":
         depth = depth / pixel_rays(camera)[:, 2].astype(np.float32).reshape(depth.shape)

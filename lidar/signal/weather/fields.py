@@ -44,7 +44,7 @@ _SPRAY_SHAPE = 0.5  # of the gamma distribution of clusters: a sixth of places h
 
 @dataclass(frozen=True, slots=True)
 class Cover:
-    """How much of a medium is left under roofs, bridges and in tunnels.
+    """Share of a medium that remains under roofs, bridges and in tunnels.
 
     corner : (2,) scene metres of the corner of the first cell
     roof   : (ny, nx) height below which air is covered, scene metres; -inf in the open
@@ -61,7 +61,7 @@ _OPEN = Cover((0.0, 0.0), np.empty((0, 0)), np.empty((0, 0)))
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """How much of a medium there is, from place to place.
+    """Amount of a medium as a function of place.
 
     corner : (2,) scene metres of the first sample
     share  : (ny, nx) of the medium in the sample's surroundings; none beyond
@@ -95,7 +95,7 @@ def _around(position: Float, far: float) -> tuple[tuple[float, float], int]:
 
 
 def field_of(setting: WeatherSetting, far: float, *, at: Situation) -> Field | None:
-    """Where the weather of a setting is up to a distance from a sensor; None for everywhere.
+    """Field of a weather setting up to a distance from a sensor; None if it is uniform.
 
     Raises InputError if the setting has a place, plumes or road users, and the situation knows none.
     """
@@ -121,7 +121,7 @@ def field_of(setting: WeatherSetting, far: float, *, at: Situation) -> Field | N
 
 
 def _cover(setting: WeatherSetting, *, at: Situation) -> Cover | None:
-    """What of a setting's weather is left under roofs around a sensor; None for all and if none is known.
+    """Cover of a weather setting around a sensor; None without roofs, or if they are unknown.
 
     Rain and snow fall straight down. Fog and dust drift in.
     """

@@ -50,7 +50,7 @@ def through_glass(
 def _drop_raster(
     seed: int, sensor: str, *, period: int, drops: float, band: tuple[float, float]
 ) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:
-    """Where drops are, by elevation and azimuth: round ones at random places."""
+    """Raster of drops by elevation and azimuth: round ones at random places."""
     rng = generator(seed, "weather", "drops", sensor, period)
     rows, columns = max(1, ceil((band[1] - band[0]) / _CELL)), round(360 / _CELL)
     wet = np.zeros((rows, columns), bool)

@@ -40,7 +40,7 @@ class Lidar:
 
 @dataclass(frozen=True, slots=True)
 class RemainingReturns:
-    """What a model leaves of the returns of a cloud.
+    """Returns of a cloud that remain after a weather model.
 
     state       : (n,) uint8, LOST, SCATTERED or TARGET
     range       : (n,) metres

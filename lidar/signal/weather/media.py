@@ -83,7 +83,7 @@ _SNOW_REFLECTANCE = ((400.0, 1100.0, 1500.0), (0.85, 0.85, 0.07))  # nm and refl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Medium:
-    """Air with particles, alike everywhere; equal only to itself, so that what it sends back is cached.
+    """Homogeneous air with particles; equal only to itself, so that its back-scatter is cached.
 
     extinction  : 1/m, one way
     backscatter : 1/(m sr), of all particles

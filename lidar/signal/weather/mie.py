@@ -28,7 +28,7 @@ def mie_efficiencies(size: ArrayLike, index: complex) -> tuple[Float, Float, Flo
 
 @njit(cache=True, nogil=True)
 def _efficiencies(size: Any, index: Any, extinction: Any, scattering: Any, back: Any) -> None:
-    """Fill the efficiencies."""
+    """Fill the Mie efficiencies (k,) of extinction, scattering and back-scatter."""
     for i in range(len(size)):
         x = size[i]
         y = x * index

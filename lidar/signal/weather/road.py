@@ -1,4 +1,4 @@
-"""What weather makes of roads: their grip, and the visibility above them."""
+"""Effects of weather on roads: friction, and visibility above them."""
 
 from __future__ import annotations
 
@@ -36,5 +36,5 @@ def _amounts(setting: WeatherSetting) -> list[float]:
 
 
 def _extinction(setting: WeatherSetting, amount: float) -> float:
-    """1/m of visible light."""
+    """Extinction coefficient of visible light, 1/m."""
     return medium_of(setting.kind, amount, wavelength_nm=_GREEN_NM, medium=setting.medium).extinction

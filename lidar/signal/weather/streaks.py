@@ -51,7 +51,7 @@ def streak_cover(
     rng: np.random.Generator,
     share: Callable[[Float], Float] | None = None,
 ) -> NDArray[np.float32]:
-    """Share (h, w) of each pixel's light that comes from particles in front of the surface seen.
+    """Share (h, w) of each pixel's light that comes from particles in front of the visible surface.
 
     Each particle is a disc that moves on a line during the exposure, out of focus as of a lens of `APERTURE`
     focused at infinity. Particles that cover less than 2 of 255 levels are left out.
@@ -92,7 +92,7 @@ def streak_cover(
 
 
 def _drawn(share: Float, *, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """Which of particles there are, by their shares (n,); shares of 0 and 1 need no random numbers."""
+    """Mask of the particles that are drawn, with probabilities ``share`` (n,)."""
     there = share >= 1
     partly = (share > 0) & ~there
     there[partly] = rng.random(int(partly.sum())) < share[partly]
@@ -115,7 +115,7 @@ def _visible_distance(diameter: float, *, across: float, pixels: float) -> float
 def _positions(
     camera: CameraSpec, *, density: float, far: float, margin: float, rng: np.random.Generator
 ) -> Float:
-    """Places (n, 3) of particles in front of a camera, camera frame; also those beside its field of view.
+    """Positions (n, 3) of particles in front of a camera, camera frame, with a margin around the view.
 
     margin : metres beside it
     """

@@ -113,7 +113,7 @@ def _refract(
     seen: NDArray[np.float32],
     cover: NDArray[np.float32],
 ) -> None:
-    """Fill ``seen`` with the light through drops and ``cover`` with where they are.
+    """Fill ``seen`` with the light through drops, and ``cover`` with their area.
 
     turn : (n,) pixels of the scene for a pixel of each drop; negative upside down
     """

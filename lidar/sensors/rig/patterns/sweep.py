@@ -116,7 +116,7 @@ def read_sweep(table: Table) -> SweepPattern:
 
 
 def read_listed(table: Table) -> Listed:
-    """The pattern that a ``[table]`` table describes: a CSV file beside the preset, and its period.
+    """Firing pattern and period of a ``[table]`` table, read from a CSV file beside the preset.
 
     The file has a header and the columns time in seconds, azimuth and zenith angle in degrees, as in the
     pattern files of Livox. Raises RigError if it cannot be read or its times do not increase.
