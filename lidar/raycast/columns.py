@@ -26,7 +26,7 @@ CHUNK = 2048
 
 
 class RayTarget(NamedTuple):
-    """The target of rays.
+    """Geometry that rays are cast against, as columns for compiled code.
 
     scene, packet, single : addresses of the Embree scene and of the arguments for packets and for single rays
     lanes      : as many zeros as rays in a packet: their number is a compile-time constant
@@ -86,7 +86,7 @@ def pack_target(target: RayTarget) -> Packed:
 
 @njit(nogil=True)
 def unpack_target(given: Packed) -> Any:
-    """The target of `pack_target`."""
+    """Inverse of `pack_target`."""
     w = given.words
     return RayTarget(
         w[0],

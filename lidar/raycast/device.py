@@ -24,7 +24,7 @@ DEVICES = f"{CPU}, cuda, cuda:N (the N-th CUDA device, from 0), {WARP_CPU} (test
 
 
 def name_fault(name: str) -> str:
-    """What is wrong with the name of a device; empty if nothing is."""
+    """Description of an invalid device name; empty for a valid one."""
     if name in (CPU, WARP_CPU) or re.fullmatch(_CUDA, name):
         return ""
     return f"device={name}: choose one of {DEVICES}"
@@ -68,7 +68,7 @@ def _has_driver() -> bool:
 
 
 class WarpDevice:
-    """A device of Warp.
+    """A compute device of Warp: its name, arrays and launches.
 
     lock : held while kernels are launched; threads take turns on a device
     """

@@ -136,7 +136,7 @@ def beside(ray: Any, a: Any, b: Any, c: Any) -> float:
 
 @compile_out_of_line
 def outside(target: RayTarget, row: int, prim: int, instance: int, ray: Any, time: float) -> float:
-    """Metres by which a ray passes outside a face, as in `beside`."""
+    """Distance in metres by which a ray passes outside a face, as in `beside`."""
     ox, oy, oz, _, _, _ = ray
     ax, ay, az = _corner(target, row, 3 * prim, instance, time)
     bx, by, bz = _corner(target, row, 3 * prim + 1, instance, time)

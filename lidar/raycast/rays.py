@@ -236,7 +236,7 @@ if hasattr(os, "register_at_fork"):  # a forked process has none of its parent's
 
 
 def _parts(n: int, threads: int) -> list[tuple[int, int]]:
-    """Bounds of parts of n rays, in whole chunks: two thirds of an equal share of what is left, so few calls.
+    """Bounds of parts of n rays in whole chunks, each two thirds of an equal share of the remaining rays.
 
     The last part is the smallest, but at least a chunk, so that threads end at about the same time.
     """

@@ -271,7 +271,7 @@ class _Rewriter(ast.NodeTransformer):
         return f"new{self.temporaries}_"
 
     def _global(self, node: ast.expr) -> Any:
-        """What a global or an attribute of a module is; None for others."""
+        """Value of a global or of a module's attribute; None for other names."""
         if isinstance(node, ast.Name) and node.id not in self.locals:
             return self.globals.get(node.id)
         if isinstance(node, ast.Attribute) and isinstance(home := self._global(node.value), ModuleType):
@@ -288,7 +288,7 @@ class _Rewriter(ast.NodeTransformer):
 
 
 def _literal(value: Any) -> ast.expr:
-    """A number of the type that it has for numba; whole numbers of Python's have 32 bits."""
+    """A number of numba's type for it; Python integers have 32 bits."""
     if isinstance(value, np.uint32):
         return _call("uint32", [_literal(int(value.astype(np.int32)))])
     if isinstance(value, float):

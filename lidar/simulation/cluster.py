@@ -46,7 +46,7 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """What a task has recorded.
+    """Result of a task: recorded frames.
 
     frames  : sensor, frame, points, SHA-256 of the files
     seconds : by stage
@@ -98,7 +98,7 @@ def record_on_cluster(
 
 
 class _Station(threading.local):
-    """What a thread of a worker keeps of the drive whose frames it recorded last."""
+    """State that a worker's thread keeps between frames of a drive."""
 
     plan = Path()
     recording: Recording

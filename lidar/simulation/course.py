@@ -1,4 +1,4 @@
-"""The part of a map that a drive needs: its course, planned on the roads, and what its sensors reach.
+"""Area of a map that a drive needs: its course on the roads, buffered by the sensors' maximum range.
 
 A scene of this part gives the drive the bytes of a scene of the whole map.
 """
@@ -43,7 +43,7 @@ _ROUNDING = 0.2
 
 @dataclass(frozen=True, slots=True)
 class DriveCourse:
-    """Where a drive goes, in plan; scene metres.
+    """Course of a drive in plan, scene metres.
 
     path  : (n, 2) the vehicle's path, all that can be recorded
     tried : lines (k, 2) of the routes that were tried in the search of the path
@@ -104,7 +104,7 @@ def needed_area(roads: RoadMap, options: DriveOptions) -> Any:
 
 
 def _around(line: Float, metres: float) -> Any:
-    """All within a distance of a line (n, 2), scene metres."""
+    """Buffer of a line (n, 2), scene metres."""
     whole = shapely.linestrings(line) if np.ptp(line, axis=0).max() > 0 else shapely.points(line[0])
     return shapely.buffer(shapely.simplify(whole, _ROUNDING), metres + _ROUNDING, quad_segs=16)
 

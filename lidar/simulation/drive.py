@@ -132,7 +132,7 @@ class _CompilationProgress(Listener):
         self._progress("compiling, once", self._compiled, total=0)
 
     def on_end(self, event: Event) -> None:  # noqa: ARG002
-        """A function is compiled."""
+        """Count a compiled function."""
         self._compiled += 1
 
 

@@ -54,7 +54,7 @@ _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
 
 @dataclass(frozen=True, slots=True)
 class FlightOptions:
-    """How a flight is planned.
+    """Parameters of flight planning.
 
     survey    : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area to fly over in
                 parallel strips, instead of a route
@@ -175,7 +175,7 @@ class _SceneBelow:
         return self._world
 
     def top(self, x: Float, y: Float) -> Float:
-        """Height (n,) of the highest surface; -inf where there is none."""
+        """Height (n,) of the highest surface; -inf without one."""
         world = self._load(x, y)
         origin = np.column_stack([x, y, np.full(len(x), _HIGH)])
         hits = world.caster.cast(origin, np.broadcast_to([0.0, 0.0, -1.0], origin.shape))

@@ -96,7 +96,7 @@ def check_attackers(plan: DrivePlan, recording: Recording) -> None:
 
 
 def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Situation, Callable[[], Seen]]]:
-    """Where a drive's scanners take their frames, and what they see there; the world is loaded as needed."""
+    """Yield each scanner frame's context, and a function that tests lines of sight in its world."""
     worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.contents.world)
 
     def seen(scanner: Scanner, frame: int, *, region: Region) -> Seen:

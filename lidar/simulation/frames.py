@@ -40,7 +40,7 @@ Readings = TypeVar("Readings", Fixes, Inertial)
 
 @dataclass(frozen=True)
 class DriveFrame:
-    """What all sensors measure from the start of a frame of the first sensor to the start of its next one.
+    """Measurements of all sensors from the start of a frame of the first sensor to that of its next.
 
     The first frame also has what others measured before it, the last one what they measured after it.
 
@@ -121,7 +121,7 @@ class Simulation:
         return next(iter(self.plan.frames.values()))
 
     def __iter__(self) -> Iterator[DriveFrame]:
-        """The frames in order of time, which threads prepare: at most twice as many as there are workers."""
+        """Frames in order of time, prepared by threads: at most twice as many as workers."""
         plan = self.plan
         recording = plan.recording(Path())
         check_attackers(plan, recording)

@@ -40,7 +40,7 @@ from lidar.world.world import World
 
 
 def heights_of(frame: Frame, fixes: Fixes) -> FixHeights:
-    """What the heights of fixes in a scene are above."""
+    """Vertical reference of the heights of fixes in a scene."""
     geoid = None if frame.vertical == "flat" else geoid_at(*fixes.true_lonlath[:, :2].T)
     return FixHeights(frame.vertical, geoid.separation, geoid.name) if geoid else FixHeights(frame.vertical)
 

@@ -58,7 +58,7 @@ class SensorFrame:
 
 @dataclass(frozen=True, slots=True)
 class Jobs(Sequence[SensorFrame]):
-    """Frames of several sensors in order of time; a job is made when it is asked for.
+    """Frames of several sensors in order of time; a job is created on access.
 
     sensors : the sensors
     order   : (n,) int16, row of each frame's sensor
@@ -93,7 +93,7 @@ class Jobs(Sequence[SensorFrame]):
 
 @dataclass(frozen=True, slots=True)
 class DrivePlan:
-    """All that `drive` records, fixed before the first frame.
+    """Immutable plan of a drive: everything that `drive` records, fixed before the first frame.
 
     scene       : the scene
     options     : the options
@@ -159,7 +159,7 @@ class DrivePlan:
         ]
 
     def recording(self, out: Path) -> Recording:
-        """What the frames are recorded from."""
+        """Input of the frame loop for a dataset folder."""
         return Recording(
             out,
             self.scene.frame,
@@ -375,7 +375,7 @@ def plan_motion(
 
 
 def flight_options(options: DriveOptions) -> FlightOptions:
-    """How the flight of a drive's options is planned."""
+    """Parameters of flight planning from the options of a drive."""
     from lidar.simulation.flight_planning import FlightOptions  # noqa: PLC0415
 
     seconds = options.duration
@@ -400,7 +400,7 @@ def _signals(
     motion: Trajectory | RoadMotion | Flight,
     sensors: Sequence[Scanner | Camera],
 ) -> SignalStates | None:
-    """What signal heads show: the plan that traffic obeys; None where no image shows them.
+    """States of signal heads by the plan that traffic obeys; None if no image shows them.
 
     Traffic of SUMO has signals of its own, whose states are not known.
     """

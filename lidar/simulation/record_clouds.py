@@ -77,7 +77,7 @@ def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds:
 
 
 def _scan(recording: Recording, scanner: Scanner, *, frame: int, world: World) -> Cloud:
-    """What a scanner measures in a frame, during the times at which scanners work."""
+    """Point cloud of a scanner in a frame; empty outside the times at which scanners work."""
     if not _works(recording, scanner, frame=frame):
         return no_returns(scanner.sensor.window_ns(frame)[0])
     with recording.watch.stage("scan"):
@@ -86,7 +86,7 @@ def _scan(recording: Recording, scanner: Scanner, *, frame: int, world: World) -
 
 
 def _alter(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> Altered:
-    """What a scanner measures in a frame, after the stages on it."""
+    """Point cloud of a scanner in a frame, after the stages on it."""
     window = scanner.sensor.window_ns(frame)
     if not _works(recording, scanner, frame=frame):
         return trace_unaltered(no_returns(window[0]))
@@ -109,7 +109,7 @@ def _alter(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds
 
 
 def _check_lookback(recording: Recording, scanner: Scanner, *, frames: int) -> None:
-    """Raise LidarError if no stage says that it looks back so many frames: tiles there are not loaded."""
+    """Raise LidarError if no stage declares this lookback: earlier tiles are not loaded."""
     if frames * scanner.period_ns > recording.contents.stages.lookback_ns:
         raise LidarError(f"a stage looks back {frames} frames of {scanner.name}, more than its `lookback`")
 

@@ -56,7 +56,7 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Recording:
-    """What frames are recorded from; shared by the threads of a drive.
+    """Input of all frames of a drive, shared by its threads.
 
     out         : dataset directory
     frame       : scene frame
@@ -87,12 +87,12 @@ class Recording:
 
     @functools.cached_property
     def visibility(self) -> Visibility | None:
-        """How much of each road user can be seen; None without traffic."""
+        """Visibility of each road user; None without traffic."""
         return None if self.actors is None else Visibility(self.actors)
 
     @functools.cached_property
     def las_info(self) -> LasInfo:
-        """What all LAS and LAZ files of the dataset share."""
+        """Header fields that all LAS and LAZ files of the dataset share."""
         return LasInfo(self.geo.crs, self.geo.offset, self.start)
 
     def release(self) -> None:

@@ -1,4 +1,4 @@
-"""Where the scene of a drive comes from: a scene directory, or a map, of which the needed part is built."""
+"""Scene of a drive: a scene directory, or a map, of which the needed area is built."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signal heads in images: what they show, and their bounding boxes."""
+"""Signal heads in images: states and bounding boxes."""
 
 from __future__ import annotations
 

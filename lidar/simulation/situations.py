@@ -1,4 +1,4 @@
-"""What stages know of the frames of a dataset."""
+"""Context that stages get for the frames of a dataset."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def situation_of(
     cloud_of: Callable[[int], Cloud] | None = None,
     surroundings: RecordedSurroundings | None = None,
 ) -> Situation:
-    """Where and when a sensor takes a frame.
+    """Context of a sensor's frame for stages.
 
     world    : what rays hit during it; None for recorded data
     cloud_of : the cloud of a frame of the same scanner, as without stages
@@ -120,7 +120,7 @@ def situation_of_unit(
     seed: int,
     effects: Effects | None = None,
 ) -> Situation:
-    """Where and when a satellite receiver or an inertial unit measures during a drive."""
+    """Context of a satellite receiver or an inertial unit over a drive for stages."""
 
     def poses(time_ns: NDArray[np.int64]) -> Poses:
         return trajectory.at(time_ns).mounted(mount.translation, mount.rotation)

@@ -1,4 +1,4 @@
-"""Surfaces behind the planes of faces, met by formula: openings of facades, rough ground."""
+"""Surfaces behind the planes of faces, intersected by formula: openings of facades, rough ground."""
 
 from lidar.raycast.relief.ground import GroundRefiner as GroundRefiner
 from lidar.raycast.relief.ground import GroundTables as GroundTables

@@ -70,7 +70,7 @@ def heights(kind: str, xy: Float, *, level: int = 0) -> Float:
 
 @inline
 def level_of(patch: float, scattered: Any, x: float, y: float) -> int:
-    """The level of detail of a patch that is seen as one, metres long, about a place.
+    """Level of detail about a place for a footprint of ``patch`` metres.
 
     scattered : whether rays near the border of two levels take either, by a random number of the place, so
                 that no edge is seen in images where a level ends

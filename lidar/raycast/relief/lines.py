@@ -13,7 +13,7 @@ metres along the ray at most."""
 
 @inline
 def beyond_plane(leaving: float, length: float) -> Any:
-    """Parameter by which a ray goes on beyond a plane that it crosses from behind.
+    """Ray parameter beyond a plane that the ray crosses from behind.
 
     leaving : metres that it leaves the plane by per parameter, above 0
     length  : metres per parameter

@@ -60,7 +60,7 @@ _SEED = 8608
 
 
 class RoughnessKind(NamedTuple):
-    """A kind of ground.
+    """Roughness parameters of a kind of ground.
 
     road   : Gd(n0) in m^3 of the waves of `BAND`
     grain  : metres, standard deviation of the heights of grains
@@ -266,7 +266,7 @@ def _steepest(field: NDArray[np.float32]) -> float:
 
 
 def _towards(ahead: Callable[[Float], Float], field: NDArray[np.float32]) -> Float:
-    """What lies ahead of blocks (4, ...) of a field in the four directions, by a function for +x +y."""
+    """Result (4, ...) of a function of a field for +x +y, in the four diagonal directions."""
     found = []
     for sx, sy in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
         # Mirrored such that cells, not nodes, keep their blocks.

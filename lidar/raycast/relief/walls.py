@@ -194,7 +194,7 @@ class WallRefiner:
         return np.where(own & (self.tables.part[hits.face] == INFILL), hits.face, np.int32(-1))
 
     def rooms(self, face: NDArray[np.int32], place: Float, direction: Float) -> Hits:
-        """What rays hit that have passed the pane of an opening: the closed room behind it.
+        """Hits of rays behind the pane of an opening: surfaces of the closed room.
 
         face      : (n,) faces of panes
         place     : (n, 3) scene metres, on the pane or behind it

@@ -69,7 +69,7 @@ def colors(
     place: Callable[[NDArray[np.intp]], Float],
     width: Float,
 ) -> NDArray[np.uint8]:
-    """SRGB (n, 3) of hits on instances, by what is drawn on them.
+    """SRGB (n, 3) of hits on instances: signs, plates, clothes.
 
     instance, face : (n,) of the hits
     klass, material, feature, color : of their surfaces, see `lidar.world.surfaces.Surfaces`
@@ -170,7 +170,7 @@ _FACES: weakref.WeakKeyDictionary[World, dict[int, str]] = weakref.WeakKeyDictio
 
 
 def _faces(world: World) -> Mapping[int, str]:
-    """Faces of the scene's signs by feature number: what is mapped of them, else what their form tells."""
+    """Sign faces of the scene by feature number: as mapped, else inferred from the form."""
     found = _FACES.get(world)
     if found is None:
         columns = world.scene.features("furniture", geometry="none").columns
@@ -205,7 +205,7 @@ def _corners(shape: Caster) -> Float:
 def _plate_axes(
     world: World, instance: NDArray[np.int32], *, face: NDArray[np.int32], place: Float
 ) -> tuple[Float, Float]:
-    """Height of the centre of the plates that are hit, and metres to the right of it, seen from outside.
+    """Height of the plate's centre at each hit, and metres to its right, viewed from outside.
 
     A face of a plate is half of a rectangle, which has the same bounds.
     """

@@ -1,4 +1,4 @@
-"""Pixels of an image at edges, whose colour one ray does not tell."""
+"""Pixels at edges, whose colour needs more than one ray."""
 
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Facades in images: what a pixel sees of the openings of a wall, averaged over its footprint."""
+"""Facades in images: colour of a wall with openings, averaged over a pixel's footprint."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def _sill(kinds: Any, k: int, axis: int, low: float, high: float, slope: float) 
 
 @inline
 def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool:
-    """Whether a footprint, with these ends in both directions, sees nothing of an opening."""
+    """Whether a footprint with these extents in both directions contains no part of an opening."""
     x0, x1 = across
     y0, y1 = upright
     within = x1 > kinds[k, march.PANEL] and x0 < kinds[k, march.PANEL + 2]
@@ -178,7 +178,7 @@ def _beside(kinds: Any, k: int, across: Any, upright: Any, slope: float) -> bool
 
 @inline
 def _paint(facades: Any, face: int, share: float, linear: Any, out: Any) -> None:
-    """Add a painted part to what is seen."""
+    """Add a painted part to the colour of a pixel."""
     out[PAINTED] += share
     for c in range(3):
         out[LIGHT + c] += share * linear[facades.color[face, c]]

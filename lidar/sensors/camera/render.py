@@ -56,7 +56,7 @@ _LIFT = 1e-3
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """Options of the renderer.
+    """Settings of the renderer.
 
     precision   : of depths, see `lidar.raycast.Caster.cast`
     retrace     : whether rays that miss are traced a second time
@@ -112,7 +112,7 @@ class CameraImage:
 
 @dataclass(frozen=True, slots=True)
 class _Traced:
-    """Rays in the scene and what they hit.
+    """Rays in the scene and their hits.
 
     origin    : (k, 3) scene metres
     row       : (n,) int32, each ray's row of ``origin``
@@ -137,7 +137,7 @@ class _Traced:
 
 @dataclass(frozen=True, slots=True)
 class TracedView(_Traced):
-    """Rays in the scene and what they hit, as in `_Traced`.
+    """Rays in the scene and their hits, as in `_Traced`.
 
     surfaces : surfaces at the hits
     """
@@ -450,7 +450,7 @@ def _mirrored_view(
     facet: NDArray[np.float32],
     options: RenderOptions,
 ) -> TracedView:
-    """What rays (k,) of a view hit after films of water with these normals (k, 3) mirror them."""
+    """Hits of rays (k,) of a view after reflection at films of water with normals (k, 3)."""
     direction, normal = view.direction[row], view.hits.normal[row]
     place = view.origin[view.row[row]] + view.hits.range[row, None] * direction
     facets = facet / np.linalg.norm(facet, axis=1, keepdims=True)
@@ -547,7 +547,7 @@ def _shade(
 
 
 def _shader(device: str) -> WarpShader:
-    """What shades on a device."""
+    """Shading function of a device."""
     from lidar.sensors.camera.warp_shade import shader  # noqa: PLC0415  (Warp, which is optional)
 
     return shader(device)
@@ -563,7 +563,7 @@ def _on_shapes(world: World, view: TracedView, *, rows: NDArray[np.intp]) -> Flo
 
 
 def _drawn(world: World, view: TracedView, *, size: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (n, 3) of the surfaces of a view, with what is drawn on instances."""
+    """Colours (n, 3) of the visible surfaces, with signs, plates and clothes drawn on instances."""
     hits, found = view.hits, view.surfaces
     on = np.flatnonzero(hits.instance >= 0)
     if not len(on):

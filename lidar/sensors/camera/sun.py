@@ -1,4 +1,4 @@
-"""Position of the sun."""
+"""Sun position from time and place."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def refraction(elevation: ArrayLike) -> Float:
 
 
 def sun_direction(frame: Frame, when: datetime, *, at: tuple[float, float] = (0.0, 0.0)) -> Float:
-    """Unit vector (3,) towards the sun in the scene's axes, seen from scene point ``at`` (x, y), metres.
+    """Unit vector (3,) towards the sun in scene axes at scene point ``at`` (x, y), metres.
 
     True north is turned into grid north by the projection's meridian convergence.
 

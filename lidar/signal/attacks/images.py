@@ -181,7 +181,7 @@ def _sample(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uin
 
 
 def _encode(light: Float) -> NDArray[np.uint8]:
-    """sRGB values of linear light; values over 1 saturate."""
+    """Linear light as sRGB codes; values over 1 saturate."""
     c = np.clip(light, 0, 1)
     coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
     rounded: NDArray[np.uint8] = np.rint(255 * coded).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What a defence is: parameters with bounds, and a method that judges a frame by it and the frames before."""
+"""Base of defences: parameters with bounds, and a method that judges a frame by it and earlier frames."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Defence(Stage):
 
     @property
     def lacks(self) -> str:
-        """What its parameters lack, in words; empty if nothing."""
+        """Description of missing parameters; empty if none is missing."""
         return ""
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Judges datasets by defences, scores the verdicts where there is truth, and writes both."""
+"""Run defences on datasets, score the verdicts against ground truth, and write both."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class DefenceTally:
 
 @dataclass(frozen=True, slots=True)
 class Defended:
-    """What defences say of datasets.
+    """Verdicts of defences on datasets, with their scores.
 
     frames  : frames that were judged
     scores  : by defence and level
@@ -299,7 +299,7 @@ def _job(
 
 
 def _truth_of(scans: RecordedScans, frame: Observation) -> FrameTruth:
-    """What attacks did to a frame."""
+    """Ground truth of the attacks on a frame."""
     seconds = frame.start_ns * 1e-9
     name, count = scans.sensor.name, len(frame)
     return attack_truth(scans.dataset, name, frame=frame.number, count=count, seconds=seconds)

@@ -1,4 +1,4 @@
-"""Consistency of fixes, inertial samples and recorded poses with the motion that the scanner sees."""
+"""Consistency of fixes, inertial samples and recorded poses with the motion estimated from sweeps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Correction:
 
 @dataclass(frozen=True)
 class NavigationDefence(Defence):
-    """Fixes, gyroscope and recorded poses that contradict the motion that the scanner sees (chi-squared)."""
+    """Chi-squared test of fixes, gyroscope and recorded poses against the motion estimated from sweeps."""
 
     history: ClassVar[int] = _LAG
     needs: ClassVar[frozenset[str]] = frozenset({"navigation"})
@@ -58,7 +58,7 @@ class NavigationDefence(Defence):
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
     ) -> Verdict:
-        """Judge the last frame by the one `_LAG` frames before, or as many as there are."""
+        """Judge the last frame against the one `_LAG` frames earlier, or the earliest."""
         del scene
         frame, past = frames[-1], frames[0]
         if len(frames) < 2:

@@ -1,4 +1,4 @@
-"""What a defence sees of a frame: the scanner's data, never labels or truth files."""
+"""Input of a defence: a frame's measurements, never labels or ground truth."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ class Observation:
         return np.where(np.isfinite(depth), depth, 0.0)
 
     def depth_towards(self, points: Float) -> Float:
-        """Metres (n,) that the frame looks in the direction of points (n, 3); 0 without a return."""
+        """Range (n,) in metres of the nearest return towards points (n, 3); 0 without a return."""
         depth: Float = self._depths[_direction_cell(points)]
         return depth
 

@@ -1,4 +1,4 @@
-"""Rays that pass through what is reported to be solid: laser penetration and free space (CARLO)."""
+"""Returns behind reported solid objects: laser penetration and free space (CARLO)."""
 
 from __future__ import annotations
 

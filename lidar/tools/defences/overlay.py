@@ -37,7 +37,7 @@ _SMALLEST = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a picture says of an object.
+    """Evidence of a camera image for or against an object.
 
     outline  : (k, 2) pixels, corners
     edges    : mean strength of the edges that run along the outline, 0 to 1
@@ -51,7 +51,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Overlay(Defence):
-    """Objects whose outline has no edges in the image, or whose inside looks like the surroundings."""
+    """Objects without edges along their outline in the image, or whose inside resembles the surroundings."""
 
     needs: ClassVar[frozenset[str]] = frozenset({"cameras"})
 
@@ -62,7 +62,7 @@ class Overlay(Defence):
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
     ) -> Verdict:
-        """Judge the boxes of the last frame that a camera sees."""
+        """Judge the bounding boxes of the last frame that are in view of a camera."""
         del scene, rng
         frame = frames[-1]
         objects = np.zeros(len(frame.objects))
@@ -89,7 +89,7 @@ class Overlay(Defence):
         return found
 
     def evidence(self, frame: Observation, row: int, *, picture: Picture) -> Evidence | None:
-        """What a picture says of a box; None if it shows it not, too small, blinded or at another time."""
+        """Evidence of an image for a bounding box; None if it does not show it at its time."""
         body = frame.members[row]
         if len(body) < 4 or np.abs(frame.time_ns[body] - picture.time_ns).min() > 1e9 * self.lag:
             return None
@@ -156,7 +156,7 @@ def project_returns(frame: Observation, rows: NDArray[np.intp], *, picture: Pict
 
 
 def hull_of(pixels: Float) -> Float | None:
-    """Corners (k, 2) of the convex hull of pixels, clockwise as seen; None if they are on a line."""
+    """Corners (k, 2) of the convex hull of pixels, clockwise; None if the pixels are collinear."""
     try:
         hull = ConvexHull(pixels)
     except (QhullError, ValueError):
@@ -230,7 +230,7 @@ def _hellinger(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
 
 
 def _outside(pixels: NDArray[np.int64], corners: Float, *, scale: Float) -> Float:
-    """How far (n,) pixels are outside of a convex outline, in units of a scale by axis; negative inside."""
+    """Distance (n,) of pixels outside a convex outline, in units of a scale by axis; negative inside."""
     places, following = corners, np.roll(corners, -1, axis=0)
     side = following - places
     normal = np.column_stack([side[:, 1], -side[:, 0]])

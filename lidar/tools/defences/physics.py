@@ -102,7 +102,7 @@ def _off_quantum(frame: Observation) -> Bools:
 
 
 def _too_weak(frame: Observation) -> Bools:
-    """Returns whose power is under the detection threshold, where the frame shows that there is one."""
+    """Returns with a power below the detection threshold, if the frame has such a threshold."""
     sensor = frame.sensor
     apparent = apparent_of_code(frame.intensity + 0.5, diffuse_code=sensor.diffuse_code)  # codes are rounded
     power = amplitude(

@@ -59,7 +59,7 @@ def able(
 
 
 def _lacks(scans: RecordedScans, *, needs: frozenset[str]) -> str:
-    """What a defence needs and the data of a scanner lack; empty if nothing."""
+    """Names of data that a defence needs and a scanner's dataset lacks; empty if none."""
     path = scans.dataset.path
     if "cameras" in needs and not scans.pictures:
         return f"needs colour images, and {path} has none"

@@ -52,7 +52,7 @@ def bins_of(suspicion: Float) -> NDArray[np.int64]:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How well suspicions tell attacked from genuine ones.
+    """Separation of attacked from genuine samples by their suspicion.
 
     genuine, attacked : numbers of both
     auc        : area under the ROC, with its 95 % interval; nan without both kinds
@@ -79,7 +79,7 @@ class Score:
 
 
 def threshold_at(samples: SuspicionCounts, rate: float) -> float:
-    """The least suspicion above which at most a share ``rate`` of genuine ones is; 1 if there is none."""
+    """Lowest suspicion that at most a share ``rate`` of genuine samples exceeds; 1 if there is none."""
     genuine = samples.genuine.sum(axis=0)
     above = genuine.sum() - np.cumsum(genuine)
     allowed = np.flatnonzero(above <= rate * genuine.sum())

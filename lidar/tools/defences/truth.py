@@ -25,7 +25,7 @@ FORGED_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class FrameTruth:
-    """What attacks did to a frame.
+    """Ground truth of the attacks on a frame.
 
     returns     : (n,) bool, returns that an attack gave
     removed_xyz : (k, 3) metres, sensor frame: genuine returns that are missing

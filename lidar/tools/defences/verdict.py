@@ -1,4 +1,4 @@
-"""What a defence says of a frame."""
+"""Verdict of a defence on a frame: suspicion of returns, objects and the frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Gaps(Columns):
 
 
 def no_gaps() -> Gaps:
-    """No places."""
+    """Gaps without any place."""
     return Gaps(np.empty((0, 2)), np.empty(0), np.empty(0))
 
 

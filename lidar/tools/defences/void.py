@@ -1,4 +1,4 @@
-"""Ground that pulses should have met and did not: hidden objects and removed returns."""
+"""Missing ground returns: hidden objects and removed returns."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Void(Defence):
 
 
 def ground_pulses(frame: Observation, *, reach: float) -> tuple[NDArray[np.intp], Float, NDArray[np.bool_]]:
-    """Pulses (k,), where they would meet the ground (k, 2), and whether they have no return there or before.
+    """Pulses (k,), their ground points (k, 2), and whether they lack a return at the ground or before it.
 
     Pulses that a nearer return stops are left out: they tell nothing of the ground.
     """

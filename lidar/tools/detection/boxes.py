@@ -16,7 +16,7 @@ _NEAREST = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Rectangle:
-    """A rectangle seen from above.
+    """An oriented rectangle in plan.
 
     centre : (2,) metres
     size   : along its axis and across, metres; the first is the longer one

@@ -106,7 +106,7 @@ class PointCluster:
 
 @dataclass(frozen=True, slots=True)
 class Scan:
-    """A cloud within the detector's reach, and its clusters.
+    """A point cloud within the detector's maximum range, and its clusters.
 
     xyz    : (n, 3) metres, sensor frame
     height : (n,) metres above the ground
@@ -120,7 +120,7 @@ class Scan:
 
 
 def find_clusters(cloud: CloudPoints, *, settings: DetectorSettings) -> Scan:
-    """The clusters of a cloud of one turn of a scanner that stands upright on a vehicle.
+    """Clusters of the point cloud of one turn of an upright scanner on a vehicle.
 
     Points above the ground, up to 2.5 m, are clustered seen from above; clusters that are too long are
     clustered again with half the distance.
@@ -174,7 +174,7 @@ def _shape(
 
 
 def _line(seen: Rectangle, *, tall: _Tall) -> float:
-    """Metres of a longer side, together with what is as high as a wall and goes on in line with it."""
+    """Length in metres of the longer side, extended by wall-high neighbours in line with it."""
     axis = np.array([np.cos(seen.yaw), np.sin(seen.yaw)])
     side = np.array([-axis[1], axis[0]]) * seen.size[1] / 2
     beyond = seen.size[0] / 2 + _BEYOND
@@ -198,7 +198,7 @@ class _Tall:
         return self.height[np.unique(np.concatenate([*rows, []]).astype(np.int64))]
 
     def high(self, xy: NDArray[np.floating]) -> Bools:
-        """Whether there are points as high as a wall near places (k, 2)."""
+        """Whether wall-high points are near places (k, 2)."""
         found: Bools = self._walls.query(xy, distance_upper_bound=_BESIDE)[0] < np.inf
         return found
 
@@ -231,7 +231,7 @@ def _link(xy: NDArray[np.floating], link: NDArray[np.floating]) -> Ints:
 
 
 def _aspect(seen: Rectangle) -> float:
-    """Cosine between the axis of a rectangle and the line of sight, 0 for one that is seen from the side."""
+    """Cosine between the axis of a rectangle and the line of sight; 0 for a side view."""
     towards = seen.centre / max(float(np.hypot(*seen.centre)), 1e-9)
     return float(abs(towards @ [np.cos(seen.yaw), np.sin(seen.yaw)]))
 

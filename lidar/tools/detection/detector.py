@@ -1,4 +1,4 @@
-"""What detectors of road users give, and how one is used."""
+"""Detectors of road users: interface and results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class CloudPoints(Protocol):
 
 
 class Detector(Protocol):
-    """Finds road users in a cloud of one turn of a scanner that stands upright on a vehicle.
+    """Detector of road users in the point cloud of one turn of an upright scanner on a vehicle.
 
     name     : "rules", "learned" or the model's file
     identity : what tells its boxes from those of other detectors, wherever its file lies

@@ -107,7 +107,7 @@ def _extents(flat: Float, height: Float, *, yaw: float) -> list[float]:
 
 
 def _moments(xyz: Float) -> list[float]:
-    """How much the points lie on a line, in a plane, and in neither."""
+    """Linearity, planarity and scattering of points."""
     around = xyz - xyz.mean(axis=0)
     small, middle, large = np.sqrt(np.maximum(np.linalg.eigvalsh(around.T @ around / len(xyz)), 0)).tolist()
     large = max(large, 1e-9)

@@ -49,7 +49,7 @@ class Learned:
     settings: DetectorSettings = PLAIN
 
     def detect(self, cloud: CloudPoints) -> Detections:
-        """Road users in a cloud of one turn of a scanner that stands upright on a vehicle."""
+        """Road users in the point cloud of one turn of an upright scanner on a vehicle."""
         scan = find_clusters(cloud, settings=self.settings)
         scores = self.scores(features(scan))
         found = []

@@ -1,4 +1,4 @@
-"""Detectors by name."""
+"""Registry of detectors."""
 
 from __future__ import annotations
 

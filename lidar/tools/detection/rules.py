@@ -11,7 +11,7 @@ from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detectio
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """The detector without learning."""
+    """Rule-based detector of road users."""
 
     settings: DetectorSettings = PLAIN
     name: str = "rules"
@@ -26,7 +26,7 @@ RULES = Rules()
 
 
 def detect(cloud: CloudPoints, *, settings: DetectorSettings = PLAIN) -> Detections:
-    """Road users in a cloud of one turn of a scanner that stands upright on a vehicle.
+    """Road users in the point cloud of one turn of an upright scanner on a vehicle.
 
     Each cluster gets a rectangle; its size, its height, the share of points above it and the number of cells
     give the score by rules.
@@ -37,7 +37,7 @@ def detect(cloud: CloudPoints, *, settings: DetectorSettings = PLAIN) -> Detecti
 
 
 def _judge(shape: ClusterShape, *, floor: float, settings: DetectorSettings) -> DetectedObject:
-    """What a cluster most likely is, with the score of the rules.
+    """Most likely class of a cluster, with the score of the rules.
 
     floor : z of the ground below it
     """
@@ -62,7 +62,7 @@ def _as_person(shape: ClusterShape) -> float:
 
 
 def _as_cycle(shape: ClusterShape) -> float:
-    """0 to 1: as a person, but longer along the line of sight; one seen from the side is as wide as a car."""
+    """Score of a cyclist, 0 to 1: as a person, but longer along the line of sight."""
     side = (
         ramp(-shape.sides[0], -2.5, -2.1) * ramp(shape.sides[0], 1.1, 1.4) * ramp(-shape.sides[1], -1.0, -0.8)
     )
@@ -87,7 +87,7 @@ def _as_truck(shape: ClusterShape) -> float:
 
 
 def _many(shape: ClusterShape) -> float:
-    """0 to 1 by the number of cells and, as a single beam tells little, by the heights that they span."""
+    """Score 0 to 1 by the number of cells and by the height that they span."""
     return shape.standing * ramp(shape.cells, 2, 12) * (0.5 + 0.5 * ramp(shape.top - shape.bottom, 0.1, 0.5))
 
 

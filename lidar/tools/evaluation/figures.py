@@ -164,7 +164,7 @@ def axes(compared: Compared) -> Canvas:
 
 
 def qualities(estimate: Path) -> Canvas | None:
-    """What an estimate says of its frames, such as matches and inliers; None if it says nothing.
+    """Quality figures that an estimate reports by frame, such as matches and inliers; None without any.
 
     It is in numeric columns, but those of poses, of a CSV file with the estimate's name, or of ``poses.csv``
     in the folder of an estimate.

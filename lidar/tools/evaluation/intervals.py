@@ -22,7 +22,7 @@ _ENDS = (2.5, 97.5)
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A figure with its 95 % interval, None where the samples are too few to tell."""
+    """A figure with its 95 % interval; None for too few samples."""
 
     value: float
     low: float | None = None

@@ -32,7 +32,7 @@ class PosePairs:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryAlignment:
-    """What moves an estimate onto the truth: ``scale * rotation @ point + shift``.
+    """Similarity transform from estimate to ground truth: ``scale * rotation @ point + shift``.
 
     rotation : (3, 3)
     shift    : (3,) metres

@@ -87,7 +87,7 @@ class Boxes(Columns):
 
 @dataclass(frozen=True, slots=True)
 class KeyFrames:
-    """Key frames.
+    """Key frames of a nuScenes dataset, as columns.
 
     token : of each sample
     time_ns, frame : (n,) of each, since the drive's start, and of the scanner

@@ -1,4 +1,4 @@
-"""How far boxes overlap: in images, from above, and in space."""
+"""Intersection over union of bounding boxes: in images, in plan, and in space."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def steps_of(
     kind: str,
     measure: str,
 ) -> list[Step]:
-    """Frames of a class; ``object`` stands for all classes.
+    """Frames of a class, as input of the tracking metrics; ``object`` stands for all classes.
 
     Objects that are low, hidden or of a class alike do not count, and found ones on them are left out.
     """

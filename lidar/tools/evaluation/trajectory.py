@@ -104,7 +104,7 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """What figures and tables are made of.
+    """An estimated trajectory paired with ground truth: input of figures and tables.
 
     pairs   : aligned
     dataset : the truth, if it is one
@@ -223,7 +223,7 @@ def _map_errors(
 
 
 def method_of(errors: TrajectoryErrors) -> str:
-    """How the errors were found, in words."""
+    """Description of how the errors were computed."""
     step = f"every {KITTI_STEP}th pose" if errors.kitti else "every pose"
     kind = "KITTI's benchmark" if errors.kitti else "shorter lengths than KITTI's benchmark (100 to 800 m)"
     return (

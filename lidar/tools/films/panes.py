@@ -65,7 +65,7 @@ _STEPS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
 class Pane(Protocol):
-    """A part of the picture; times are asked for in rising order."""
+    """A part of the picture; times must be requested in ascending order."""
 
     def draw(self, row: int) -> Pixels:
         """The image (h, w, 3) of a row of the film."""
@@ -358,7 +358,7 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
 
 
 def _bright(color: NDArray[np.uint8]) -> tuple[int, int, int]:
-    """A colour, mixed with white where it would not be seen on the dark ground."""
+    """A colour, lightened for contrast on the dark background."""
     light = float(color @ np.array([0.299, 0.587, 0.114])) / 255
     share = min(max((_LIGHTEST - light) / (1 - light), 0.0), 1.0) if light < 1 else 0.0
     red, green, blue = np.rint(color + share * (255.0 - color)).astype(int).tolist()

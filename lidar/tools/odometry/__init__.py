@@ -1,1 +1,1 @@
-"""Motion of a vehicle from what its sensors measured: LiDAR, cameras, and their fusion with GNSS and IMU."""
+"""Estimated motion of a vehicle: LiDAR and visual odometry, and their fusion with GNSS and IMU."""

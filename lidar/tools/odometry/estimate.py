@@ -1,4 +1,4 @@
-"""What an odometry method finds, and the files that hold it."""
+"""Result of an odometry method, and its files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ OWN_FILES = frozenset({TRAJECTORY, "trajectory.kitti", "poses.csv", REPORT})
 
 @dataclass(frozen=True)
 class MotionEstimate:
-    """Poses of a vehicle.
+    """Estimated poses of a vehicle, with covariances and a report.
 
     time_ns : (n,) int64, rising, since the drive's start
     poses   : (n, 4, 4) of the vehicle, true metres: in the scene if ``in_scene``, else in the frame that the
@@ -124,7 +124,7 @@ def begun_at(estimate: MotionEstimate, place: tuple[float, ...], *, frame: Frame
 
 
 def write_estimate(folder: Path, estimate: MotionEstimate, *, dataset: Dataset) -> None:
-    """Write an estimate into a folder: TUM, KITTI, poses.csv, and what was done as JSON."""
+    """Write an estimate into a folder: TUM, KITTI, poses.csv, and the report as JSON."""
     poses, quat = estimate.poses, quat_from_matrix(estimate.poses[:, :3, :3])
     position = np.ascontiguousarray(poses[:, :3, 3])
     absolute_ns = posix_ns(dataset.start) + estimate.time_ns

@@ -88,7 +88,7 @@ def fused_odometry(
 
 
 def _name_of(dataset: Dataset, kind: str, *, names: tuple[str, ...]) -> str:
-    """The sensor of a kind that is named, or the first; empty if there is none."""
+    """Name of the sensor of a kind that the user chose, or of the first; empty without any."""
     there = dataset.sensors(kind)
     return next((name for name in (*names, *there) if name in there), "")
 

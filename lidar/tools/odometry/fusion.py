@@ -68,7 +68,7 @@ class Fixed:
 
 @dataclass(frozen=True)
 class Unit:
-    """Samples of an inertial unit and what is known of it.
+    """Samples of an inertial unit, with its noise model.
 
     vehicle_from_unit : (4, 4)
     gravity           : m/s^2
@@ -92,7 +92,7 @@ class Fused:
 
 
 def fixes_of(dataset: Dataset, receiver: str) -> Fixed:
-    """The fixes of a receiver with the deviations that their state and dilution of precision stand for.
+    """Fixes of a receiver, with standard deviations by their state and dilution of precision.
 
     Multipath is that of the share of the sky which is hidden, as the number of satellites tells it.
 

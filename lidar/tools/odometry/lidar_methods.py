@@ -229,7 +229,7 @@ def _set_voxel(odometry_of: Any, config: Any, *, metres: float) -> None:
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """Let this thread and those that it starts run on one core, where the system can tell them to.
+    """Restrict this thread and its children to one core, where the system supports it.
 
     GenZ-ICP has as many threads as there are cores when it first runs, and no setting for it. Sums of several
     threads differ from run to run.

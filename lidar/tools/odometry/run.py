@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class OdometrySummary:
-    """What `estimate_motion` did.
+    """Summary of `estimate_motion`.
 
     length_m : of the way from pose to pose
     seconds  : that it took
@@ -50,7 +50,7 @@ def estimate_motion(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> OdometrySummary:
-    """Write the motion of a dataset's vehicle by what its sensors measured into a folder.
+    """Estimate the motion of a dataset's vehicle from its measurements, and write it into a folder.
 
     The folder holds ``trajectory.tum``, ``trajectory.kitti``, ``poses.csv`` and ``odometry.json``. Of the
     dataset the sensors' files and the calibration are read; true poses, depth images, labels and boxes are

@@ -23,7 +23,7 @@ _ROUNDS = 15
 
 @dataclass(frozen=True)
 class Sighted:
-    """Known points and the bearings at which a camera sees them.
+    """Known points and their bearings from a camera.
 
     point   : (n, 3) in the map's frame
     bearing : (n, 3) unit vectors in the camera's frame
@@ -43,7 +43,7 @@ class Sighted:
     motion: Float
 
     def errors(self, pose: Float) -> tuple[Float, Float, Float]:
-        """Errors (n, 2) in standard deviations, their weights as 1 / radians (n,), and points (n, 3) seen.
+        """Errors (n, 2) in standard deviations, weights (n,) in 1 / radians, and the visible points (n, 3).
 
         Points are in the camera's frame at the time at which they are seen.
         """
@@ -60,7 +60,7 @@ class Sighted:
         return found * weight[:, None], weight, seen
 
     def take(self, rows: Any) -> Sighted:
-        """Some of the points."""
+        """Subset of the points."""
         columns = (self.point, self.bearing, self.sigma, self.fuzz, self.share)
         point, bearing, sigma, fuzz, share = (column[rows] for column in columns)
         return Sighted(point, bearing, sigma, fuzz, self.origin, share, self.motion)
@@ -101,7 +101,7 @@ def pose_of(
     rng: np.random.Generator,
     prior: Float | None = None,
 ) -> tuple[Float, Bools, Float] | None:
-    """The pose from which known points are seen, the inliers (n,) and the pose's covariance (6, 6).
+    """Camera pose from known points (PnP), the inliers (n,) and the pose's covariance (6, 6).
 
     start  : (4, 4) expected pose, which is tried first
     trials : of three points each (P3P in a random sample consensus; Fischler and Bolles 1981), at most; fewer

@@ -155,7 +155,7 @@ def _by_stereo(images: Stream, other: Stream, *, settings: OdometrySettings) -> 
 
 
 def _scale_by_road(found: Tracked, images: Stream, *, height: float) -> tuple[Float, str]:
-    """Factors (k,) of the distances of keyframes by the height over the road, and what they are from.
+    """Scale factors (k,) of keyframes from the camera's height over the road, and their source.
 
     The points of the road ahead lie on a plane, whose distance below the camera is known. Keyframes that
     follow one another share points of the map, hence a scale, which drifts slowly.

@@ -41,7 +41,7 @@ _ROUNDS = 2  # of distances and pose from each
 
 
 class FeatureDepths(Protocol):
-    """Measures distances of features."""
+    """Depths of image features."""
 
     def __call__(self, row: int, features: ImageFeatures, *, motion: Float) -> tuple[Float, Float]:
         """Distances (n,) of a frame's features and their deviations over them; NaN where unknown.
@@ -52,7 +52,7 @@ class FeatureDepths(Protocol):
 
 @dataclass(frozen=True)
 class Tracked:
-    """What tracking found.
+    """Result of tracking a camera.
 
     reference : (n,) rows of the keyframes that frames are relative to
     relative  : (n, 4, 4) poses of frames in their keyframes' frames

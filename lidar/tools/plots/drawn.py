@@ -1,4 +1,4 @@
-"""What figures return, and tools that they share."""
+"""Result of a figure, and tools that figures share."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MOST = 2000
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A figure.
+    """A figure, with a note and its numbers.
 
     note    : its figures in one line
     numbers : the same by name

@@ -35,13 +35,13 @@ _QUALITY = 85
 
 @dataclass(frozen=True, slots=True)
 class LiveTarget:
-    """Where a drive is shown: in the file, or in a viewer without one."""
+    """Target of a live view: a file, or a viewer."""
 
     file: Path | None
 
 
 def live_target(words: Sequence[str] | None, *, overwrite: bool) -> LiveTarget | None:
-    """Where the words of an option show a drive; None without the option.
+    """Target of a live view from the words of an option; None without the option.
 
     Raises InputError for other words than a free file name that ends with .rrd, and MissingExtraError without
     rerun.

@@ -27,7 +27,7 @@ SCRIPTS = ("sweep.js", "draw.js", "panels.js", "player.js")
 
 @dataclass(frozen=True, slots=True)
 class PageSummary:
-    """What a page holds.
+    """Summary of a page.
 
     path    : the file
     bytes   : of it
@@ -130,7 +130,7 @@ def served_page(drive: Drive) -> bytes:
 
 
 def _left_out(drive: Drive) -> list[str]:
-    """What of the dataset is not shown."""
+    """Parts of the dataset that the page leaves out."""
     names = {*(shown.clouds.name for shown in drive.scanners), *(camera.name for camera in drive.cameras)}
     notes = []
     if left := [name for name in drive.dataset.sensors("lidar", "camera") if name not in names]:

@@ -69,7 +69,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.OK, data, kind=kind)
 
     def _found(self, path: str) -> tuple[str, bytes]:
-        """Media type and bytes at a path; raises IndexError if there is nothing."""
+        """Media type and bytes at a path; raises IndexError for an unknown path."""
         server = self.server
         if path == "/":
             return "text/html; charset=utf-8", server.page
