@@ -32,6 +32,9 @@ from lidar.traffic.fcd import read_fcd
 
 FRAME = Frame.at(24.945, 60.168)
 ROUNDS = 40
+RIGS = resources.files("lidar.sensors.rig") / "rigs"
+SENSORS = resources.files("lidar.sensors.rig") / "sensors"
+VEHICLES = resources.files("lidar.motion") / "vehicles"
 
 GPX = """<?xml version="1.0" encoding="{}"?>
 <gpx version="1.1" creator="a" xmlns="http://www.topografix.com/GPX/1/1"><trk><name>Mäki</name><trkseg>
@@ -87,9 +90,8 @@ def trajectory_text(tmp_path):
 
 
 def seeds():
-    inside = resources.files("lidar.sensors.rig")
-    for folder, use in (("rigs", load_whole_rig), ("vehicles", load_vehicle), ("sensors", load_sensor)):
-        files = sorted((f for f in inside.joinpath(folder).iterdir() if f.name.endswith(".toml")), key=str)
+    for folder, use in ((RIGS, load_whole_rig), (VEHICLES, load_vehicle), (SENSORS, load_sensor)):
+        files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=str)
         for file in files[:: max(len(files) // 4, 1)]:
             yield pytest.param(use, file.read_text("utf-8"), ".toml", id=file.name)
     yield pytest.param(lambda p: read_route(p, FRAME), GPX.format("UTF-8"), ".gpx", id="gpx")
@@ -159,17 +161,17 @@ def test_geojson_of_another_structure_is_refused(document, tmp_path):
 @pytest.mark.parametrize(
     ("folder", "name", "old", "new", "use"),
     [
-        ("rigs", "vlp16", "[[lidar]]", "[[lidar]]\nrate_hz = 1e-12", load_whole_rig),
-        ("sensors", "vlp16", "rates_hz = [", "rates_hz = [1e18, ", load_sensor),
-        ("vehicles", "car", "turning_radius = ", "turning_radius = 9e9", load_vehicle),
-        ("vehicles", "car", "turning_radius = ", "turning_radius = 0.006", load_vehicle),
-        ("sensors", "mid40", "pulse_hz = ", "pulse_hz = 1e-308 # ", load_sensor),
-        ("sensors", "ust10lx", "step_deg = ", "step_deg = 1e-308 # ", load_sensor),
-        ("rigs", "seed", "height = 720", "height = 65535", load_whole_rig),
+        (RIGS, "vlp16", "[[lidar]]", "[[lidar]]\nrate_hz = 1e-12", load_whole_rig),
+        (SENSORS, "vlp16", "rates_hz = [", "rates_hz = [1e18, ", load_sensor),
+        (VEHICLES, "car", "turning_radius = ", "turning_radius = 9e9", load_vehicle),
+        (VEHICLES, "car", "turning_radius = ", "turning_radius = 0.006", load_vehicle),
+        (SENSORS, "mid40", "pulse_hz = ", "pulse_hz = 1e-308 # ", load_sensor),
+        (SENSORS, "ust10lx", "step_deg = ", "step_deg = 1e-308 # ", load_sensor),
+        (RIGS, "seed", "height = 720", "height = 65535", load_whole_rig),
     ],
 )
 def test_numbers_far_out_of_range_are_refused(folder, name, old, new, use, tmp_path):
-    text = resources.files("lidar.sensors.rig").joinpath(folder, f"{name}.toml").read_text("utf-8")
+    text = folder.joinpath(f"{name}.toml").read_text("utf-8")
     (tmp_path / "a.toml").write_text(text.replace(old, new, 1), "utf-8")
     with pytest.raises(LidarError, match=r"a\.toml"):
         use(tmp_path / "a.toml")
