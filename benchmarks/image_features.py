@@ -2,7 +2,7 @@
 
     python benchmarks/image_features.py SCENE [--pairs 10] [--variant supersample=2 ...] [--traffic] [--json]
 
-Prints a table of docs/measurements/cameras.md; needs the extra ``odometry``. A KITTI camera (1242 x 375,
+Prints a table of docs/measurements/sensors.md; needs the extra ``odometry``. A KITTI camera (1242 x 375,
 10 Hz) drives at random; the images of consecutive frames are rendered with the standard settings and with
 those of each variant (``NAME=VALUE,NAME=VALUE``), in turn, in one thread. ORB features of both are
 matched (nearest descriptor, mutual, ratio below 0.8); a match is correct if it ends within 1.5 pixels of
