@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from difflib import get_close_matches
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -274,7 +275,7 @@ _NOT_IN_RECIPE = ("relief", "device", "stages", "weather", "attacks", "road", "w
 
 
 @Parameter(name="*")
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class DriveOptions:
     """Options of a drive. The dataset stores them; its bytes depend on all but ``workers`` and ``scheduler``.
 
@@ -418,7 +419,7 @@ class DriveOptions:
             raise InputError(f"`road` {self.road}: one of {', '.join(_ROADS)}")
         if self.road == "by-weather" and not self._weather():
             raise InputError("`road` by-weather: give `weather`, too")
-        self.contents()
+        _ = self.recording_settings
 
     def road_conditions(self) -> RoadConditions:
         """Grip and visibility that vehicles drive with."""
@@ -428,7 +429,7 @@ class DriveOptions:
             return ROADS[self.road]
         from lidar.signal.weather.road import road_conditions  # noqa: PLC0415
 
-        ground = self.contents().world
+        ground = self.recording_settings.world
         return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)
 
     def _weather(self) -> WeatherList:
@@ -456,8 +457,9 @@ class DriveOptions:
         """Side of the road that the vehicle drives on."""
         return cast("Side", self.side) if self.side else "left" if scene.left_hand else "right"
 
-    def contents(self) -> RecordingSettings:
-        """Files and settings of every frame; raises InputError for unknown names."""
+    @cached_property
+    def recording_settings(self) -> RecordingSettings:
+        """Files and settings of every frame, resolved once; raises InputError for unknown names."""
         from lidar.settings import RecordingSettings, settings_of  # noqa: PLC0415  (a second, not needed for --help)
         from lidar.signal.registry import Stages  # noqa: PLC0415
 

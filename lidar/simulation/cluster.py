@@ -116,7 +116,7 @@ def _record_task(task: _Task) -> _Done:
         _station.recording = plan.recording(task.out)
         _station.sensors = plan.sensors
         _station.worlds = Worlds(
-            plan.scene, plan.max_range, actors=plan.actors, settings=_station.recording.contents.world
+            plan.scene, plan.max_range, actors=plan.actors, settings=_station.recording.settings.world
         )
         _station.plan = task.plan
     recording, worlds = _station.recording, _station.worlds

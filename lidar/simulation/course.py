@@ -86,15 +86,15 @@ def needed_area(roads: RoadMap, options: DriveOptions) -> Any:
     around the stretch of the drive at hand. Road users are simulated within a radius.
     """
     course = drive_course(roads, options)
-    rig, contents = load_rig(options.rig), options.contents()
+    rig, settings = load_rig(options.rig), options.recording_settings
     sensors = sensors_of(rig, options)
     x, y = course.path[len(course.path) // 2]
     scale = max(float(np.asarray(roads.frame.scale_at(x, y))), 1.0)
-    margin = min(max((s.max_range for s in sensors), default=0.0), contents.world.reach)
+    margin = min(max((s.max_range for s in sensors), default=0.0), settings.world.reach)
     parts = [_around(course.path, (margin + _ASIDE) * scale)]
     parts += [_around(line, _OBSTACLES * scale) for line in course.tried]
     colored = any(isinstance(s, Camera) and "rgb" in s.spec.images for s in sensors)
-    if colored and contents.camera.shadows:
+    if colored and settings.camera.shadows:
         parts += _squares(course.path, CHUNK, margin=margin + OVERHANG)
     if rig.gnss:
         parts += _squares(course.path, BLOCK_M * scale, margin=REACH + OVERHANG)

@@ -212,7 +212,7 @@ def _driven(
         planning=planning_s,
         recording=recording_s,
         stages=recording.watch.seconds,
-        effects=recording.contents.stages.effects(recording.effects.counts),
+        effects=recording.settings.stages.effects(recording.effects.counts),
     )
 
 
@@ -253,7 +253,7 @@ def _write_plan(plan: DrivePlan, recording: Recording) -> None:
         trajectory=plan.trajectory,
         start=plan.start,
         frames=plan.frames,
-        contents=plan.options.contents(),
+        settings=plan.options.recording_settings,
         effects=recording.effects,
     )
 

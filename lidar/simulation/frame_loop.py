@@ -48,7 +48,7 @@ def run_jobs(
     """
     released_ns = 0
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
-    worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.contents.world)
+    worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.settings.world)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with _pool(workers) as pool:
         for chunk, region in recording_chunks(jobs, recording):
@@ -92,12 +92,12 @@ def _pool(workers: int) -> Iterator[ThreadPoolExecutor]:
 
 def check_attackers(plan: DrivePlan, recording: Recording) -> None:
     """Raise InputError for an attacker's device that no scanner of a drive ever has in sight."""
-    check_sight(recording.contents.stages, _scanner_frames(plan, recording))
+    check_sight(recording.settings.stages, _scanner_frames(plan, recording))
 
 
 def _scanner_frames(plan: DrivePlan, recording: Recording) -> Iterator[tuple[Situation, Callable[[], Seen]]]:
     """Yield each scanner frame's context, and a function that tests lines of sight in its world."""
-    worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.contents.world)
+    worlds = Worlds(plan.scene, plan.max_range, actors=recording.actors, settings=recording.settings.world)
 
     def seen(scanner: Scanner, frame: int, *, region: Region) -> Seen:
         worlds.follow(region)
@@ -115,7 +115,7 @@ def recording_chunks(
     jobs: Sequence[SensorFrame], recording: Recording
 ) -> Iterator[tuple[Sequence[SensorFrame], Region]]:
     """`chunks` whose boxes also cover the places of earlier frames that stages ask for."""
-    back_ns = recording.contents.stages.lookback_ns
+    back_ns = recording.settings.stages.lookback_ns
     for run, box in chunks(jobs, recording.trajectory):
         yield run, _widen(box, run, trajectory=recording.trajectory, back_ns=back_ns) if back_ns else box
 

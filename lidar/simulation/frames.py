@@ -133,7 +133,7 @@ class Simulation:
             workers=plan.options.workers,
             in_order=True,
         )
-        stages = recording.contents.stages
+        stages = recording.settings.stages
         fixes, samples = _fixes(plan, stages), _samples(plan, stages)
         for number, (start_ns, end_ns, group) in enumerate(_steps(plan, measured)):
             pose = plan.trajectory.at([start_ns])

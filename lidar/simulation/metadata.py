@@ -125,7 +125,7 @@ def write_metadata(
     trajectory: Trajectory,
     start: datetime,
     frames: Mapping[str, int],
-    contents: RecordingSettings,
+    settings: RecordingSettings,
     effects: Effects | None = None,
 ) -> None:
     """Write all files of a dataset but clouds, images and boxes.
@@ -136,7 +136,7 @@ def write_metadata(
 
     frames : number of frames, by sensor
     """
-    seed, paths = contents.seed, Paths(out)
+    seed, paths = settings.seed, Paths(out)
     write_json(paths.calibration, calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
         times = np.fromiter(map(sensor.frame_start_ns, range(frames[sensor.name])), np.int64)
@@ -157,10 +157,10 @@ def write_metadata(
                     for rows, part in windows
                 ),
             )
-        if contents.kitti and isinstance(sensor, Scanner):
+        if settings.kitti and isinstance(sensor, Scanner):
             folder, mount = paths.sensor(sensor.name), sensor.spec.mount
             write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)
-    stages = contents.stages
+    stages = settings.stages
     situation = partial(situation_of_unit, trajectory=trajectory, start=start, seed=seed, effects=effects)
     for receiver in rig.gnss:
         fixes = observed_fixes(scene, receiver, trajectory=trajectory, start=start, seed=seed)

@@ -150,7 +150,7 @@ class DrivePlan:
         """
         position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)].copy()
         self.trajectory.release()
-        settings = self.options.contents().world
+        settings = self.options.recording_settings.world
         sight = min(self.max_range, settings.reach)
         return [
             *height_limit(position[:, 2]),
@@ -166,7 +166,7 @@ class DrivePlan:
             trajectory=self.trajectory,
             start=self.start,
             geo=self.geo,
-            contents=self.options.contents(),
+            settings=self.options.recording_settings,
             actors=self.actors,
             signals=self.signals,
             max_range=self.max_range,
@@ -209,7 +209,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
 
     Raises InputError (also as RouteError, RigError) for what cannot be driven.
     """
-    settings = options.contents().world
+    settings = options.recording_settings.world
     check_relief(scene, settings)
     check_device(settings.device)
     start = options.start or solar_start(scene)
@@ -223,7 +223,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
     _refuse_elsewhere(scene, motion if isinstance(motion, Trajectory) else motion.trajectory, sensors=sensors)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
-    stages = options.contents().stages
+    stages = options.recording_settings.stages
     actors = with_objects(actors, stages, scene=scene, trajectory=trajectory)
     check_start(start, trajectory.duration_ns)
     jobs = schedule(sensors, trajectory.duration_ns)
@@ -296,7 +296,7 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     sensors: tuple[Scanner | Camera, ...] = (*scanners(rig), *cameras(rig))
     if not sensors and not rig.gnss:
         raise InputError(f"rig {rig.name} has no sensors")
-    stages = options.contents().stages
+    stages = options.recording_settings.stages
     known = {POSES: True, ROAD_USERS: options.traffic is not None}
     known[LABELS] = known[ROAD_USERS] or bool(stages.at("scene", "scene"))
     stages.check({**sensor_kinds(rig), "scene": "scene"}, known=[need for need, has in known.items() if has])

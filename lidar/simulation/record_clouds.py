@@ -37,7 +37,7 @@ def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: 
     if "truth" in paths:
         write_truth(paths["truth"], measured.truth)
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=measured.velocity)
-    for form in recording.contents.label_formats:
+    for form in recording.settings.label_formats:
         form.write(paths[f"labels {form.name}"], point_labels(cloud, recording.actors))
     if "boxes" in paths:
         with recording.watch.stage("boxes"):
@@ -102,7 +102,7 @@ def _alter(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds
     at = situation_of(recording, scanner, frame=frame, world=world, cloud_of=cloud_of)
     with recording.watch.stage("scan"):
         sweep = _swept(recording, scanner, frame=frame, world=world)
-        altered = altered_sweep(sweep, recording.contents.stages, at=at)
+        altered = altered_sweep(sweep, recording.settings.stages, at=at)
     if recording.scanning_ns is None:
         return altered
     return altered.where(lambda cloud: _while_on(recording, firing_times(cloud)))
@@ -110,7 +110,7 @@ def _alter(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds
 
 def _check_lookback(recording: Recording, scanner: Scanner, *, frames: int) -> None:
     """Raise LidarError if no stage declares this lookback: earlier tiles are not loaded."""
-    if frames * scanner.period_ns > recording.contents.stages.lookback_ns:
+    if frames * scanner.period_ns > recording.settings.stages.lookback_ns:
         raise LidarError(f"a stage looks back {frames} frames of {scanner.name}, more than its `lookback`")
 
 
@@ -122,8 +122,8 @@ def _swept(recording: Recording, scanner: Scanner, *, frame: int, world: World) 
         trajectory=recording.trajectory,
         world=world,
         frame=frame,
-        seed=recording.contents.seed,
-        settings=recording.contents.scanner,
+        seed=recording.settings.seed,
+        settings=recording.settings.scanner,
     )
 
 
@@ -136,7 +136,7 @@ def _works(recording: Recording, scanner: Scanner, *, frame: int) -> bool:
 
 def sent_pulses(recording: Recording, scanner: Scanner, *, frame: int) -> Firings:
     """The pulses of a frame, as far as scanners work during it."""
-    sent = find_pulse(scanner.sensor, frame, settings=recording.contents.scanner)
+    sent = find_pulse(scanner.sensor, frame, settings=recording.settings.scanner)
     return sent if recording.scanning_ns is None else sent.where(_while_on(recording, sent.time_ns))
 
 
@@ -161,12 +161,12 @@ def write_clouds(
 
     velocity : (n,) radial velocities of a Doppler scanner, m/s; by default they are simulated
     """
-    contents, watch = recording.contents, recording.watch
+    settings, watch = recording.settings, recording.watch
     begin, time_ns = scanner.frame_start_ns(frame), firing_times(cloud)
     table = cloud_table(cloud) | {"time_ns": (time_ns - begin).astype(np.uint32)}
-    world_formats = [form for form in contents.cloud_formats if form.frame == "world"]
+    world_formats = [form for form in settings.cloud_formats if form.frame == "world"]
     placed = np.empty((0, 3))
-    compensated = contents.deskew or any(form.kitti for form in contents.cloud_formats)
+    compensated = settings.deskew or any(form.kitti for form in settings.cloud_formats)
     if world_formats or compensated:
         mount = scanner.spec.mount
         with watch.stage("georeference"):
@@ -181,17 +181,17 @@ def write_clouds(
         return table | dict(zip("xyz", still.T, strict=True))
 
     info = None
-    if any(form.framed for form in contents.cloud_formats):
+    if any(form.framed for form in settings.cloud_formats):
         pose = _pose_in_crs(recording, scanner, time_ns=begin)
         info = FrameInfo(scanner.name, frame, begin, pose)
     deskewed_table: Table = {}
-    if contents.deskew:
-        deskewed_table = still_at(begin + int(MOMENTS[contents.deskew] * scanner.period_ns))
-    for form in contents.cloud_formats:
+    if settings.deskew:
+        deskewed_table = still_at(begin + int(MOMENTS[settings.deskew] * scanner.period_ns))
+    for form in settings.cloud_formats:
         if form.frame == "sensor":
             with watch.stage(f"write {form.name}"):
                 form.write(paths[form.name], still_at(begin) if form.kitti else table, frame=info)
-                if contents.deskew:
+                if settings.deskew:
                     form.write(paths[f"deskewed {form.name}"], deskewed_table, frame=info)
     if world_formats:
         with watch.stage("georeference"):
@@ -222,8 +222,8 @@ def _velocity(recording: Recording, scanner: Scanner, *, frame: int, cloud: Clou
         moving = surface_velocity(recording.actors, cloud.feature, placed=placed, time_ns=firing_times(cloud))
     mount, sigma = scanner.spec.mount, scanner.sensor.velocity_sigma
     velocity = radial_velocity(cloud, mount, trajectory=recording.trajectory, moving=moving)
-    if sigma and recording.contents.scanner.range_noise != "none":
-        rng = generator(recording.contents.seed, scanner.name, frame, "velocity noise")
+    if sigma and recording.settings.scanner.range_noise != "none":
+        rng = generator(recording.settings.seed, scanner.name, frame, "velocity noise")
         if isinstance(cloud, TracedCloud):  # a return keeps its noise when stages remove others
             row = np.where(cloud.source >= 0, cloud.source, cloud.source.max(initial=-1) + 1)
             noise = rng.standard_normal(int(row.max(initial=-1)) + 1, np.float32)[row]

@@ -47,7 +47,7 @@ def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: W
 
 def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
     """Render one frame."""
-    samples = recording.contents.camera.moments(camera.spec)
+    samples = recording.settings.camera.moments(camera.spec)
     times = exposure_times(camera.spec, camera.frame_start_ns(frame), samples=samples)
     rows = len(times) // samples
     first = (samples // 2) * rows  # of the exposure's middle sample, whose depth and labels are kept
@@ -77,7 +77,7 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
     if recording.has_stages(camera):
         original = image
         at = situation_of(recording, camera, frame=frame, world=world)
-        image = altered_image(image, recording.contents.stages, at=at)
+        image = altered_image(image, recording.settings.stages, at=at)
         truth = image_truth(image, original)
     flow = None
     if "flow" in camera.spec.images:
@@ -109,7 +109,7 @@ def _render(
     lamps: Lamps | None,
 ) -> Image:
     """A frame of a camera; ``times`` are its exposure times, ``span_ns`` the times of the world's motion."""
-    contents, (start, end) = recording.contents, span_ns
+    settings, (start, end) = recording.settings, span_ns
     with recording.watch.stage("render"):
         return render(
             camera.spec,
@@ -118,8 +118,8 @@ def _render(
             sun=sun_during(recording, start),
             times=None if recording.actors is None else (times - start) / (end - start),
             lamps=lamps,
-            random=generator(contents.seed, camera.name, frame, "image"),
-            options=contents.camera.options(camera.spec),
+            random=generator(settings.seed, camera.name, frame, "image"),
+            options=settings.camera.options(camera.spec),
         )
 
 

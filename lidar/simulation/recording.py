@@ -63,7 +63,7 @@ class Recording:
     trajectory  : of the ego vehicle
     start       : UTC time of the drive's start
     geo         : from the scene frame to the export CRS
-    contents    : which files are written
+    settings    : which files are written
     watch       : measures the time of each stage
     effects     : counts what stages do
     actors      : other road users; None without traffic, and then without boxes
@@ -77,7 +77,7 @@ class Recording:
     trajectory: Trajectory
     start: datetime
     geo: Georeference
-    contents: RecordingSettings
+    settings: RecordingSettings
     watch: Stopwatch = field(default_factory=Stopwatch)
     effects: Effects = field(default_factory=Effects)
     actors: Actors | None = None
@@ -114,11 +114,11 @@ class Recording:
             if self.signals is not None:
                 files["signals"] = paths.frame_signals(name, frame)
             return files | {kind: paths.image(name, frame, kind=kind) for kind in sensor.spec.images}
-        for form in self.contents.cloud_formats:
+        for form in self.settings.cloud_formats:
             files[form.name] = form.path(paths.sensor(name), frame)
-            if self.contents.deskew and form.frame == "sensor":
+            if self.settings.deskew and form.frame == "sensor":
                 files[f"deskewed {form.name}"] = paths.deskewed(name, frame, suffix=form.suffix)
-        for row in self.contents.label_formats:
+        for row in self.settings.label_formats:
             files[f"labels {row.name}"] = row.path(paths.sensor(name), frame)
         return files
 
@@ -131,4 +131,4 @@ class Recording:
         if isinstance(sensor, Camera) and "rgb" not in sensor.spec.images:
             return False
         kind = "camera" if isinstance(sensor, Camera) else "lidar"
-        return self.contents.stages.act_on(sensor.name, kind=kind)
+        return self.settings.stages.act_on(sensor.name, kind=kind)

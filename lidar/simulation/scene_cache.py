@@ -72,7 +72,7 @@ def built_scene(
     Raises InputError (also as RouteError) for a drive that cannot be planned, MissingExtraError without what
     its device needs, and NetworkError if a place cannot be downloaded.
     """
-    world = drive.contents().world
+    world = drive.recording_settings.world
     check_device(world.device)
     chosen = place.build_options("", relief=world.relief)
     source = _Map(path, place, clouds=clouds, options=chosen, servers=servers or Servers(), progress=progress)

@@ -73,7 +73,7 @@ def situation_of(
         utc=recording.start,
         poses=poses,
         world=world,
-        seed=recording.contents.seed,
+        seed=recording.settings.seed,
         camera=camera,
         light=None if camera is None else light_during(recording, start_ns),
         earlier=None if cloud_of is None else earlier,
@@ -132,8 +132,8 @@ def light_during(recording: Recording, time_ns: int) -> Light:
     """Sun and sky of the images of a drive at a time."""
     from lidar.sensors.camera.render import light_of  # noqa: PLC0415  (of images alone)
 
-    contents = recording.contents
-    return light_of(sun_during(recording, time_ns), cloud=contents.camera.cloud, snow=contents.world.snow)
+    settings = recording.settings
+    return light_of(sun_during(recording, time_ns), cloud=settings.camera.cloud, snow=settings.world.snow)
 
 
 def sun_during(recording: Recording, time_ns: int) -> Float:

@@ -144,14 +144,14 @@ def _apply_to_dataset(
     last |= {s.name: float(dataset.sample_times(s.name)[-1:].sum()) / 1e9 for s in sensors}
     chosen.check_start(sensor_kinds(rig), last=last)
     recording = recording_again(dataset, out, stages=chosen)
-    contents = recording.contents
+    settings = recording.settings
     jobs = [
         (s, frame)
         for s in sensors
         if recording.has_stages(s)
         for frame in range(len(dataset.sample_times(s.name)))
     ]
-    form = richest_format(contents) if any(isinstance(s, Scanner) for s, _ in jobs) else None
+    form = richest_format(settings) if any(isinstance(s, Scanner) for s, _ in jobs) else None
     has_devices = any(isinstance(named.stage, Attacker) for named in stages)
     around = surroundings_of(dataset) if has_devices else None
     if form is not None:
@@ -202,13 +202,13 @@ def _altered_units(rig: Rig, stages: Stages) -> list[GnssSpec | ImuSpec]:
 
 def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | ImuSpec) -> None:
     """Write the measurements of a receiver or an inertial unit after the stages, and their truth."""
-    stages, start, out = recording.contents.stages, recording.start, Paths(recording.out)
+    stages, start, out = recording.settings.stages, recording.start, Paths(recording.out)
     at = situation_of_unit(
         spec.name,
         spec.mount,
         trajectory=recording.trajectory,
         start=start,
-        seed=recording.contents.seed,
+        seed=recording.settings.seed,
         effects=recording.effects,
     )
     truth = dataset.paths.measurements_truth(spec.name)
@@ -243,7 +243,7 @@ def _apply_to_frame(
     around: RecordedSurroundings | None,
 ) -> int:
     """Write a cloud after the stages with its labels, boxes and truth; return the number of points."""
-    contents = recording.contents
+    settings = recording.settings
 
     def past_of(number: int) -> Past:
         cloud = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=number)
@@ -251,7 +251,7 @@ def _apply_to_frame(
 
     past = past_of(frame)
 
-    threshold = contents.scanner.link or contents.scanner.detection
+    threshold = settings.scanner.link or settings.scanner.detection
     at = situation_of(
         recording,
         scanner,
@@ -261,7 +261,7 @@ def _apply_to_frame(
     )
     altered = altered_recording(
         past.cloud,
-        contents.stages,
+        settings.stages,
         sensor=scanner.sensor,
         at=at,
         threshold=threshold,
@@ -294,7 +294,7 @@ def _check_sight(
         for device, frame in jobs
         if isinstance(device, Scanner)
     )
-    check_sight(recording.contents.stages, ((at, partial(seen, device, at)) for device, at in places))
+    check_sight(recording.settings.stages, ((at, partial(seen, device, at)) for device, at in places))
 
 
 def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, frame: int) -> None:
@@ -311,7 +311,7 @@ def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, f
         read.get("semantic", np.full(shape, Class.UNLABELED, np.uint8)),
         image_to_feature(read["instance"]) if "instance" in read else np.full(shape, -1, np.int32),
     )
-    found = altered_image(image, recording.contents.stages, at=situation_of(recording, camera, frame=frame))
+    found = altered_image(image, recording.settings.stages, at=situation_of(recording, camera, frame=frame))
     assert found.rgb is not None  # noqa: S101
     for path in (paths["rgb"], paths["truth"]):
         path.parent.mkdir(parents=True, exist_ok=True)

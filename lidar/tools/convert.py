@@ -76,10 +76,10 @@ def _with_clouds_as(
     if dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{dataset.path}: the drive was not finished; finish it first")
     recording, source = recording_again(dataset, out), _source(dataset, form)
-    deskew = recording.contents.deskew if form.frame == "sensor" else ""
-    if recording.contents.deskew and not deskew:
+    deskew = recording.settings.deskew if form.frame == "sensor" else ""
+    if recording.settings.deskew and not deskew:
         log.warning("de-skewed clouds are left out: %s files hold points in the world frame", form.name)
-    contents = replace(recording.contents, formats=(form.name,), deskew=deskew)
+    settings = replace(recording.settings, formats=(form.name,), deskew=deskew)
     if not source.exact and source.module != form.module:
         log.warning("points have the digits of %s files, not all that a drive would write", source.name)
     with reading_file(dataset.paths.manifest):
@@ -87,7 +87,7 @@ def _with_clouds_as(
     if dataset.stored is not None:
         dataset.stored.mirror(dataset.path, progress=progress)
     with complete_folder(out) as part:
-        writing, count = replace(recording, out=part, contents=contents), 0
+        writing, count = replace(recording, out=part, settings=settings), 0
         _copy_all_but_clouds(dataset, writing, devices=devices)
         for device in devices:
             frames = [frame for frame, _ in dataset.files(device.name, source)]
@@ -134,7 +134,7 @@ def _copy_all_but_clouds(dataset: Dataset, recording: Recording, *, devices: lis
         folder = new.sensor(device.name)
         left |= {form.path(folder, 0).parent for form in FORMATS.values()}
         left.add(new.deskewed(device.name, 0, suffix="").parent)
-        left |= set() if recording.contents.kitti else {folder / name for name in _SEQUENCE}
+        left |= set() if recording.settings.kitti else {folder / name for name in _SEQUENCE}
     copy_dataset(dataset.path, recording.out, leave_out=left)
 
 
@@ -146,7 +146,7 @@ def _convert_cloud(
     paths = recording.paths(scanner, frame)
     for target in paths.values():
         target.parent.mkdir(parents=True, exist_ok=True)
-    (form,) = recording.contents.cloud_formats
+    (form,) = recording.settings.cloud_formats
     if source.module == form.module and form.frame == "world":
         with reading_file(path):
             form.write(paths[form.name], source.read(path), info=recording.las_info)

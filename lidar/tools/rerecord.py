@@ -57,9 +57,9 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
     with reading_file(dataset.paths.manifest):
         seed = int(dataset.manifest["seed"])
         recorded = [(name, text) for name, text in recipe["settings"]]
-        settings = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages.stages))
+        chosen = settings_of(recipe["fidelity"], with_stage_settings(recorded, stages.stages))
         formats, labels = tuple(recipe["formats"]), tuple(recipe["labels"])
-        contents = RecordingSettings(formats, labels, recipe["deskew"], seed, *settings, stages)
+        settings = RecordingSettings(formats, labels, recipe["deskew"], seed, *chosen, stages)
         crs = export_crs(dataset.frame, recipe["crs"])
         on = dataset.manifest.get("scanners_on_ns")
         scanning_ns = None if on is None else np.array(on, np.int64).reshape(-1, 2)
@@ -69,20 +69,20 @@ def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) 
         trajectory=dataset.trajectory(),
         start=dataset.start,
         geo=Georeference(dataset.frame, crs, exact=bool(recipe.get("exact"))),
-        contents=contents,
+        settings=settings,
         scanning_ns=scanning_ns,
     )
 
 
-def richest_format(contents: RecordingSettings) -> Format:
+def richest_format(settings: RecordingSettings) -> Format:
     """The format in the sensor frame that keeps most columns.
 
     Raises InputError if there is none.
     """
-    found = [form for form in contents.cloud_formats if form.frame == "sensor"]
+    found = [form for form in settings.cloud_formats if form.frame == "sensor"]
     if not found:
         raise InputError(
-            f"clouds are in the world frame ({','.join(contents.formats)}); record the sensor frame too"
+            f"clouds are in the world frame ({','.join(settings.formats)}); record the sensor frame too"
         )
     return max(found, key=lambda form: len(form.columns))
 
@@ -110,7 +110,7 @@ def write_altered(
 
     form : in which the dataset's cloud was read
     """
-    contents, cloud = recording.contents, altered.cloud
+    settings, cloud = recording.settings, altered.cloud
     source = replace(recording, out=dataset.path).paths(scanner, frame)
     paths = recording.paths(scanner, frame)
     for path in paths.values():
@@ -122,7 +122,7 @@ def write_altered(
     if "velocity" in table:
         velocity = np.where(cloud.source >= 0, np.append(table["velocity"], 0)[cloud.source], 0)
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=velocity)
-    for labels in contents.label_formats:
+    for labels in settings.label_formats:
         name = f"labels {labels.name}"
         labels.write(paths[name], _labels(altered, source[name] if labels.name == "semantickitti" else None))
     boxes = Paths(dataset.path).frame_boxes(scanner.name, frame)

@@ -132,11 +132,11 @@ def _mark(
     if "watermark" in recipe:
         raise DatasetError(f"{dataset.path}: has a watermark already; sign the original")
     recording = recording_again(dataset, out)
-    forms = marked_formats(recording.contents.formats)
+    forms = marked_formats(recording.settings.formats)
     if not forms:
         known = ", ".join(form.name for form in marked_formats(tuple(FORMATS)))
         raise InputError(
-            f"{dataset.path}: clouds are {','.join(recording.contents.formats)}; a watermark needs one of"
+            f"{dataset.path}: clouds are {','.join(recording.settings.formats)}; a watermark needs one of"
             f" {known}, which keep ring and column"
         )
     # Exact coordinates first: CSV rounds them.

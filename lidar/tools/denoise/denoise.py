@@ -171,7 +171,7 @@ class _DatasetJob:
         if not self.jobs:
             raise InputError(f"{dataset.path}: has no clouds")
         self.recording = recording_again(dataset, out or dataset.path)
-        self.form = richest_format(self.recording.contents)
+        self.form = richest_format(self.recording.settings)
         self.points = dict.fromkeys((s.name for s, _ in self.jobs), 0)
 
     def frames(self) -> Iterator[_Frame]:

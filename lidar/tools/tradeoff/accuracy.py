@@ -201,11 +201,11 @@ def pick_settings(
 
     profile = profile_of(scene, options, folder=wanted.profile_cache, progress=progress)
     asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
-    contents = options.contents()
+    settings = options.recording_settings
     given = {
-        "rays": contents.scanner.rays,
-        "supersample": contents.camera.supersample,
-        "blur": contents.camera.blur,
+        "rays": settings.scanner.rays,
+        "supersample": settings.camera.supersample,
+        "blur": settings.camera.blur,
     }
     by = Wanted(asked, workers=options.workers, given=given, free=free)
     planned = None

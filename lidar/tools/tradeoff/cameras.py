@@ -45,9 +45,9 @@ def compared_camera(
     bench: Bench, camera: Camera, *, compared: TradeoffOptions, scenes: Sequence[str], progress: Progress
 ) -> SensorComparison:
     """The comparison of a camera; ``scenes`` are labels of the scenes after the first."""
-    plan, contents = bench.plan, bench.plan.options.contents()
+    plan, chosen = bench.plan, bench.plan.options.recording_settings
     exposed = camera.spec.exposure_ns > 0
-    basis = camera_basis(contents.camera, exposed=exposed, world=contents.world, built=plan.scene.relief)
+    basis = camera_basis(chosen.camera, exposed=exposed, world=chosen.world, built=plan.scene.relief)
     variants = camera_variants(
         basis, compared=compared.compare, scenes=scenes, traffic=plan.actors is not None
     )

@@ -125,8 +125,8 @@ class Ladders:
 
 def ladders_of(options: DriveOptions, sensors: Sequence[Scanner | Camera]) -> Ladders:
     """The settings to choose from for the sensors of a drive; those of its level are among them."""
-    contents, given = options.contents(), {name for name, _ in options.settings}
-    scanner, camera = contents.scanner, contents.camera
+    settings, given = options.recording_settings, {name for name, _ in options.settings}
+    scanner, camera = settings.scanner, settings.camera
     cameras = [s for s in sensors if isinstance(s, Camera)]
     exposed = any(c.spec.exposure_ns for c in cameras)
     of_camera = ("supersample", "blur") if exposed else ("supersample",)

@@ -86,7 +86,7 @@ class _Timing:
         recording = plan.recording(out)
         self._plan, self._sensor, self._frame = plan, sensor, frame
         self._worlds = Worlds(
-            plan.scene, plan.max_range, actors=plan.actors, settings=plan.options.contents().world
+            plan.scene, plan.max_range, actors=plan.actors, settings=plan.options.recording_settings.world
         )
         start = self._start = sensor.frame_start_ns(frame)
         xy = plan.trajectory.at(np.array([start, start + sensor.period_ns])).position[:, :2]

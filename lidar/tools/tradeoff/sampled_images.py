@@ -27,7 +27,7 @@ def image_errors_of(
 
     Depths are those of the files, rounded.
     """
-    near, exposed = bench.plan.options.contents().world, camera.spec.exposure_ns > 0
+    near, exposed = bench.plan.options.recording_settings.world, camera.spec.exposure_ns > 0
     exact = camera_basis(settings[0], exposed=exposed, world=near).exact
     for frame in bench.frames[camera.name]:
         shot = bench.shot(camera, frame)

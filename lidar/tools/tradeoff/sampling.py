@@ -133,7 +133,7 @@ def _returns(
     backend: str = FAST,
 ) -> PulseReturns:
     """Returns of some pulses of a frame; of the reference's backend, in the whole world."""
-    near = bench.plan.options.contents().world
+    near = bench.plan.options.recording_settings.world
     around = near if backend == FAST else replace(near, origin="near", reach=inf)
     return returns_of(
         bench.plan,

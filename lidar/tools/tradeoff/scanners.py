@@ -36,9 +36,9 @@ def compared_scanner(
     bench: Bench, scanner: Scanner, *, compared: TradeoffOptions, scenes: Sequence[str], progress: Progress
 ) -> SensorComparison:
     """The comparison of a scanner; ``scenes`` are labels of the scenes after the first."""
-    plan, contents = bench.plan, bench.plan.options.contents()
+    plan, settings = bench.plan, bench.plan.options.recording_settings
     basis = scanner_basis(
-        contents.scanner, rays=compared.reference_rays, world=contents.world, built=plan.scene.relief
+        settings.scanner, rays=compared.reference_rays, world=settings.world, built=plan.scene.relief
     )
     variants = scanner_variants(
         basis, compared=compared.compare, scenes=scenes, traffic=plan.actors is not None

@@ -199,7 +199,7 @@ class SimulatedFrame:
 def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1) -> SimulatedFrame:
     """Every n-th pulse of a frame."""
     plan = bench.plan
-    settings = replace(noiseless(plan.options.contents().scanner), rays=1)
+    settings = replace(noiseless(plan.options.recording_settings.scanner), rays=1)
     pulses = np.arange(0, len(firings(scanner.sensor, frame)), every)
     world = bench.world(scanner, frame, backend=FAST)
     sweep, found = swept(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)

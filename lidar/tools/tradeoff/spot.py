@@ -76,15 +76,15 @@ def spot_check(
         found.setdefault(name, []).extend(errors)
         progress("checking errors", sum(map(len, found.values())), total=total)
 
-    contents = plan.options.contents()
+    settings = plan.options.recording_settings
     for bench in places(plan, scanners, frames=_FRAMES):
         for scanner in scanners:
-            for errors in errors_of(bench, scanner, settings=[contents.scanner]):
+            for errors in errors_of(bench, scanner, settings=[settings.scanner]):
                 add(scanner.name, errors)
     for bench in places(plan, cameras, frames=_FRAMES):
         for camera in cameras:
             for images in image_errors_of(
-                bench, camera, settings=[contents.camera], blocks=blocks_of(cameras)
+                bench, camera, settings=[settings.camera], blocks=blocks_of(cameras)
             ):
                 add(camera.name, images)
     figures = {s.name: range_figures for s in scanners} | {

@@ -25,8 +25,8 @@ def test_an_unknown_name_lists_the_devices(name):
 
 def test_the_cpu_needs_no_warp(monkeypatch):
     monkeypatch.setattr(device, "need", lambda *_: pytest.fail("Warp is imported"))
-    assert DriveOptions(device="cpu").contents().world.device == "cpu"
-    assert DriveOptions().contents().world.device == "cpu"
+    assert DriveOptions(device="cpu").recording_settings.world.device == "cpu"
+    assert DriveOptions().recording_settings.world.device == "cpu"
 
 
 @pytest.mark.skipif(HAS_WARP, reason="Warp is installed")

@@ -39,7 +39,9 @@ class Clouding(WeatherSetting):
 def _known(monkeypatch):
     """A registry with an attack and weather, whatever there is."""
     stages = {"dropped_packets": "signal.dropped_packets.DroppedPackets"}
-    monkeypatch.setattr(registry, "_STAGES", stages | {"blinding": "attacks.b.Blinding", "weather": "w.W"})
+    monkeypatch.setattr(
+        registry, "_STAGES", stages | {"blinding": "signal.attacks.b.Blinding", "weather": "w.W"}
+    )
     classes = {"blinding": Blinding, "weather": Clouding}
     plain = registry.stage_class
     monkeypatch.setattr(registry, "stage_class", lambda name: classes.get(name) or plain(name))
@@ -62,15 +64,12 @@ def test_weather_comes_first_then_attacks_then_other_stages():
 @pytest.mark.usefixtures("_known")
 def test_weather_loses_weak_echoes_unless_the_user_says_otherwise():
     fog = read_weather("fog=50m")
-    assert not DriveOptions(route="random").contents().scanner.link
-    assert DriveOptions(route="random", weather=fog).contents().scanner.link
+    assert not DriveOptions(route="random").recording_settings.scanner.link
+    assert DriveOptions(route="random", weather=fog).recording_settings.scanner.link
     off = DriveOptions(route="random", weather=fog, settings=(("link", "off"),))
-    assert not off.contents().scanner.link
-    assert (
-        DriveOptions(route="random", stages=read_stages(["weather:kind=fog,amount=9"]).stages)
-        .contents()
-        .scanner.link
-    )
+    assert not off.recording_settings.scanner.link
+    staged = DriveOptions(route="random", stages=read_stages(["weather:kind=fog,amount=9"]).stages)
+    assert staged.recording_settings.scanner.link
 
 
 @pytest.mark.parametrize(
@@ -89,10 +88,12 @@ def test_weather_loses_weak_echoes_unless_the_user_says_otherwise():
     ],
 )
 def test_weather_wets_the_ground_and_covers_the_sky_by_its_kind(text, cloud, wetness, snow):
-    contents = DriveOptions(route="random", weather=read_weather(text)).contents()
-    found = contents.camera.cloud, contents.world.wetness, contents.world.snow
+    settings = DriveOptions(route="random", weather=read_weather(text)).recording_settings
+    found = settings.camera.cloud, settings.world.wetness, settings.world.snow
     assert found == pytest.approx((cloud, wetness, snow))
-    told = DriveOptions(route="random", weather=read_weather(text), settings=(("wetness", "0.9"),)).contents()
+    told = DriveOptions(
+        route="random", weather=read_weather(text), settings=(("wetness", "0.9"),)
+    ).recording_settings
     assert told.world.wetness == 0.9
 
 
