@@ -1,4 +1,6 @@
-"""The `lidar` program: drive through scenes, and make maps of what was recorded."""
+"""The `lidar` program: its commands, in groups."""
+
+from cyclopts import Group
 
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
@@ -14,36 +16,20 @@ from lidar.errors import InputError, LidarError
 
 __all__ = ["app", "main"]
 
-for _command in (
-    drive,
-    sweep,
-    redteam,
-    tradeoff,
-    detect,
-    evaluate,
-    info,
-    map_,
-    view,
-    convert,
-    apply,
-    plot,
-    animate,
-    denoise,
-    odometry,
-    defend,
-    train,
-    defences,
-    tamper,
-    sign,
-    verify,
-    stages,
-    rigs,
-    sensors,
-    classes,
-    settings,
-    selftest,
-):
-    app.command(_command)
+_COMMANDS = {
+    "Record": (drive, sweep),
+    "Look": (info, view, plot, animate),
+    "Use recorded data": (map_, convert, apply, denoise, odometry, detect, train),
+    "Measure": (evaluate, tradeoff, selftest),
+    "Security": (defend, redteam, sign, verify, tamper),
+    "Lists": (rigs, sensors, settings, stages, defences, classes),
+}
+"""Commands by the groups of ``lidar --help``, in the order in which users meet them."""
+
+for _order, (_title, _commands) in enumerate(_COMMANDS.items(), 1):
+    _group = Group(_title, sort_key=_order)
+    for _command in _commands:
+        app.command(_command, group=_group)
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ def map_(
     options: MapOptions = MapOptions(),
     report: Reporting = Report(),
 ) -> int:
-    """Aggregate all point clouds of a dataset into one georeferenced cloud.
+    """Aggregate all point clouds of a dataset into one georeferenced point cloud.
 
     For example:
 
@@ -124,7 +124,7 @@ def convert(
     options: ConvertOptions,
     report: Reporting = Report(),
 ) -> int:
-    """Write a recorded drive in the layout of another dataset, or its clouds in another format.
+    """Write a dataset in the layout of another dataset, or its point clouds in another format.
 
     With a format of clouds, the result is the same dataset with its clouds in this format: those of a drive
     with --format, byte for byte, if the recorded format keeps all digits.
@@ -169,7 +169,7 @@ def apply(
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Apply weather, attacks or other stages to recorded data: a dataset, or clouds of KITTI or nuScenes.
+    """Apply weather, attacks or other stages to a dataset, or to point clouds of KITTI or nuScenes.
 
     Stages before the detector take each recorded return as one echo, with the power that its intensity
     implies. Pulses without a return are known of datasets; in clouds of KITTI and nuScenes they fill the gaps
@@ -215,7 +215,7 @@ def denoise(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Remove the returns of rain and snow from recorded clouds, and score filters where the truth is known.
+    """Remove returns of rain and snow from recorded point clouds, and score filters against ground truth.
 
     For example:
 
@@ -254,7 +254,7 @@ def odometry(
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Estimate the motion of a recorded vehicle from what its sensors measured, without the true poses.
+    """Estimate the motion of the vehicle from recorded measurements, without ground truth.
 
     Writes trajectory.tum (TUM), trajectory.kitti (KITTI), poses.csv with standard deviations where the method
     states them, and odometry.json, which says what was done.

@@ -43,7 +43,7 @@ def drive(
     live: Annotated[tuple[str, ...] | None, SEVERAL, Parameter(group=OUTPUT, metavar="[FILE.rrd]")] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Drive a route through a scene or a map and record what the rig senses.
+    """Drive a route through a scene or a map, and record a dataset with the sensors of a rig.
 
     The same command resumes an interrupted drive; its files are those of an uninterrupted one, byte for
     byte. Of a map, the part that the drive needs is built first and kept for later drives; the recorded files

@@ -23,7 +23,7 @@ def evaluate(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Measure an estimate against the truth: a trajectory with 95 % intervals, detections or tracks.
+    """Evaluate an estimate against ground truth: a trajectory with intervals, detections or tracks.
 
     For example:
 
@@ -113,7 +113,7 @@ def detect(
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Find road users in recorded clouds, and write them in the layout of a benchmark.
+    """Detect road users in recorded point clouds, and write them in the layout of a benchmark.
 
     For example:
 

@@ -10,7 +10,7 @@ from lidar.cli.program import JsonFlag, QuietFlag
 
 
 def stages(*, json: JsonFlag = False) -> int:
-    """List the stages, weather and attacks among them, that change what sensors measure: their parameters.
+    """List the stages that change measurements, with weather and attacks: parameters and meaning.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def sensors(*, json: JsonFlag = False) -> int:
 
 
 def classes(*, json: JsonFlag = False) -> int:
-    """List the classes of points and pixels with their codes, also those of other datasets, and materials.
+    """List the classes of points and pixels with their codes, also in other datasets, and materials.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def classes(*, json: JsonFlag = False) -> int:
 
 
 def settings(*, json: JsonFlag = False) -> int:
-    """List the fidelity settings: their values at each level and their effect.
+    """List the fidelity settings: values at each level, and meaning.
 
     Parameters
     ----------

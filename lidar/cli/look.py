@@ -76,7 +76,7 @@ def view(
     open3d: bool = False,
     report: Reporting = Report(),
 ) -> int:
-    """Play a drive in a browser: the point cloud in step with images, boxes, plan and speed.
+    """Play a drive in a browser: point cloud, images, bounding boxes, plan and speed in step.
 
     For example:
 

@@ -24,10 +24,6 @@ app = App(
     lidar drive scene --route random --duration 20 -o drive
 
     lidar map drive -o map.laz
-
-    lidar rigs, lidar sensors, lidar settings and lidar stages list the choices, lidar classes the codes.
-
-    Accuracy and stability at the extremes on this machine: lidar selftest.
     """,
 )
 app.register_install_completion_command()

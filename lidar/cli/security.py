@@ -29,7 +29,7 @@ def defend(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     report: Reporting = Report(),
 ) -> int:
-    """Judge recorded frames by defences against spoofing, and score the verdicts where the truth is known.
+    """Judge recorded frames by defences against spoofing, and score the verdicts against ground truth.
 
     Defences see what the sensors measured, never labels or truth files. Thresholds are those that a stated
     share of genuine returns, objects and frames passes.
