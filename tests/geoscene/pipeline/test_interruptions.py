@@ -314,7 +314,7 @@ AFTER_THREADS = """
 import io
 import laspy
 import numpy as np
-from geoscene.processes import run_tasks, threads_of_libraries
+from geoscene.support.processes import run_tasks, threads_of_libraries
 
 def compressed(points):
     las = laspy.LasData(laspy.LasHeader(point_format=6))

@@ -53,7 +53,7 @@ def made_up_modules(monkeypatch):
 
 
 INNER = """
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 
 FACTOR = 2.0
 
@@ -62,7 +62,7 @@ def twice(x):
     return FACTOR * x
 """
 OUTER = """
-from geoscene.compiled import njit
+from geoscene.support.compiled import njit
 from lidar.made_up_inner import {names}
 
 @njit()
