@@ -1,6 +1,6 @@
 # make demo        build the bundled real scene, drive it, write pictures and point clouds
-# make test        all tests; those of the web page need chromium and chromedriver, and are skipped without
-# make test-fast   the tests outside the modules that build scenes, record drives or compile kernels
+# make test        the tests to run before a commit
+# make test-all    all tests; those of the web page need chromium and chromedriver, and are skipped without
 # make test-gpu    the kernels of CUDA on the CPU; installs the extra gpu
 # make fuzz        property tests with fresh random seeds and ten times the examples; 20,000 damaged files
 # make bench       benchmark against references, in bench/; options in ARGS, such as ARGS="--only casting writing"
@@ -13,12 +13,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 # One worker process per core; all tests of a file run in one worker, so that they share what they record.
-# Files start in the order of tests/conftest.py, the slow ones first.
+# Files start in the order of tests/conftest.py.
 PYTEST := $(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 # Tests and benchmarks start many processes, each of which would compile the packages to bytecode.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-fast test-gpu fuzz bench bench-quick lint docs wheel-test clean
+.PHONY: demo test test-all test-gpu fuzz bench bench-quick lint docs wheel-test clean
 
 $(STAMP): requirements.lock pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; name one: make PYTHON=python3.12")'
@@ -31,10 +31,10 @@ demo: $(STAMP)
 	$(BIN)/python examples/demo.py
 
 test: $(STAMP)
-	$(PYTEST)
+	$(PYTEST) -m "not full"
 
-test-fast: $(STAMP)
-	$(PYTEST) -m "not slow"
+test-all: $(STAMP)
+	$(PYTEST)
 
 test-gpu: $(STAMP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check warp-lang==1.19.0

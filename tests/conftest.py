@@ -1,4 +1,4 @@
-"""Shared fixtures, marks of slow tests, and profiles of Hypothesis."""
+"""Shared fixtures, the choice of tests for `make test`, and profiles of Hypothesis."""
 
 import logging
 import os
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
-from helpers import DEMO_BOX
+from helpers import DEMO_BOX, ROOT
 from hypothesis import HealthCheck, settings
 
 from geoscene.options import BuildOptions
@@ -30,31 +30,30 @@ settings.load_profile("same")
 FUZZ_FACTOR = 10
 
 
-SLOW = frozenset(
-    (
-        "test_actors", "test_benchmarks",
-        "test_build", "test_cli", "test_cluster", "test_documented_commands", "test_drive",
-        "test_ego_drive", "test_elevation", "test_examples", "test_fcd", "test_files",
-        "test_flight_planning", "test_footprints", "test_interruptions", "test_network",
-        "test_outputs", "test_overture", "test_places", "test_raycast", "test_rays",
-        "test_real", "test_relief_scenes", "test_render", "test_roofs", "test_ros",
-        "test_scale", "test_scene_cache", "test_sensors", "test_site", "test_siting", "test_storage",
-        "test_structures",
-        "test_sumo", "test_sweep", "test_traffic", "test_view", "test_view_browser",
-    )
+FULL = (
+    "extremes/test_footprints", "extremes/test_places", "extremes/test_rays", "extremes/test_scale",
+    "geoscene/pipeline/test_interruptions", "geoscene/pipeline/test_scale",
+    "geoscene/support/test_cluster", "geoscene/support/test_storage", "geoscene/view/test_view_browser",
+    "lidar/simulation/test_cluster", "lidar/simulation/test_killed", "lidar/simulation/test_storage",
+    "lidar/tools/odometry/test_lidar_methods", "lidar/tools/view/test_page_browser",
+    "lidar/traffic/test_sumo", "test_benchmarks", "test_documented_commands", "test_examples", "test_site",
 )  # fmt: skip
-"""Modules that compile most kernels, build scenes or record drives: most of the time, 40 % of the tests."""
+"""Modules of which `make test` runs nothing but tests marked ``gate``: they kill programs, start browsers,
+servers and clusters, run all documented commands, or need minutes."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark slow tests, and multiply the examples of property tests under ``--hypothesis-profile=fuzz``.
+    """Mark tests that `make test` leaves out, and multiply the examples under ``--hypothesis-profile=fuzz``.
 
-    Modules of slow tests come first, so that no worker is left with one while the others have nothing to do.
+    Modules that use a scene take longest and come first, so that all workers end together.
     """
     for item in items:
-        if item.path.stem in SLOW:
-            item.add_marker("slow")
-    items.sort(key=lambda item: item.path.stem not in SLOW)
+        module = item.path.relative_to(ROOT / "tests").with_suffix("").as_posix()
+        is_full = module in FULL and not item.get_closest_marker("gate")
+        if is_full or item.get_closest_marker("shared"):
+            item.add_marker("full")
+    in_scenes = {item.path for item in items if "scene" in getattr(item, "fixturenames", ())}
+    items.sort(key=lambda item: item.path not in in_scenes)
     if config.getoption("--hypothesis-profile") == "fuzz":
         attribute = "_hypothesis_internal_use_settings"  # there is no public way to the settings of a test
         functions = (item.obj for item in items if isinstance(item, pytest.Function))
@@ -63,7 +62,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             setattr(test, attribute, settings(own, max_examples=FUZZ_FACTOR * own.max_examples))
 
 
-SHARED = Path(os.environ.get("GEOSCENE_SHARED") or Path(__file__).resolve().parents[2] / "shared")
+SHARED = Path(os.environ.get("GEOSCENE_SHARED") or ROOT.parent / "shared")
 """Folder of the real extracts, which are no part of the repository."""
 
 
