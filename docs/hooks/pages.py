@@ -2,6 +2,7 @@
 
 README, CONTRIBUTING and CHANGELOG become pages. The options of both programs, and the sensors, rigs,
 settings, stages and defences that come with them, are written as the programs list them: never out of date.
+The guide's page of a command ends with a link to its options.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,8 +41,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_page_markdown(markdown: str, **_: Any) -> str:
-    """A page as repository hosts read it: lists need no blank line before them and less indentation."""
+def on_page_markdown(markdown: str, *, page: Page, **_: Any) -> str:
+    """The page as repository hosts read it, with a link to the options of its command."""
+    command = re.fullmatch(r"guide/(geoscene|lidar)-(\w+)\.md", page.file.src_uri)
+    if command and command[2] in import_module(f"{command[1]}.cli").app:
+        program, name = command.groups()
+        markdown += f"\nAll options: [`{program} {name}`](../reference/{program}.md#{program}-{name}).\n"
+    return as_hosts_read(markdown)
+
+
+def as_hosts_read(markdown: str) -> str:
+    """Markdown in which lists need no blank line before them and less indentation."""
     lines: list[str] = []
     shift, fenced = 0, False
     for line in markdown.split("\n"):
