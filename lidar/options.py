@@ -915,8 +915,7 @@ class PlotOptions:
     """Options of a figure of a dataset."""
 
     sensor: str = ""
-    """Scanner or receiver; by default the first one, for coverage all scanners. For weather a built-in
-    scanner (lidar sensors lists them) or a TOML file, hdl64e_s2 by default."""
+    """Scanner or receiver; by default the first one, for coverage all scanners."""
 
     frames: str = ""
     """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by

@@ -15,15 +15,10 @@ from lidar.errors import InputError
 from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
 from lidar.tools.plots import FIGURES
 
-_FIGURES = "; ".join(
-    [
-        *(f"{row.name} ({row.meaning})" for row in FIGURES.values()),
-        "weather (range by visibility, extinction and lost returns by rate, echoes of the air by range).",
-    ]
-)
+_FIGURES = "; ".join(f"{row.name} ({row.meaning})" for row in FIGURES.values()) + "."
 
-Plotted = Literal["weather", "range-image", "intensity", "returns", "speed", "coverage", "gnss"]
-"""Names of figures: `FIGURES`, and of models without a drive."""
+Plotted = Literal["range-image", "intensity", "returns", "speed", "coverage", "gnss"]
+"""Names of figures, as in `FIGURES`."""
 
 
 def info(
@@ -147,14 +142,14 @@ def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
 
 def plot(
     what: Annotated[Plotted, Parameter(help=_FIGURES)],
-    dataset: Path | None = None,
+    dataset: Path,
     /,
     *,
     options: PlotOptions = PlotOptions(),
     out: Out,
     report: Reporting = Report(),
 ) -> int:
-    """Plot a recorded drive, or models of weather against published values.
+    """Plot a recorded drive.
 
     For example:
 
@@ -162,24 +157,16 @@ def plot(
 
     lidar plot coverage drive -o coverage.svg
 
-    lidar plot weather --sensor vlp16 -o weather.png
-
     Parameters
     ----------
     dataset
-        Directory or URL of the dataset; none for weather.
+        Directory or URL of the dataset.
     out
         PNG or SVG to write.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.tools.plots import plot as drawn  # noqa: PLC0415
 
-    if what == "weather":
-        if dataset is not None:
-            raise InputError(f"`dataset` {dataset}: weather is plotted without one; leave it out")
-        return _plot_weather(options, out, report=report)
-    if dataset is None:
-        raise InputError(f"`dataset`: give the drive to plot: lidar plot {what} DRIVE -o {out}")
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         found = drawn(
@@ -194,27 +181,6 @@ def plot(
         print_json({"path": str(out), **found.numbers})
     else:
         print(f"{out}: {found.note}")
-    return 0
-
-
-def _plot_weather(options: PlotOptions, out: Path, *, report: Report) -> int:
-    """Plot models of weather against published values."""
-    from geoscene.support.files import write_atomically  # noqa: PLC0415
-    from lidar.sensors.rig.scanner import load_sensor  # noqa: PLC0415
-    from lidar.signal.weather.figures import weather_figure  # noqa: PLC0415
-    from lidar.tools.plots import check_out  # noqa: PLC0415
-
-    if options.frames or options.resolution is not None:
-        raise InputError("`frames` and `resolution` are of drives; leave them out for weather")
-    check_out(out, overwrite=report.overwrite)
-    name = options.sensor or "hdl64e_s2"
-    scanner = load_sensor(Path(name) if name.endswith(".toml") else name)
-    note_new_folder(out)
-    write_atomically(out, weather_figure(scanner).encoded(out.suffix.lower()))
-    if report.json:
-        print_json({"path": str(out)})
-    else:
-        print(f"{out}: weather and a {scanner.maker} {scanner.model}")
     return 0
 
 
