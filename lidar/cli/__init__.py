@@ -11,7 +11,7 @@ from lidar.cli.evaluation import detect, evaluate
 from lidar.cli.lists import classes, rigs, selftest, sensors, settings, stages
 from lidar.cli.look import animate, info, plot, view
 from lidar.cli.program import app
-from lidar.cli.security import defences, defend, sign, tamper, train, verify
+from lidar.cli.security import defences, defend, sign, train, verify
 from lidar.errors import InputError, LidarError
 
 __all__ = ["app", "main"]
@@ -21,7 +21,7 @@ _COMMANDS = {
     "Look": (info, view, plot, animate),
     "Use recorded data": (map_, convert, apply, denoise, odometry, detect, train),
     "Measure": (evaluate, tradeoff, selftest),
-    "Security": (defend, redteam, sign, verify, tamper),
+    "Security": (defend, redteam, sign, verify),
     "Lists": (rigs, sensors, settings, stages, defences, classes),
 }
 """Commands by the groups of ``lidar --help``, in the order in which users meet them."""

@@ -1,4 +1,4 @@
-"""Commands that judge, sign and verify recorded data, and that tamper with them."""
+"""Commands that judge, sign and verify recorded data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from cyclopts import Parameter
 
 from geoscene.support.console import (
     FAILURE,
-    SEVERAL,
     Report,
     command_line,
     note_new_folder,
@@ -194,62 +193,6 @@ def defences(*, json: JsonFlag = False) -> int:
     return 0
 
 
-def tamper(
-    dataset: Path,
-    /,
-    *,
-    replace: Annotated[tuple[str, ...], SEVERAL] = (),
-    by: Path | None = None,
-    freeze: bool = False,
-    shift: Annotated[tuple[str, ...], SEVERAL] = (),
-    out: Out,
-    report: Reporting = Report(),
-) -> int:
-    """Replace recorded files by those of other frames or drives, and shift time stamps between sensors.
-
-    For attacks on what is stored; tamper.truth.csv tells what was done. Other attacks on recorded data are
-    stages: lidar apply --attack.
-
-    For example:
-
-    lidar tamper drive --replace lidar_top:1-1=0 --shift lidar_top=0.05 -o tampered
-
-    Parameters
-    ----------
-    dataset
-        Directory of the dataset.
-    replace
-        Frames and the first of those that replace them: SENSOR:FIRST-LAST=SOURCE; repeat for more.
-    by
-        Directory of the dataset that these are taken from; the same one by default.
-    freeze
-        Repeat the first of them.
-    shift
-        Sensor and the seconds by which its time stamps are later: SENSOR=SECONDS; repeat for more.
-    out
-        Directory to write to.
-    """
-    from lidar.tools.tamper import read_replacement, read_shift  # noqa: PLC0415
-    from lidar.tools.tamper import tamper as tampered  # noqa: PLC0415
-
-    note_new_folder(out)
-    done = tampered(
-        dataset,
-        out,
-        replacements=[read_replacement(text) for text in replace],
-        by=by or "",
-        freeze=freeze,
-        shifts=[read_shift(text) for text in shift],
-        overwrite=report.overwrite,
-    )
-    if report.json:
-        print_json({**asdict(done), "path": str(out)})
-    else:
-        shifts = "".join(f"; {name} is {ns / 1e9:g} s late" for name, ns in done.shifts.items())
-        print(f"{out}: {done.files} files replaced{shifts}")
-    return 0
-
-
 def sign(
     dataset: Path,
     /,
@@ -266,12 +209,10 @@ def sign(
 
     lidar sign drive --chain private.pem
 
-    lidar sign kitti/sequences/00 --watermark secret.key --chain secret.key -o signed_kitti
-
     Parameters
     ----------
     dataset
-        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+        Directory of the dataset.
     out
         Directory to write to; without it, the hash chain is added to the dataset itself.
     """
@@ -322,7 +263,7 @@ def verify(
     Parameters
     ----------
     dataset
-        Directory of the dataset or export, or of clouds of KITTI or nuScenes; without keys also a URL.
+        Directory of the dataset or export; without keys also a URL.
     noise
         Standard deviation in metres that coordinates got since the watermark, such as by another format.
     false_alarms

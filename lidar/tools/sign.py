@@ -13,13 +13,12 @@ from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
-from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format, format_of
-from lidar.dataset.formats.table import read_rows, table_cloud
-from lidar.dataset.layout import Dataset, Paths
-from lidar.dataset.provenance import derived_from, write_folder_provenance
+from lidar.dataset.formats.table import table_cloud
+from lidar.dataset.layout import Dataset, Paths, open_dataset
+from lidar.dataset.provenance import derived_from
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.signable import Signable, place_of, signable
+from lidar.dataset.signable import signed_files
 from lidar.errors import DatasetError, FormatError, InputError, LidarError
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Scanner, scanners
@@ -27,7 +26,6 @@ from lidar.sensors.rig.specs import rig_of
 from lidar.simulation.record_clouds import write_clouds
 from lidar.simulation.recording import Recording
 from lidar.tools.integrity.digest_files import FrameDigests, Link, frame_file, links_bytes
-from lidar.tools.integrity.directions import with_mark
 from lidar.tools.integrity.keys import Signer
 from lidar.tools.integrity.merkle import (
     START,
@@ -82,17 +80,15 @@ def sign_dataset(
 ) -> SignSummary:
     """Write a dataset with a watermark, a signed hash chain or both to ``out``.
 
-    ``source`` is a dataset, or a folder with clouds of KITTI or nuScenes. Without ``out`` the chain is added
-    to the data themselves; a watermark changes clouds and needs ``out``.
+    Without ``out`` the chain is added to the dataset itself; a watermark changes clouds and needs ``out``.
 
     Raises InputError and DatasetError for data that cannot be signed; nothing is written then.
     """
     source = Path(source)
-    given = signable(source)
+    dataset = open_dataset(source)
     if watermark is None and signer is None:
         raise InputError("give `watermark`, `chain` or both")
-    dataset = given.dataset
-    if dataset is not None and dataset.manifest["frames_done"] != dataset.frames:
+    if dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{source}: the drive was not finished; finish it first")
     if out is None:
         if watermark is not None:
@@ -102,9 +98,9 @@ def sign_dataset(
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
         with exclusive(source.resolve()):
             delete_leftovers(source)
-            summary, data = _chain(given, signer, summary=SignSummary(source), progress=progress)
+            summary, data = _chain(dataset, signer, summary=SignSummary(source), progress=progress)
             known = {chain.relative_to(source).as_posix(): hashlib.sha256(data).digest()}
-            add_to_checksums(source, below=given.integrity.name, known=known)
+            add_to_checksums(source, below=Paths(source).integrity.name, known=known)
             write_atomically(chain, data)  # last: it marks signed data
         return summary
     out = Path(out)
@@ -113,11 +109,9 @@ def sign_dataset(
         summary = SignSummary(part)
         if watermark is None:
             copy_dataset(source, part, leave_out={Paths(part).integrity})
-        elif dataset is None:
-            summary = _marked_clouds(source, summary, watermark=watermark, progress=progress)
         else:
             summary = _mark(dataset, summary, watermark=watermark, progress=progress)
-        summary, data = _chain(signable(part), signer, summary=summary, progress=progress)
+        summary, data = _chain(open_dataset(part), signer, summary=summary, progress=progress)
         if data:
             write_atomically(Paths(part).chain, data)
         write_checksums(part)
@@ -161,44 +155,6 @@ def _mark(
     return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
 
 
-def _marked_clouds(
-    source: Path, summary: SignSummary, *, watermark: WatermarkKey, progress: Progress
-) -> SignSummary:
-    """Copy a folder of KITTI or nuScenes with a watermark in its clouds."""
-    out, clouds = summary.path, foreign_clouds(source)
-    marks = Paths(out).integrity / "watermark.json"
-    if (Paths(source).integrity / marks.name).exists():
-        raise DatasetError(f"{source}: has a watermark already; sign the original")
-    places = [path.relative_to(source) for path, _ in clouds]
-    leave_out = {*(out / place for place in places), Paths(out).integrity}
-    copy_dataset(source, out, leave_out=leave_out)
-    squares = points = 0.0
-    for done, (path, form) in enumerate(clouds):
-        progress("watermark", done, total=len(clouds))
-        rows = read_rows(path, len(form.columns))
-        sensor, frame = cloud_place(source, path)
-        xyz = with_mark(watermark, rows[:, :3], sensor=sensor, frame=frame)
-        moved = np.linalg.norm(xyz - rows[:, :3].astype(np.float64), axis=1)
-        write_atomically(out / places[done], np.column_stack([xyz, rows[:, 3:]]).astype("<f4"))
-        squares, points = squares + float(moved @ moved), points + len(moved)
-    progress("watermark", len(clouds), total=len(clouds))
-    marks.parent.mkdir(exist_ok=True)
-    write_folder_provenance(source, out, by="sign")
-    write_json(marks, {"schema": SCHEMA, "step": watermark.step, "clouds": len(clouds)})
-    return replace(summary, marked=len(clouds), rms=float(np.sqrt(squares / max(points, 1))))
-
-
-def cloud_place(source: Path, path: Path) -> tuple[str, int]:
-    """Folder and frame of a cloud of KITTI or nuScenes, by which its watermark differs from others.
-
-    Raises DatasetError for a file that is named otherwise.
-    """
-    found = place_of(path.relative_to(source))
-    if found is None:
-        raise DatasetError(f"{path}: its name has no frame number of six digits or more, nor a time stamp")
-    return found
-
-
 def _kept(name: str) -> bool:
     """Whether files of a frame, named as by `Recording.paths`, stay as they are with a watermark."""
     return name in ("boxes", "truth") or name.startswith("labels ")
@@ -239,6 +195,11 @@ def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:
     return block_digests(table, rate_hz=rate_hz)
 
 
+def frame_rate(dataset: Dataset, sensor: str) -> float:
+    """Frames of a sensor a second, by which clouds in the world frame are cut; 0 if unknown."""
+    return float(dataset.sensors().get(sensor, {}).get("rate_hz", 0.0))
+
+
 def frame_digests(folder: Path, names: list[str], *, rate_hz: float) -> FrameDigests:
     """Digests of the files of a frame."""
     sha256 = {name: file_digest(folder / name) for name in names}
@@ -257,29 +218,31 @@ def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
 
 
 def _chain(
-    data: Signable, signer: Signer | None, *, summary: SignSummary, progress: Progress
+    dataset: Dataset, signer: Signer | None, *, summary: SignSummary, progress: Progress
 ) -> tuple[SignSummary, bytes]:
-    """Write the hash chain over the files of a directory; the bytes of the signature, empty without a key."""
+    """Write the hash chain over the files of a dataset; the bytes of the signature, empty without a key."""
     if signer is None:
         return summary, b""
     signer.sign(b"")  # a key that cannot sign is refused before anything is written
-    files, folder = data.files(), data.integrity
+    files, folder = signed_files(dataset), Paths(dataset.path).integrity
     folder.mkdir(exist_ok=True)
-    Paths(data.path).chain.unlink(missing_ok=True)
+    Paths(dataset.path).chain.unlink(missing_ok=True)
     heads: dict[str, tuple[int, bytes]] = {}
     total, done = sum(map(len, files.frames.values())), 0
     for sensor, frames in files.frames.items():
-        rate_hz, head, links = data.rate_hz(sensor), START, list[Link]()
-        for frame, time_ns in zip(sorted(frames), data.time_ns(sensor, sorted(frames)), strict=True):
+        rate_hz, head, links = frame_rate(dataset, sensor), START, list[Link]()
+        times = dataset.sample_times(sensor).tolist()
+        for frame in sorted(frames):
             progress("sign", done, total=total)
-            digests = frame_digests(data.path, frames[frame], rate_hz=rate_hz)
+            time_ns = times[frame] if frame < len(times) else -1
+            digests = frame_digests(dataset.path, frames[frame], rate_hz=rate_hz)
             write_atomically(frame_file(folder, sensor, frame=frame), digests.to_bytes())
             head = link(head, sensor=sensor, frame=frame, time_ns=time_ns, root=digests.root)
             links.append(Link(frame, time_ns, digests.root, head))
             done += 1
         write_atomically(folder / f"{sensor}.csv", links_bytes(links))
         heads[sensor] = len(links), head
-    tables = {name: file_digest(data.path / name) for name in files.others}
+    tables = {name: file_digest(dataset.path / name) for name in files.others}
     document = {
         "schema": SCHEMA,
         "algorithm": signer.algorithm,

@@ -17,8 +17,8 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
-from lidar.dataset.layout import Paths, open_dataset, reading_file
-from lidar.dataset.signable import Signable, is_truth, signable
+from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.dataset.signable import is_truth, signed_files
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.tools.integrity.blocks import SECTORS
 from lidar.tools.integrity.digest_files import FrameDigests, Link, frame_file, read_digests, read_links
@@ -27,7 +27,7 @@ from lidar.tools.integrity.marked_clouds import MarkedCloud, cloud_files
 from lidar.tools.integrity.merkle import START, link, signed_message
 from lidar.tools.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
 from lidar.tools.integrity.watermark import SPREAD, WatermarkKey
-from lidar.tools.sign import SCHEMA, blocks_in
+from lidar.tools.sign import SCHEMA, blocks_in, frame_rate
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,6 @@ class MarkedFrame:
     blocks : (k,) tampered ones: ring times 36 plus sector
     forged : number of returns that do not bear the watermark
     absent : whether the cloud has no watermark at all, such as one of another frame or key
-    rings  : whether blocks are of rings of the scanner; else of 512 steps of elevation
     """
 
     file: str
@@ -83,13 +82,12 @@ class MarkedFrame:
     forged: int
     places: tuple[Place, ...]
     absent: bool
-    rings: bool = True
 
     def to_text(self) -> list[str]:
         """One line for the cloud and one for each place."""
         if self.absent:
             return [f"{self.file}: no watermark of this key and frame"]
-        text = block_text(np.array(self.blocks), world=False, rings=self.rings)
+        text = block_text(np.array(self.blocks), world=False)
         lines = [f"{self.file}: watermark broken in {len(self.blocks)} blocks ({text})"]
         for place in self.places:
             low, high = (", ".join(f"{v:.2f}" for v in corner) for corner in (place.low, place.high))
@@ -224,15 +222,17 @@ def verify_dataset(
     """
     if watermark is None and signer is None:
         return VerifyReport(checksums=_checksum_report(path, progress=progress))
-    data = signable(Path(path))
+    dataset = open_dataset(path)
     if not 0 <= noise <= 1:
         raise InputError(f"`noise` {noise:g}: give 0 to 1 metre")
     if not 0 < false_alarms <= 100:
         raise InputError(f"`false_alarms` {false_alarms:g}: give more than 0 and at most 100 blocks a cloud")
-    chain = None if signer is None else _chain_report(data, signer, progress=progress)
+    chain = None if signer is None else _chain_report(dataset, signer, progress=progress)
     marks = None
     if watermark is not None:
-        marks = _watermark_report(data, watermark, noise=noise, false_alarms=false_alarms, progress=progress)
+        marks = _watermark_report(
+            dataset, watermark, noise=noise, false_alarms=false_alarms, progress=progress
+        )
     return VerifyReport(marks, chain)
 
 
@@ -275,29 +275,26 @@ def _check_lost(folder: Path, name: str) -> None:
         )
 
 
-def block_text(blocks: Ints, *, world: bool, rings: bool = True, most: int = 4) -> str:
+def block_text(blocks: Ints, *, world: bool, most: int = 4) -> str:
     """Rings and directions of blocks in words.
 
     world : of a cloud in the world frame, whose sectors are parts of a turn in time
-    rings : of a cloud that names rings; those of others are left out
     """
-    if not rings:
-        blocks = np.unique(blocks % SECTORS)
     ring, sector = np.divmod(blocks, SECTORS)
     step = 360 // SECTORS
     words = []
     for r, s in zip(ring.tolist(), sector.tolist(), strict=True):
         turn = f"part {s + 1} of {SECTORS}" if world else f"{s * step - 180} to {(s + 1) * step - 180} deg"
-        words.append(f"ring {r} {turn}" if rings else turn)
+        words.append(f"ring {r} {turn}")
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return "; ".join(words[:most]) + more
 
 
 def _watermark_report(
-    data: Signable, watermark: WatermarkKey, *, noise: float, false_alarms: float, progress: Progress
+    dataset: Dataset, watermark: WatermarkKey, *, noise: float, false_alarms: float, progress: Progress
 ) -> WatermarkReport:
     found = WatermarkReport(noise, watermark.error_rate(noise))
-    jobs = list(cloud_files(data))
+    jobs = list(cloud_files(dataset))
     for done, file in enumerate(jobs):
         progress("watermark", done, total=len(jobs))
         where: dict[str, Any] = {"sensor": file.sensor, "frame": file.frame}
@@ -324,7 +321,6 @@ def _watermark_report(
                     forged=forged,
                     places=verdict.places,
                     absent=verdict.absent,
-                    rings=not cloud.cells.ranges,
                 )
             )
     progress("watermark", len(jobs), total=len(jobs))
@@ -341,10 +337,10 @@ def _check_coarseness(cloud: MarkedCloud, watermark: WatermarkKey) -> None:
         )
 
 
-def _chain_report(data: Signable, signer: Signer, *, progress: Progress) -> ChainReport:
-    path = Paths(data.path).chain
+def _chain_report(dataset: Dataset, signer: Signer, *, progress: Progress) -> ChainReport:
+    path = Paths(dataset.path).chain
     if not path.is_file():
-        raise DatasetError(f"{data.path}: is not signed; lidar sign --chain signs it")
+        raise DatasetError(f"{dataset.path}: is not signed; lidar sign --chain signs it")
     with reading_file(path):
         text = path.read_text("utf-8")
         document = json.loads(text)
@@ -357,28 +353,28 @@ def _chain_report(data: Signable, signer: Signer, *, progress: Progress) -> Chai
         tables = {name: bytes.fromhex(sha256) for name, sha256 in document["files"].items()}
         signature, algorithm = bytes.fromhex(document["signature"]), str(document["algorithm"])
     if algorithm != signer.algorithm:
-        raise InputError(f"{data.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
+        raise InputError(f"{dataset.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
     findings: list[Finding] = []
     written = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
     if text != written or not signer.verifies(signed_message(heads, tables), signature):
         detail = "signed with another key, or the list of signed files was changed"
-        findings.append(Finding("signature is not valid", path.relative_to(data.path).as_posix(), detail))
-    files = data.files()
-    findings += _tables_found(data, tables, present=files.others)
+        findings.append(Finding("signature is not valid", path.relative_to(dataset.path).as_posix(), detail))
+    files = signed_files(dataset)
+    findings += _tables_found(dataset, tables, present=files.others)
     frames = 0
     for sensor, head in heads.items():
         found, count = _frames_found(
-            data, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
+            dataset, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
         )
         findings, frames = findings + found, frames + count
     return ChainReport(algorithm, frames, files.count, tuple(findings))
 
 
-def _tables_found(data: Signable, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
+def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
     """Differences of files of no frame."""
     found = [Finding("added", name) for name in present if name not in signed]
     for name, sha256 in signed.items():
-        path = _inside(data, name)
+        path = _inside(dataset, name)
         if path is None or not path.is_file():
             found.append(Finding("missing", name))
         elif file_digest(path) != sha256:
@@ -386,14 +382,14 @@ def _tables_found(data: Signable, signed: dict[str, bytes], *, present: list[str
     return found
 
 
-def _inside(data: Signable, name: str) -> Path | None:
-    """A file of the directory; None for a path that leads out of it."""
+def _inside(dataset: Dataset, name: str) -> Path | None:
+    """A file of the dataset; None for a path that leads out of it."""
     path = Path(name)
-    return None if path.is_absolute() or ".." in path.parts else data.path / path
+    return None if path.is_absolute() or ".." in path.parts else dataset.path / path
 
 
 def _frames_found(
-    data: Signable,
+    dataset: Dataset,
     sensor: str,
     *,
     head: tuple[int, bytes],
@@ -401,18 +397,18 @@ def _frames_found(
     progress: Progress,
 ) -> tuple[list[Finding], int]:
     """Differences of the frames of a sensor, and the number of frames that were compared."""
-    place = f"integrity/{sensor}.csv"
+    place, integrity = f"integrity/{sensor}.csv", Paths(dataset.path).integrity
     try:
-        links = read_links(data.integrity / f"{sensor}.csv")
+        links = read_links(integrity / f"{sensor}.csv")
     except LidarError as error:
         return [Finding("signed list cannot be read", place, str(error), sensor=sensor)], 0
     found, signed = list[Finding](), dict[int, FrameDigests]()
     if broken := _broken_link(links, sensor, head=head):
         found.append(Finding("signed list was changed", place, broken, sensor=sensor))
     for entry in links:
-        path = frame_file(data.integrity, sensor, frame=entry.frame)
+        path = frame_file(integrity, sensor, frame=entry.frame)
         where: dict[str, Any] = {"sensor": sensor, "frame": entry.frame}
-        name = path.relative_to(data.path).as_posix()
+        name = path.relative_to(dataset.path).as_posix()
         try:
             digests = signed[entry.frame] = read_digests(path)
         except LidarError as error:
@@ -420,8 +416,8 @@ def _frames_found(
             continue
         if digests.root != entry.root:
             found.append(Finding("signed digests were changed", name, **where))
-    rate_hz = data.rate_hz(sensor)
-    differing = _files_found(data, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
+    rate_hz = frame_rate(dataset, sensor)
+    differing = _files_found(dataset, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
     return [*found, *differing], len(links)
 
 
@@ -438,7 +434,7 @@ def _broken_link(links: list[Link], sensor: str, *, head: tuple[int, bytes]) -> 
 
 
 def _files_found(
-    data: Signable,
+    dataset: Dataset,
     sensor: str,
     *,
     signed: dict[int, FrameDigests],
@@ -462,7 +458,7 @@ def _files_found(
         progress(f"verify {sensor}", done, total=len(signed))
         for name, sha256 in digests.sha256.items():
             where: dict[str, Any] = {"sensor": sensor, "frame": frame}
-            path = _inside(data, name)
+            path = _inside(dataset, name)
             if path is None or not path.is_file():
                 yield Finding("missing", name, **where)
                 continue
@@ -491,5 +487,5 @@ def _change(
     if not len(blocks):
         detail = "no block of points differs: the header, or the order of points"
         return Finding("changed", name, detail, **where)
-    text = block_text(blocks, world=path.suffix in (".laz", ".las"), rings=path.suffix != ".bin")
+    text = block_text(blocks, world=path.suffix in (".laz", ".las"))
     return Finding("changed", name, text, tuple(blocks.tolist()), **where)

@@ -11,23 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.dataset.foreign import foreign_clouds
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import Table, table_cloud
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.signable import Signable
-from lidar.errors import DatasetError, FormatError, InputError
+from lidar.errors import FormatError, InputError
 from lidar.geometry.time_scales import drive_ns
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.specs import rig_of
 from lidar.simulation.record_clouds import sent_pulses
 from lidar.simulation.recording import Recording
-from lidar.tools.integrity.directions import cells_by_direction, is_marked
 from lidar.tools.integrity.watermark import WatermarkCells
 from lidar.tools.rerecord import recording_again
-from lidar.tools.sign import cells_of, cloud_place, marked_formats
+from lidar.tools.sign import cells_of, marked_formats
 
 _STEPS = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 """Metres that coordinates may be rounded to, the coarsest first."""
@@ -60,57 +57,46 @@ class MarkedCloud:
 class MarkedCloudFile:
     """A file of a cloud that may bear a watermark; `read` reads it."""
 
-    data: Signable
+    dataset: Dataset
     path: Path
     form: Format
     sensor: str
     frame: int
-    geometry: _Geometry | None = None
+    geometry: _Geometry
 
     @property
     def place(self) -> str:
         """Path in the directory."""
-        return self.path.relative_to(self.data.path).as_posix()
+        return self.path.relative_to(self.dataset.path).as_posix()
 
     def read(self) -> MarkedCloud:
         """The cloud; raises LidarError for a file that is missing or damaged."""
-        if self.data.dataset is None:
-            table = self.form.read(self.path)
-            points = _finite(_xyz(table).astype(np.float32), self.path)
-            points = points[is_marked(points)]
-            cells = cells_by_direction(points, sensor=self.sensor, frame=self.frame)
-            return MarkedCloud(self.place, self.sensor, self.frame, points, cells, coarseness(points))
-        path = self.data.dataset.frame_file(self.path)
+        path = self.dataset.frame_file(self.path)
         if self.form.frame == "sensor":
             cloud = table_cloud(cloud_points(path))
             cells = cells_of(cloud, sensor=self.sensor, frame=self.frame)
             return MarkedCloud(self.place, self.sensor, self.frame, cloud.xyz, cells, coarseness(cloud.xyz))
-        assert self.geometry is not None, "clouds in the world frame have one"  # noqa: S101
         table = self.form.read(path)
         if missing := [name for name in ("ring", "gps_time") if name not in table]:
             raise FormatError(f"{path}: lacks {', '.join(missing)}")
-        world: Float = _xyz(table).astype(np.float64)
+        world: Float = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float64)
         if not np.isfinite(world).all() or not np.isfinite(table["gps_time"]).all():
             raise FormatError(f"{path}: damaged (coordinates that are not numbers)")
         xyz, cells = self.geometry.in_sensor(world, table, name=self.sensor, frame=self.frame)
         return MarkedCloud(self.place, self.sensor, self.frame, xyz, cells, coarseness(world))
 
 
-def cloud_files(data: Signable) -> Iterator[MarkedCloudFile]:
-    """The files of clouds that may bear a watermark, in order.
+def cloud_files(dataset: Dataset) -> Iterator[MarkedCloudFile]:
+    """The files of a dataset's clouds that may bear a watermark, in order.
 
     Raises InputError for a dataset without a format that keeps one.
     """
-    if data.dataset is None:
-        for path, form in foreign_clouds(data.path):
-            yield MarkedCloudFile(data, path, form, *cloud_place(data.path, path))
-        return
-    dataset, formats = data.dataset, tuple(data.dataset.manifest["recipe"].get("formats", ()))
+    formats = tuple(dataset.manifest["recipe"].get("formats", ()))
     forms = readable_formats(tuple(name for name in formats if name in FORMATS))
     if not forms:
         known = ", ".join(form.name for form in readable_formats(tuple(FORMATS)))
         raise InputError(
-            f"{data.path}: clouds are {','.join(formats)}, which lack ring or pulse; a watermark is read"
+            f"{dataset.path}: clouds are {','.join(formats)}, which lack ring or pulse; a watermark is read"
             f" from {known}"
         )
     geometry = _Geometry(dataset)
@@ -118,7 +104,7 @@ def cloud_files(data: Signable) -> Iterator[MarkedCloudFile]:
         for frame in range(len(dataset.sample_times(name))):
             for form in forms:
                 path = form.path(dataset.paths.sensor(name), frame)
-                yield MarkedCloudFile(data, path, form, name, frame, geometry)
+                yield MarkedCloudFile(dataset, path, form, name, frame, geometry)
 
 
 def readable_formats(formats: tuple[str, ...]) -> list[Format]:
@@ -184,14 +170,3 @@ def _find_pulse(ring: NDArray[np.int64], time_ns: NDArray[np.int64], *, sent: Fi
     after = np.clip(np.searchsorted(key, wanted), 1, len(key) - 1)
     nearer = wanted - key[after - 1] <= key[after] - wanted
     return order[np.where(nearer, after - 1, after)]
-
-
-def _xyz(table: Table) -> NDArray[np.floating]:
-    return np.column_stack([table[axis] for axis in "xyz"])
-
-
-def _finite(xyz: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """Coordinates as they are; raises DatasetError for those that are no numbers."""
-    if not np.isfinite(xyz).all():
-        raise DatasetError(f"{path}: damaged (coordinates that are not numbers)")
-    return xyz

@@ -40,7 +40,6 @@ class WatermarkCells:
 
     sensor, frame : name and number
     ring, column, echo : (n,) as of `lidar.sensors.laser.cloud.Cloud`
-    ranges : whether ranges are marked instead of coordinates, see `lidar.tools.integrity.directions`
     """
 
     sensor: str
@@ -48,7 +47,6 @@ class WatermarkCells:
     ring: NDArray[np.integer]
     column: NDArray[np.integer]
     echo: NDArray[np.integer]
-    ranges: bool = False
 
     def where(self, keep: NDArray[np.bool_]) -> WatermarkCells:
         """The returns of a mask (n,)."""
@@ -63,8 +61,8 @@ class WatermarkCells:
 class Decoded:
     """What a watermark says of the returns of a frame.
 
-    wrong : (n, 3) bool, bits of x, y, z that are not those of the key; (n, 1) of ranges
-    off   : (n, 3) or (n, 1) metres from the nearest lattice point, of either bit
+    wrong : (n, 3) bool, bits of x, y, z that are not those of the key
+    off   : (n, 3) metres from the nearest lattice point, of either bit
     """
 
     wrong: NDArray[np.bool_]
@@ -87,18 +85,17 @@ class WatermarkKey:
             raise InputError(f"`step` {self.step:g}: give 0.0001 to 1 metre")
 
     def embedded(self, xyz: NDArray[np.floating], cells: WatermarkCells) -> Float:
-        """Coordinates (n, 3), or ranges (n, 1), with the watermark, each at most half its step off."""
+        """Coordinates (n, 3) with the watermark, each at most half its step off."""
         dither, half, bits = self._expected(cells)
         index = bits + 2 * np.rint(((xyz - dither) / half - bits) / 2)
         marked: Float = dither + half * index
         return marked
 
     def decoded(self, xyz: NDArray[np.floating], cells: WatermarkCells) -> Decoded:
-        """Bits and lattice distances of coordinates (n, 3) in the sensor frame, or of their ranges."""
+        """Bits and lattice distances of coordinates (n, 3) in the sensor frame."""
         dither, half, bits = self._expected(cells)
-        given = np.linalg.norm(xyz.astype(np.float64), axis=1)[:, None] if cells.ranges else xyz
-        index = np.rint((given - dither) / half)
-        return Decoded(index % 2 != bits, given - dither - half * index)
+        index = np.rint((xyz - dither) / half)
+        return Decoded(index % 2 != bits, xyz - dither - half * index)
 
     def error_rate(self, sigma: float, *, within: float = np.inf) -> float:
         """Share of bits that Gaussian noise with a standard deviation in metres makes wrong.
@@ -111,7 +108,7 @@ class WatermarkKey:
         )
 
     def _expected(self, cells: WatermarkCells) -> tuple[Float, Float, NDArray[np.uint8]]:
-        """Dither, half the step (n, 3) in metres and bits (n, 3) of returns; (n, 1) of ranges."""
+        """Dither, half the step (n, 3) in metres and bits (n, 3) of returns."""
         order = cells.order()
         values = self._cells(cells)[order]
         ring = cells.ring[order]
@@ -120,12 +117,8 @@ class WatermarkKey:
             bits = bits ^ values["of_later"][earlier(ring, back + 1), back]
         row = np.argsort(order)
         half = self.step / 2 * (1 + SPREAD * (values["stretch"][row] / 32767.5 - 1))
-        count = 1 if cells.ranges else 3
-        return (
-            (values["dither"][row] / 32768 * half)[:, :count],
-            half[:, :count],
-            ((bits[row, None] >> np.arange(count)) & 1).astype(np.uint8),
-        )
+        dither: Float = values["dither"][row] / 32768 * half
+        return dither, half, ((bits[row, None] >> np.arange(3)) & 1).astype(np.uint8)
 
     def _cells(self, cells: WatermarkCells) -> NDArray[np.void]:
         """The pseudo-random function (n,) of each return."""
