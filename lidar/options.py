@@ -60,7 +60,7 @@ RASTERS = ("dsm", "dtm", "density", "intensity")
 """Rasters of a map."""
 
 ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
-"""Origins of returns, `lidar.sensors.physics.echoes.Origin` in lower case."""
+"""Origins of returns, `lidar.sensors.physics.origin.Origin` in lower case."""
 
 SHOWN = ("all", "sweep", "cameras", "map")
 """What a film can show."""
@@ -760,11 +760,8 @@ class MapOptions:
     interference, injected, replayed, moved, receiver; all by default, but for noise."""
 
     poses: str = "truth"
-    """Poses that place the points: truth; by the fixes of a GNSS receiver of the dataset, RECEIVER; with the
-    turns of an inertial unit too, RECEIVER+UNIT; or of a trajectory file, FILE.tum."""
-
-    refine: bool = False
-    """Refine measured poses by aligning the sweeps to each other (extra registration)."""
+    """Poses that place the points: truth, or FILE.tum: a trajectory of the vehicle, such as lidar odometry
+    writes."""
 
     outliers: Annotated[
         tuple[int, float] | None,
@@ -814,8 +811,11 @@ class MapOptions:
         for name, words in (("origin", ORIGINS), ("raster", RASTERS)):
             if unknown := [word for word in getattr(self, name) if word not in words]:
                 raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(words)}")
-        if self.refine and self.poses == "truth":
-            raise InputError("`refine` is for measured poses; name a receiver or a file with `poses`")
+        if self.poses != "truth" and not self.poses.lower().endswith(".tum"):
+            raise InputError(
+                f"`poses` {self.poses}: give truth or FILE.tum; lidar odometry --method fused writes"
+                " trajectory.tum by receivers, inertial units and scanners"
+            )
         if self.time is not None and not self.time[0] < self.time[1]:
             raise InputError(f"`time` {self.time[0]:g},{self.time[1]:g}: ends before it begins")
         if self.bounds_deg is not None:

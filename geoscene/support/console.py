@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter, Token
@@ -135,11 +136,18 @@ def whole(_: object, tokens: Sequence[Token]) -> int:
         raise ValueError("give a whole number") from None
 
 
-def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exception], ...]) -> None:
+def main(
+    app: App,
+    roots: tuple[type[Exception], ...],
+    *,
+    usage: tuple[type[Exception], ...],
+    removed: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Run a program and exit with its code.
 
-    roots : exceptions printed as one line, exit code 1
-    usage : those of them caused by input or options, exit code 2
+    roots   : exceptions printed as one line, exit code 1
+    usage   : those of them caused by input or options, exit code 2
+    removed : what to write instead of former options, by flag
     """
     logging.basicConfig(
         level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
@@ -157,7 +165,8 @@ def main(app: App, roots: tuple[type[Exception], ...], *, usage: tuple[type[Exce
             code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
             sys.stdout.flush()
     except CycloptsError as error:
-        message = str(error).rstrip(".")
+        flag = next((word for word in sys.argv[1:] if word in removed), "")
+        message = f"{flag} is removed: {removed[flag]}" if flag else str(error).rstrip(".")
         _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
         sys.exit(USAGE)
     except roots as error:

@@ -32,6 +32,10 @@ for _order, (_title, _commands) in enumerate(_COMMANDS.items(), 1):
         app.command(_command, group=_group)
 
 
+_REMOVED = {"--refine": "use lidar odometry DATASET --method fused -o EST, and --poses EST/trajectory.tum"}
+"""What to write instead of former options, by flag."""
+
+
 def main() -> None:
     """Run the program."""
-    run(app, (LidarError, GeosceneError), usage=(InputError, SceneInputError))
+    run(app, (LidarError, GeosceneError), usage=(InputError, SceneInputError), removed=_REMOVED)

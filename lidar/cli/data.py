@@ -46,7 +46,7 @@ def map_(
 
     lidar map drive -o map.laz --raster dsm,dtm --resolution 0.5 --compare scene
 
-    lidar map drive -o map.laz --poses gnss+imu --refine
+    lidar map drive -o map.laz --poses estimate/trajectory.tum
 
     lidar map drive -o tiles --tiles 100 --voxel 0.1 --outliers 16,2
 

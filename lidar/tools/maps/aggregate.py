@@ -26,7 +26,7 @@ from lidar.tools.maps.colors import distinct, ramp
 from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances
 from lidar.tools.maps.image_colors import ImageColors
 from lidar.tools.maps.outliers import Outliers
-from lidar.tools.maps.poses import PoseErrors, measured_trajectory, pose_errors, write_poses
+from lidar.tools.maps.poses import PoseErrors, pose_errors, read_poses, write_poses
 from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.selection import Selection
 from lidar.tools.maps.source import COLUMNS, MapClouds
@@ -50,7 +50,7 @@ class MapSummary:
     path      : the file, or the folder of tiles
     beside    : further files: rasters, and those of comparisons
     distances : to the surfaces of the scene that the map was compared with
-    poses     : errors of measured poses; None for true ones
+    poses     : errors of the poses of a file; None for true ones
     """
 
     points_in: int
@@ -111,7 +111,7 @@ def aggregate(
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     names = _scanners(dataset, options)
-    trajectory = measured_trajectory(dataset, options.poses, refine=options.refine, progress=progress)
+    trajectory = None if options.poses == "truth" else read_poses(Path(options.poses), dataset)
     selection = Selection(dataset, options, trajectory=trajectory)
     colors = ImageColors(dataset) if options.color == "image" else None
     source = MapClouds(dataset, names, selection=selection, trajectory=trajectory, colors=colors)

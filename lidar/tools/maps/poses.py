@@ -1,39 +1,27 @@
-"""The trajectory that places a map's points: the true one, or as measured, refined by registration."""
+"""The trajectory that places a map's points: the true one, or one from a TUM file, and its errors."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from geoscene.support.progress import Progress
 from geoscene.typing import Ints
-from lidar.dataset.formats import format_of
 from lidar.dataset.layout import Dataset
-from lidar.dataset.recorded import Stream, labelled_clouds
-from lidar.errors import DatasetError, InputError
+from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
-from lidar.geometry.trajectory_tum import write_tum
-from lidar.tools.maps.aligned_motion import aligned_motion
-from lidar.tools.maps.measured_poses import (
-    fixes_along,
-    fixes_of,
-    measured_motion,
-    motion_along,
-    poses_by_fixes,
-    trajectory_in,
-    trajectory_of,
-)
-from lidar.tools.maps.pose_graph import fit_poses
+from lidar.geometry.trajectory_tum import read_tum, write_tum
 
-_STEP_NS = 100_000_000  # between poses by an inertial unit, and those that are compared with the truth
+_STEP_NS = 100_000_000  # between poses that are compared with the truth
+_FARTHEST = 1e6  # metres from the scene's origin
 
 
 @dataclass(frozen=True, slots=True)
 class PoseErrors:
-    """Root mean squares of the errors of measured poses.
+    """Root mean squares of the errors of poses.
 
     horizontal_m, vertical_m : true metres
     yaw_deg                  : degrees
@@ -44,42 +32,32 @@ class PoseErrors:
     yaw_deg: float
 
 
-def measured_trajectory(
-    dataset: Dataset, poses: str, *, refine: bool, progress: Progress
-) -> Trajectory | None:
-    """The vehicle's trajectory as measured; None for the true one.
+def read_poses(path: Path, dataset: Dataset) -> Trajectory:
+    """The vehicle's trajectory in the scene, from a TUM file of true metres from the scene's origin.
 
-    poses  : truth, RECEIVER, RECEIVER+UNIT (a receiver and an inertial unit) or FILE.tum
-    refine : by aligning the clouds of the scanner with the most points
-
-    Raises InputError for names that the dataset lacks and files that are no trajectories, DatasetError for
-    data that cannot be used, and MissingExtraError where `refine` needs a package that is not installed.
+    Raises as `lidar.geometry.trajectory_tum.read_tum`, and InputError for poses that are not of the drive.
     """
-    if poses == "truth":
-        return None
-    clouds = _best_clouds(dataset) if refine else None
-    if poses.lower().endswith(".tum"):
-        given = trajectory_in(dataset, Path(poses))
-        if clouds is None:
-            return given
-        fixes, motion = fixes_along(given), motion_along(given, _times(clouds))
-    else:
-        receiver, unit = _names(dataset, poses)
-        fixes = fixes_of(dataset, receiver)
-        if clouds is None and not unit:
-            placed = poses_by_fixes(fixes, fixes.time_ns)
-            return trajectory_of(placed, fixes.time_ns, frame=dataset.frame, scale=fixes.scale)
-        time_ns = _times(clouds) if clouds else _even_times(dataset.sample_times(unit))
-        motion = measured_motion(dataset, fixes, unit=unit, time_ns=time_ns)
-    if clouds:
-        motion = aligned_motion(clouds, motion, progress=progress)
-    return trajectory_of(fit_poses(motion, fixes), motion.time_ns, frame=dataset.frame, scale=fixes.scale)
+    absolute_ns, position, quat = read_tum(path)
+    begin, last = posix_ns(dataset.start), dataset.trajectory().duration_ns
+    time_ns = absolute_ns - begin
+    if time_ns[0] > last or time_ns[-1] < 0:
+        raise InputError(
+            f"`poses` {path}: its times are {absolute_ns[0] / 1e9:.3f} to {absolute_ns[-1] / 1e9:.3f}, the"
+            f" drive's {begin / 1e9:.3f} to {(begin + last) / 1e9:.3f} (POSIX seconds)"
+        )
+    scale = float(dataset.frame.scale_at(*position[0, :2]))
+    scale = float(dataset.frame.scale_at(*(scale * position[0, :2])))
+    if not math.isfinite(scale) or np.abs(position).max() > _FARTHEST:
+        raise InputError(f"`poses` {path}: positions beyond {_FARTHEST / 1000:g} km from the scene's origin")
+    velocity = np.gradient(position, time_ns * 1e-9, axis=0)
+    placed = np.ascontiguousarray(position * [scale, scale, 1.0])
+    return Trajectory(time_ns, placed, quat, velocity, np.asarray(dataset.frame.scale_at(*placed[:, :2].T)))
 
 
 def pose_errors(found: Trajectory, true: Trajectory) -> PoseErrors:
     """Errors of a trajectory, every 0.1 s of the time that it shares with the true one."""
     first, last = max(found.time_ns[0], true.time_ns[0]), min(found.time_ns[-1], true.time_ns[-1])
-    time_ns = _even_times(np.array([first, last]))
+    time_ns = _even_times(first, last)
     here, there = found.at(time_ns), true.at(time_ns)
     off = (here.position - there.position) / there.scale
     ahead = np.einsum("nji,nj->ni", there.rotation, here.rotation[:, :, 0])
@@ -94,33 +72,6 @@ def write_poses(path: Path, trajectory: Trajectory, *, dataset: Dataset) -> None
     write_tum(path, time_ns, position=position, quat_xyzw=trajectory.quat_xyzw)
 
 
-def _names(dataset: Dataset, poses: str) -> tuple[str, str]:
-    """The receiver and the inertial unit, or an empty name, of RECEIVER or RECEIVER+UNIT."""
-    receiver, _, unit = poses.partition("+")
-    receivers, units = dataset.sensors("gnss"), dataset.sensors("imu")
-    if receiver not in receivers or (unit and unit not in units) or poses.endswith("+"):
-        known = [*receivers, *(f"{one}+{other}" for one in receivers for other in units), "FILE.tum"]
-        raise InputError(f"`poses` {poses}: unknown; of {dataset.path} there are truth, {', '.join(known)}")
-    return receiver, unit
-
-
-def _best_clouds(dataset: Dataset) -> Stream:
-    """The clouds with times of the scanner whose first frame has the most points."""
-    streams = [labelled_clouds(dataset, name) for name in dataset.sensors("lidar")]
-    found = [one for one in streams if one is not None and len(one.frames) > 1]
-    if not found:
-        raise DatasetError(
-            f"{dataset.path}: no clouds in the sensor frame with times in it, which `refine` aligns;"
-            " drive with `formats` pcd"
-        )
-    return max(found, key=lambda one: format_of(one.files[0]).count(one.files[0]))
-
-
-def _times(clouds: Stream) -> Ints:
-    """Starts of the frames and the end of the last one, nanoseconds since the drive's start."""
-    return np.append(clouds.time_ns, clouds.time_ns[-1] + round(1e9 / float(clouds.sensor["rate_hz"])))
-
-
-def _even_times(time_ns: Ints) -> Ints:
-    """Times every `_STEP_NS` from the first of some to the last, and the last."""
-    return np.unique(np.append(np.arange(time_ns[0], time_ns[-1], _STEP_NS), time_ns[-1]))
+def _even_times(first: int, last: int) -> Ints:
+    """Times every `_STEP_NS` from the first to the last, and the last."""
+    return np.unique(np.append(np.arange(first, last, _STEP_NS), last))

@@ -131,7 +131,7 @@ def first_motion(scans: SweepSequence) -> Float:
         motion, matched = np.eye(4), 0.0
         motion[0, 3] = speed * seconds
         for _ in range(_ROUNDS):
-            local = LocalMap("odometry", source_voxel=_FIRST_VOXEL, target_voxel=_FIRST_VOXEL)
+            local = LocalMap(source_voxel=_FIRST_VOXEL, target_voxel=_FIRST_VOXEL)
             first, second = (local.thinned(_still_sweep(scans, row, motion=motion)) for row in (0, 1))
             local.add(first, np.eye(4))
             found = local.aligned(second, motion, sigma=sigma)
@@ -249,7 +249,7 @@ def _small_gicp(scans: SweepSequence, settings: OdometrySettings, *, first: Floa
     """Point to plane to a map of planes, with the motion before as a prior (`local_map`)."""
     del first  # each sweep has its expected motion
     side = settings.voxel or 0.25
-    local = LocalMap("odometry", source_voxel=2 * side, target_voxel=side)
+    local = LocalMap(source_voxel=2 * side, target_voxel=side)
     sigma = _usual(scans, settings)
 
     def register(points: Float, last: Float, *, step: Float) -> tuple[Float, Float | None]:

@@ -40,15 +40,14 @@ class LocalMap:
     Normals are those of the map, at points whose neighbours are in a plane: elsewhere a ring of one sweep
     would be drawn to the same ring of another, which hides pitch.
 
-    extra         : that brings small_gicp, for the error without it
     source_voxel  : metres, to which a sweep is thinned
     target_voxel  : metres, to which the map is thinned
 
     Raises MissingExtraError without small_gicp.
     """
 
-    def __init__(self, extra: str, *, source_voxel: float = 1.0, target_voxel: float = 0.5) -> None:
-        self._gicp = need("small_gicp", extra)
+    def __init__(self, *, source_voxel: float, target_voxel: float) -> None:
+        self._gicp = need("small_gicp", "odometry")
         self._source_voxel, self._target_voxel = source_voxel, target_voxel
         self._keys: deque[Float] = deque(maxlen=_KEYS)
         self._last = np.eye(4)
