@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from geoscene.support.lazy import lazily
+from geoscene.support.notebooks import register_previews
 
 if TYPE_CHECKING:
     from geoscene.export import export_scene as export_scene
@@ -36,3 +37,5 @@ __all__ = list(_HOMES)
 
 
 __getattr__ = lazily(__name__, _HOMES)
+
+register_previews({"geoscene.scene.layout.Scene": "geoscene.scene.preview"})

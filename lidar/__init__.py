@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from geoscene import __version__ as __version__
 from geoscene.support.lazy import lazily
+from geoscene.support.notebooks import register_previews
 
 if TYPE_CHECKING:
     from lidar.dataset.formats import read_cloud as read_cloud
@@ -53,3 +54,10 @@ __all__ = list(_HOMES)
 
 
 __getattr__ = lazily(__name__, _HOMES)
+
+register_previews(
+    {
+        "lidar.dataset.layout.Dataset": "lidar.dataset.preview",
+        "lidar.sensors.laser.cloud.Cloud": "lidar.sensors.laser.preview",
+    }
+)

@@ -22,6 +22,7 @@ from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.support.files import digest, digest_of, write_atomically
+from geoscene.support.notebooks import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
@@ -36,6 +37,9 @@ _PARTS = {
 SCHEMA = 3
 """Version of the scene directory; a reader refuses others."""
 
+
+OVERHANG = 50.0
+"""Metres by which a building may extend beyond its tile."""
 
 _TILES = "tiles"
 """Name of the folder of tiles."""
@@ -116,7 +120,7 @@ _NAMES = frozenset(
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Previewed):
     """A scene directory, opened. Its files are read on request; no other module needs their names.
 
     path     : the directory, or the cache of one in object storage
@@ -284,18 +288,6 @@ class Scene:
         """All tiles, one at a time."""
         for i, j in self.tile_indices:
             yield self.tile(i, j, forests=forests)
-
-    def _repr_png_(self) -> bytes:
-        """A picture from above, for notebooks."""
-        from geoscene.scene.preview import scene_png  # noqa: PLC0415  (Pillow)
-
-        return scene_png(self)
-
-    def _repr_html_(self) -> str:
-        """The picture and a table of figures, for notebooks."""
-        from geoscene.scene.preview import scene_html  # noqa: PLC0415
-
-        return scene_html(self)
 
     def shapes(self) -> dict[str, Mesh]:
         """The meshes that the tiles' instances copy, by name."""

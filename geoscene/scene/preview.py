@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 from geoscene.drawing.previews import PAPER, Color, PreviewPlan, card
-
-if TYPE_CHECKING:
-    from geoscene.scene.layout import Scene
+from geoscene.scene.layout import Scene
 
 _LAYERS: dict[str, tuple[Color, Color | None]] = {
     "landcover": ((226, 230, 216), None),
@@ -25,7 +22,7 @@ _BLOCK, _MOST = 20_000, 200_000
 """Features that are read at once, and that a picture shows of a layer."""
 
 
-def scene_png(scene: Scene) -> bytes:
+def png(scene: Scene) -> bytes:
     """A PNG picture of a scene from above; of layers with very many features the first ones only."""
     plan = PreviewPlan(scene.bounds, PAPER)
     for name, (fill, edge) in _LAYERS.items():
@@ -41,10 +38,10 @@ def scene_png(scene: Scene) -> bytes:
     return plan.png()
 
 
-def scene_html(scene: Scene) -> str:
+def html(scene: Scene) -> str:
     """The picture and a table of figures."""
     title = scene.manifest.get("name") or scene.path.name
-    return card(f"Scene {title}", _figures(scene), picture=scene_png(scene))
+    return card(f"Scene {title}", _figures(scene), picture=png(scene))
 
 
 def _figures(scene: Scene) -> Iterator[tuple[str, str]]:

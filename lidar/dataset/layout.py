@@ -35,6 +35,7 @@ from pyproj import CRS
 from geoscene.errors import reading
 from geoscene.geometry.frames import Frame
 from geoscene.support.files import delete_leftovers, digest, write_json
+from geoscene.support.notebooks import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS
@@ -150,7 +151,7 @@ class Paths:
 
 
 @dataclass(frozen=True)
-class Dataset:
+class Dataset(Previewed):
     """An opened dataset directory.
 
     path     : the directory, or the cache of one in object storage
@@ -212,18 +213,6 @@ class Dataset:
             if not len(times) and self.manifest.get("sensor_frames", {}).get(name):
                 raise DatasetError(f"{path}: damaged (no times of its frames); drive again with `overwrite`")
         return times
-
-    def _repr_png_(self) -> bytes:
-        """A picture from above, for notebooks."""
-        from lidar.dataset.preview import dataset_png  # noqa: PLC0415
-
-        return dataset_png(self)
-
-    def _repr_html_(self) -> str:
-        """The picture and a table of figures, for notebooks."""
-        from lidar.dataset.preview import dataset_html  # noqa: PLC0415
-
-        return dataset_html(self)
 
     def trajectory(self) -> Trajectory:
         """The ego vehicle's poses."""

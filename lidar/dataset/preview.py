@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,11 +11,9 @@ from geoscene.classes import class_codes
 from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.typing import Float
 from lidar.dataset.formats.table import placed_returns
+from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds
 from lidar.geometry.poses import Trajectory
-
-if TYPE_CHECKING:
-    from lidar.dataset.layout import Dataset
 
 _CLOUDS = 8
 """Clouds of the first scanner that a picture is made of, spread over the drive."""
@@ -26,7 +23,7 @@ _MARGIN = 40.0
 _WAY = (255, 90, 60)
 
 
-def dataset_png(dataset: Dataset) -> bytes:
+def png(dataset: Dataset) -> bytes:
     """A PNG picture of a drive from above, points coloured by class."""
     trajectory = dataset.trajectory()
     way = trajectory.position[:: max(len(trajectory) // _POSES, 1), :2]
@@ -52,9 +49,9 @@ def _sample(clouds: Stream, trajectory: Trajectory) -> tuple[Float, np.ndarray]:
     return np.concatenate(places), class_codes().color[np.concatenate(labels)]
 
 
-def dataset_html(dataset: Dataset) -> str:
+def html(dataset: Dataset) -> str:
     """The picture and a table of figures."""
-    return card(f"Drive {dataset.path.name}", _figures(dataset), picture=dataset_png(dataset))
+    return card(f"Drive {dataset.path.name}", _figures(dataset), picture=png(dataset))
 
 
 def _figures(dataset: Dataset) -> Iterator[tuple[str, str]]:

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
+from geoscene.support.notebooks import Previewed
 from lidar.errors import LidarError
 
 
 @dataclass(frozen=True, slots=True)
-class Cloud(Columns):
+class Cloud(Previewed, Columns):
     """The returns of one frame, in the order of their pulses.
 
     start_ns : time of the frame's first firing, nanoseconds since the drive's start
@@ -45,18 +46,6 @@ class Cloud(Columns):
     echo: NDArray[np.uint8]
     echoes: NDArray[np.uint8]
 
-    def _repr_png_(self) -> bytes:
-        """A picture from above in the sensor frame, x to the right, coloured by class, for notebooks."""
-        from lidar.sensors.laser.preview import cloud_png  # noqa: PLC0415
-
-        return cloud_png(self)
-
-    def _repr_html_(self) -> str:
-        """The picture and the number of returns by class, for notebooks."""
-        from lidar.sensors.laser.preview import cloud_html  # noqa: PLC0415
-
-        return cloud_html(self)
-
     def __post_init__(self) -> None:
         """Check that all columns have the same length."""
         for name, column in self.columns().items():
@@ -70,7 +59,7 @@ class TracedCloud(Cloud):
 
     The original cloud is what the scanner reports without stages.
 
-    origin : (n,) uint8, `lidar.sensors.physics.echoes.Origin`
+    origin : (n,) uint8, `lidar.sensors.physics.origin.Origin`
     source : (n,) int32, row of the original return that this one is, or was moved from; -1 for an added one
     hidden : (n,) int32, row of the original return that this one hides or replaces; -1 for none
     """

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from geoscene.classes import Class, class_codes
 from geoscene.drawing.previews import DARK, PreviewPlan, around, card
-
-if TYPE_CHECKING:
-    from lidar.sensors.laser.cloud import Cloud
+from lidar.sensors.laser.cloud import Cloud
 
 _NEAR = np.array([[-5.0, -5.0], [5.0, 5.0]])
 """Metres around the scanner that a picture shows at least."""
@@ -18,7 +14,7 @@ _NEAR = np.array([[-5.0, -5.0], [5.0, 5.0]])
 _SCANNER = (255, 90, 60)
 
 
-def cloud_png(cloud: Cloud) -> bytes:
+def png(cloud: Cloud) -> bytes:
     """A PNG picture of a cloud in the sensor frame, x to the right, with a mark where the scanner is."""
     xyz = cloud.xyz.astype(np.float64)
     plan = PreviewPlan(around(np.vstack([xyz[:, :2], _NEAR])), DARK)
@@ -27,9 +23,9 @@ def cloud_png(cloud: Cloud) -> bytes:
     return plan.png()
 
 
-def cloud_html(cloud: Cloud) -> str:
+def html(cloud: Cloud) -> str:
     """The picture and a table."""
     codes, counts = np.unique(cloud.klass, return_counts=True)
     ranked = np.argsort(-counts, kind="stable").tolist()
     rows = [(Class(int(codes[k])).name.lower().replace("_", " "), f"{counts[k]:,}") for k in ranked]
-    return card(f"{len(cloud):,} returns", rows, picture=cloud_png(cloud))
+    return card(f"{len(cloud):,} returns", rows, picture=png(cloud))
