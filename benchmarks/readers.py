@@ -21,6 +21,7 @@ from lidar.dataset.formats import FORMATS, MAPS, format_of, read_table
 from lidar.dataset.formats.table import rows
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset, read_rows, read_sensors
+from lidar.dataset.png import read_png
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.truth_files import read_truth
 from lidar.errors import FormatError
@@ -28,7 +29,6 @@ from lidar.geometry.trajectory_tum import read_tum
 from lidar.motion.replay import read_replay
 from lidar.motion.vehicle import load_vehicle
 from lidar.motion.waypoints import read_track
-from lidar.sensors.camera.png import read_png
 from lidar.sensors.rig.devices import cameras, scanners
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import load_rig, rig_digest

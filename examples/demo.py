@@ -21,9 +21,9 @@ from geoscene.support.console import progress_bar
 from geoscene.view import view_scene
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.png import counts_to_depth, read_png, write_png
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions, MapOptions
-from lidar.sensors.camera.png import counts_to_depth, read_png, write_png
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive
 from lidar.tools.maps.aggregate import aggregate
@@ -31,10 +31,10 @@ from lidar.tools.maps.picture import (
     class_colors,
     cloud_picture,
     depth_picture,
-    scene_picture,
     sweep_picture,
     with_legend,
 )
+from lidar.tools.plots.scene_picture import scene_picture
 from lidar.traffic.populate import TrafficOptions
 from lidar.world.world import World
 

@@ -16,7 +16,7 @@ from helpers import ROOT
 from helpers.programs import ENVIRONMENT
 
 import geoscene
-from lidar.sensors.camera.png import read_png
+from lidar.dataset.png import read_png
 
 FOLDER = ROOT / "examples" / "python"
 

@@ -13,9 +13,10 @@ from bench.scenes import RIGS, Setup
 from geoscene.typing import Ints
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
-from lidar.sensors.camera.render import exposure_times, render
+from lidar.sensors.camera.render import render
 from lidar.sensors.camera.sun import sun_direction
 from lidar.sensors.laser.scan import scan
+from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import firings

@@ -13,7 +13,7 @@ import geoscene
 import lidar
 from geoscene.classes import class_codes
 from lidar.dataset.formats import read_table
-from lidar.sensors.camera.png import counts_to_depth, read_png, write_png
+from lidar.dataset.png import counts_to_depth, read_png, write_png
 from lidar.tools.maps.picture import PictureView, cloud_picture, depth_picture, with_key
 
 RIG = """

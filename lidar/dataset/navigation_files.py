@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 from geoscene.support.csv_tables import BLOCK_ROWS
 from geoscene.typing import Float
 from lidar.dataset.layout import Paths, opened_rows, read_rows, reading_file
-from lidar.sensors.navigation.gnss import (
-    NAMES,
-    STATES,
-    Fixes,
-)
-from lidar.sensors.navigation.imu import Inertial
+from lidar.sensors.navigation.measurements import NAMES, STATES, Fixes, Inertial
 from lidar.sensors.navigation.nmea import satellites_used
 
 

@@ -15,11 +15,10 @@ from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats.table import Table, placed_returns
 from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.png import counts_to_depth, read_png
 from lidar.dataset.recorded import Stream, color_images
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.camera.png import counts_to_depth, read_png
-from lidar.sensors.camera.render import exposure_times
-from lidar.sensors.rig.camera_model import project
+from lidar.sensors.rig.camera_model import exposure_times, project
 from lidar.sensors.rig.specs import CameraSpec, rig_of
 
 _ROLLS = 5

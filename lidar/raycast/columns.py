@@ -42,7 +42,7 @@ class RayTarget(NamedTuple):
     first      : (k,) int64, first row of ``transforms``
     steps      : (k,) int64, rows of ``transforms``; 1 for a static instance
     transforms : (r, 12) float64, from instance to caster, each relative to its own origin
-    groups     : (g, 4) int64, trees (see `lidar.raycast.tree`) of the own parts and of groups of instances:
+    groups     : (g, 4) int64, trees (`lidar.geometry.box_tree`) of the own parts and of groups of instances:
                  addresses of nodes and order, number of items, number of the first instance (-1: parts)
     """
 

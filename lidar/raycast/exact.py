@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar.geometry.box_tree import DEPTH, FIRST, LEAF, NODE, RIGHT
 from lidar.raycast.columns import RayTarget
 from lidar.raycast.lanes import GRAZING, START
 from lidar.raycast.memory import (
@@ -19,7 +20,6 @@ from lidar.raycast.memory import (
 )
 from lidar.raycast.planes import PLANE, beside, transform_of
 from lidar.raycast.rows import CORNERS, COUNT, MASK, NODES, ORDER, PART, PLANES, VERTICES
-from lidar.raycast.tree import DEPTH, FIRST, LEAF, NODE, RIGHT
 
 STACK = 2 * DEPTH
 """Numbers of the array ``stack`` that `first_hit` needs."""

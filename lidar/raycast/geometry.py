@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.geometry.box_tree import Tree, tree_of
 from lidar.raycast.hull import LONG, NARROW, displacements, margins_of, patches
-from lidar.raycast.tree import Tree, tree_of
 
 if TYPE_CHECKING:
     from lidar.raycast.caster import Caster

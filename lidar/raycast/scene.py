@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import BackendError
+from lidar.geometry.box_tree import Tree, tree_of
 from lidar.raycast import kernels
 from lidar.raycast.columns import Packed, RayColumns, RayTarget, pack_target
 from lidar.raycast.geometry import ALL, Geometry, MeshInstances
 from lidar.raycast.hits import Hits
 from lidar.raycast.rays import share
 from lidar.raycast.rows import PART
-from lidar.raycast.tree import Tree, tree_of
 
 
 class Group(NamedTuple):

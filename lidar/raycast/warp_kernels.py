@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from lidar.raycast import lanes, planes, tree
+from lidar.geometry.box_tree import DEPTH as TREE_DEPTH
+from lidar.geometry.box_tree import LEAF as TREE_LEAF
+from lidar.raycast import lanes, planes
 from lidar.raycast.exact import STACK
 from lidar.raycast.rows import CORNERS, COUNT, MASK, NODES, NUMBERS, ORDER, PLANES, START_NUMBER, VERTICES
 
@@ -25,13 +27,13 @@ ONE = wp.constant(wp.float64(1.0))
 FLAT = wp.constant(wp.float64(1e-100))
 STEEP = wp.constant(wp.float64(1e100))
 REACHED = wp.constant(wp.float64(1.0 + 1e-15))
-LEAF = wp.constant(tree.LEAF)
-DEPTH = wp.constant(tree.DEPTH)
+LEAF = wp.constant(TREE_LEAF)
+DEPTH = wp.constant(TREE_DEPTH)
 
 
 @wp.struct
 class WarpNode:
-    """A row of `lidar.raycast.tree.Tree.nodes`."""
+    """A row of `lidar.geometry.box_tree.Tree.nodes`."""
 
     low: wp.vec3f
     high: wp.vec3f

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar.errors import LidarError
-from lidar.sensors.navigation.gnss import Fixes, gnss_columns
-from lidar.sensors.navigation.imu import Inertial, imu_columns
+from lidar.sensors.navigation.gnss import gnss_columns
+from lidar.sensors.navigation.imu import imu_columns
+from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation
 from lidar.signal.stage import FixesStage, SamplesStage

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.run import Altered, cloud_truth, trace_unaltered
 
 _OF_RETURNS = ("origin", "source", "hidden")

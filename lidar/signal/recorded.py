@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, number_echoes, select_reported, trace
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, number_echoes, select_reported, trace
 from lidar.sensors.physics.intensity import apparent_of_code, reflectivity_code
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.range_error import quantise
 from lidar.sensors.rig.patterns.beams import Firings, T
 from lidar.sensors.rig.scanner import Sensor

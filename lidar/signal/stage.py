@@ -15,16 +15,16 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.detector import receive
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, trace
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, artificial_echoes, trace
 from lidar.sensors.physics.link import apparent_of
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.situation import Situation
 
 if TYPE_CHECKING:
     from lidar.sensors.camera.render import CameraImage
-    from lidar.sensors.navigation.gnss import Fixes
-    from lidar.sensors.navigation.imu import Inertial
+    from lidar.sensors.navigation.measurements import Fixes, Inertial
 
 POSES = "poses and time"
 ROAD_USERS = "road users (lidar drive --traffic)"

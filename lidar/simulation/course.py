@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 
 from geoscene.pipeline.reach import RoadMap
+from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
 from lidar.motion.replay import read_replay
 from lidar.motion.road_drive import road_course
@@ -26,7 +27,6 @@ from lidar.simulation.flight_planning import flight_course
 from lidar.simulation.frame_loop import CHUNK
 from lidar.simulation.plan import flight_options, sensors_of
 from lidar.traffic.surroundings import LEFT
-from lidar.world.world import OVERHANG
 
 _ASIDE = 15.0
 """Metres, maximum distance of a sensor from the rear axle's path."""

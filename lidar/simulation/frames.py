@@ -20,8 +20,8 @@ from lidar.geometry.poses import Poses
 from lidar.options import DriveOptions
 from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.navigation.gnss import Fixes
-from lidar.sensors.navigation.imu import Inertial, observe_imu
+from lidar.sensors.navigation.imu import observe_imu
+from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.sensors.rig.specs import GnssSpec, ImuSpec
 from lidar.signal.navigation import altered_fixes, altered_samples
 from lidar.signal.registry import Stages

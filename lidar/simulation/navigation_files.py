@@ -22,14 +22,9 @@ from lidar.dataset.navigation_files import FixHeights
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import iso_times
 from lidar.sensors.navigation.geoid import geoid_at
-from lidar.sensors.navigation.gnss import (
-    Fixes,
-    antenna_motion,
-    epochs,
-    gnss_columns,
-    observe_gnss,
-)
-from lidar.sensors.navigation.imu import Inertial, imu_columns
+from lidar.sensors.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
+from lidar.sensors.navigation.imu import imu_columns
+from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.sensors.navigation.nmea import HEIGHTS, height_note, nmea
 from lidar.sensors.navigation.satellite_visibility import sky_view
 from lidar.sensors.rig.specs import GnssSpec

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.support.csv_tables import write_columns
 from geoscene.typing import Float
 from lidar.dataset.deskew import MOMENTS, deskew
-from lidar.dataset.formats.table import FrameInfo, Table, cloud_table, point_labels
+from lidar.dataset.formats.table import FrameInfo, PointLabels, Table, cloud_table
 from lidar.errors import LidarError
 from lidar.geometry.random_streams import generator
 from lidar.geometry.time_scales import gps_seconds
@@ -25,6 +25,7 @@ from lidar.simulation.boxes import box_rows, count_points
 from lidar.simulation.measured import MeasuredCloud, firing_times, placed_cloud
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of
+from lidar.world.actors import Actors
 from lidar.world.thread_worlds import Worlds
 from lidar.world.world import World
 
@@ -38,11 +39,22 @@ def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: 
         write_truth(paths["truth"], measured.truth)
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=measured.velocity)
     for form in recording.settings.label_formats:
-        form.write(paths[f"labels {form.name}"], point_labels(cloud, recording.actors))
+        form.write(paths[f"labels {form.name}"], _point_labels(cloud, recording.actors))
     if "boxes" in paths:
         with recording.watch.stage("boxes"):
             write_columns(paths["boxes"], measured.boxes)
     return measured
+
+
+def _point_labels(cloud: Cloud, actors: Actors | None) -> PointLabels:
+    """The labels of a cloud's points."""
+    road_user, moving = np.zeros(len(cloud), np.int64), np.zeros(len(cloud), bool)
+    if actors is not None and len(actors):
+        row = cloud.feature.astype(np.int64) - int(actors.feature[0])
+        on = np.flatnonzero((row >= 0) & (row < len(actors)))
+        road_user[on] = row[on] + 1
+        moving[on] = ~actors.parked[row[on]]
+    return PointLabels(cloud.klass, road_user, moving)
 
 
 def measure_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:

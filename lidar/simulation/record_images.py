@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.support.csv_tables import write_columns
+from lidar.dataset.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
-from lidar.sensors.camera.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.sensors.camera.render import CameraImage as Image
-from lidar.sensors.camera.render import exposure_times, optical_flow, render
+from lidar.sensors.camera.render import optical_flow, render
 from lidar.sensors.camera.signal_lamps import Lamps
+from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera
 from lidar.signal.run import altered_image, image_truth, write_truth
 from lidar.simulation.boxes import ImageBoxes, image_boxes

@@ -29,11 +29,11 @@ from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples
+from lidar.dataset.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.options import ApplyOptions, with_stage_settings
-from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.scanner import Sensor, load_sensor

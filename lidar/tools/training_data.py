@@ -15,11 +15,11 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.png import read_png
 from lidar.dataset.recorded import Stream, cloud_points, color_images, labelled_clouds, nearest, still_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.camera.png import read_png
 
 Sample = dict[str, Any]
 

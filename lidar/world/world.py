@@ -14,6 +14,7 @@ from geoscene.classes import Class
 from geoscene.geometry.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.scene import Scene
+from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast import Caster, Geometry, Hits, MeshInstances
@@ -53,8 +54,6 @@ Region = tuple[float, float, float, float]
 _ABOVE, _CEILING = 0.05, 100.0
 """Metres above a face from which, and up to which, roofs are looked for."""
 
-OVERHANG = 50.0
-"""Metres by which a building may extend beyond its tile and still be loaded."""
 _WITHIN = 160.0  # metres around a place within which shelter is known, at most
 _MOVED = 32.0  # metres between places that share a shelter
 _KEPT = 4  # shelters that are kept

@@ -35,7 +35,6 @@ from geoscene.typing import Float
 from lidar.errors import FormatError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.laser.cloud import Cloud
-from lidar.world.actors import Actors
 
 Table = dict[str, NDArray[Any]]
 
@@ -165,17 +164,6 @@ class PointLabels:
     klass: NDArray[np.integer]
     road_user: NDArray[np.integer]
     moving: NDArray[np.bool_]
-
-
-def point_labels(cloud: Cloud, actors: Actors | None) -> PointLabels:
-    """The labels of a cloud's points."""
-    road_user, moving = np.zeros(len(cloud), np.int64), np.zeros(len(cloud), bool)
-    if actors is not None and len(actors):
-        row = cloud.feature.astype(np.int64) - int(actors.feature[0])
-        on = np.flatnonzero((row >= 0) & (row < len(actors)))
-        road_user[on] = row[on] + 1
-        moving[on] = ~actors.parked[row[on]]
-    return PointLabels(cloud.klass, road_user, moving)
 
 
 def read_rows(path: Path, columns: int) -> NDArray[np.float32]:

@@ -25,10 +25,10 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.png import feature_to_image, image_to_feature, read_png, write_png
 from lidar.dataset.recorded import Stream, color_images
 from lidar.errors import DatasetError
 from lidar.geometry.time_scales import iso_times
-from lidar.sensors.camera.png import feature_to_image, image_to_feature, read_png, write_png
 
 Row = dict[str, Any]
 

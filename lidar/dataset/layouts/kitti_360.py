@@ -24,9 +24,9 @@ from geoscene.typing import Float
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive, write_stamps
+from lidar.dataset.png import image_to_feature, read_png, write_png
 from lidar.geometry.attitude import matrix_from_quat
 from lidar.geometry.mounts import Mount
-from lidar.sensors.camera.png import image_to_feature, read_png, write_png
 
 log = logging.getLogger(__name__)
 

@@ -17,10 +17,10 @@ from geoscene.support.files import write_atomically, write_json
 from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset
+from lidar.dataset.png import DEPTH_SCALE, depth_to_counts, write_png
 from lidar.dataset.recorded import cloud_points, scanner_clouds
 from lidar.dataset.seen_points import ImageView, motions_of, returns_of, views_of
 from lidar.errors import DatasetError
-from lidar.sensors.camera.png import DEPTH_SCALE, depth_to_counts, write_png
 from lidar.sensors.rig.camera_model import intrinsic_matrix
 
 

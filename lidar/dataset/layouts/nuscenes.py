@@ -28,6 +28,7 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import nuscenes
 from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.png import write_png
 from lidar.dataset.recorded import (
     Stream,
     color_images,
@@ -39,7 +40,6 @@ from lidar.dataset.recorded import (
 )
 from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.camera.png import write_png
 
 Row = dict[str, Any]
 

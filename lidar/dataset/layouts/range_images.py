@@ -21,9 +21,9 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset, reading_file
+from lidar.dataset.png import write_png
 from lidar.dataset.recorded import cloud_points, labelled_clouds
 from lidar.errors import DatasetError
-from lidar.sensors.camera.png import write_png
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.scanner import firings
 from lidar.sensors.rig.specs import Rig, rig_of

@@ -13,8 +13,8 @@ from geoscene.typing import Ints
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
 from lidar.dataset.layouts import ros_messages as ros
 from lidar.dataset.layouts.ros_drive import Message, RosDrive, Topic
+from lidar.dataset.png import counts_to_depth, read_png
 from lidar.errors import DatasetError
-from lidar.sensors.camera.png import counts_to_depth, read_png
 
 log = logging.getLogger(__name__)
 

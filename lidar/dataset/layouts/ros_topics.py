@@ -20,7 +20,7 @@ from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds, labell
 from lidar.geometry.attitude import body_rates, matrix_from_quat, quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, OPTICAL_QUAT
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.navigation.gnss import Fixes, fix_variances
+from lidar.sensors.navigation.measurements import Fixes, fix_variances
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.patterns.scanner2d import Scan2d
 from lidar.sensors.rig.specs import ImuSpec

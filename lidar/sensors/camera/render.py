@@ -145,16 +145,6 @@ class TracedView(_Traced):
     surfaces: Surfaces
 
 
-def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> NDArray[np.int64]:
-    """Times at which poses are needed for one frame, for `render`: ``samples`` over the exposure.
-
-    Each sample is one time, or, for a rolling shutter, one for each row from the top.
-    """
-    within = (2 * np.arange(samples) + 1) * camera.exposure_ns // (2 * samples)
-    rows = np.arange(camera.height) * camera.row_ns if camera.row_ns else np.zeros(1, np.int64)
-    return (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
-
-
 def render(
     camera: CameraSpec,
     poses: Poses,

@@ -12,7 +12,6 @@ Heights are the scene's: above the assumed level ground in a ``flat`` scene, abo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -20,44 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import body_rates
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
+from lidar.sensors.navigation.measurements import NAMES, STATES, Fixes
 from lidar.sensors.navigation.satellite_visibility import Sky, dilution, open_sky
 from lidar.sensors.rig.specs import GnssSpec
 
-
-@dataclass(frozen=True, slots=True)
-class Errors:
-    """Standard deviations of a receiver's errors along each horizontal axis, and up.
-
-    white, bias, blocked : (horizontal, vertical) metres: of w, of b, and of m where the whole sky is blocked
-    tau      : seconds, correlation time of b
-    speed    : m/s along each axis, white
-    quality  : fix quality in NMEA sentences
-    """
-
-    white: tuple[float, float]
-    bias: tuple[float, float]
-    tau: float
-    blocked: tuple[float, float]
-    speed: float
-    quality: int
-
-
-STATES = {
-    "none": Errors((np.nan, np.nan), (0.0, 0.0), 1.0, (0.0, 0.0), np.nan, 0),
-    "single": Errors((0.3, 0.6), (1.5, 2.5), 600.0, (7.5, 15.0), 0.05, 1),
-    "sbas": Errors((0.2, 0.4), (0.6, 1.0), 300.0, (7.5, 15.0), 0.05, 2),
-    "float": Errors((0.05, 0.10), (0.25, 0.4), 200.0, (0.5, 1.0), 0.03, 5),
-    "fixed": Errors((0.008, 0.015), (0.006, 0.010), 100.0, (0.02, 0.04), 0.02, 4),
-    "ideal": Errors((0.0, 0.0), (0.0, 0.0), 1.0, (0.0, 0.0), 0.0, 1),
-}
-"""Typical magnitudes, not those of one product; ``blocked`` models street canyons."""
-NAMES = tuple(STATES)
 MULTIPATH_TAU_S = 60.0
 """Correlation time of the multipath error m, seconds."""
 _AROUND = 4  # poses around a time that its differences depend on
@@ -70,44 +40,6 @@ _LADDER = {  # by mode, best first: state, minimum satellites (of one system), m
     "rtk": (("fixed", 6, 4.0), ("float", 5, 8.0), ("single", 4, 25.0)),
 }
 """A maximum PDOP of 25 is the default of u-blox receivers; the limits of carrier-phase states are assumed."""
-
-
-@dataclass(frozen=True, slots=True)
-class Fixes(Columns):
-    """Measurements of a receiver and ground truth, one row per epoch; measurements without a fix are NaN.
-
-    time_ns   : (n,) int64, since the drive's start
-    state     : (n,) int8, row of `NAMES`
-    quality   : (n,) int8, as in NMEA: 0 none, 1 single, 2 differential, 4 fixed, 5 float
-    satellites : (n,) int8, used
-    dop       : (n, 3) dilution of precision, horizontal, vertical, in position
-    lonlath   : (n, 3) degrees, degrees, metres, measured
-    speed     : (n,) m/s over ground, measured
-    course    : (n,) radians clockwise from true north, measured; held at standstill
-    error     : (n, 3) metres east, north, up: measured minus true
-    true_lonlath : (n, 3) of the antenna
-    true_velocity : (n, 3) m/s true east, north, up, of the antenna
-    used      : (n, k) bool, satellites used
-    names     : (k,) of the satellites, such as G01
-    """
-
-    time_ns: NDArray[np.int64]
-    state: NDArray[np.int8]
-    quality: NDArray[np.int8]
-    satellites: NDArray[np.int8]
-    dop: Float
-    lonlath: Float
-    speed: Float
-    course: Float
-    error: Float
-    true_lonlath: Float
-    true_velocity: Float
-    used: NDArray[np.bool_]
-    names: NDArray[np.str_]
-
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """The columns by name; the satellites' names hold for all rows."""
-        return {name: column for name, column in Columns.columns(self).items() if name != "names"}
 
 
 def epochs(spec: GnssSpec, duration_ns: int) -> NDArray[np.int64]:
@@ -279,18 +211,6 @@ def _course(velocity: Float, speed: Float, *, least: Float) -> Float:
     known: NDArray[np.int64] = np.where(speed > least, np.arange(len(speed)), -1)
     last: NDArray[np.int64] = np.maximum.accumulate(known)
     return np.where(last >= 0, course[np.maximum(last, 0)], 0.0)
-
-
-def fix_variances(fixes: Fixes) -> Float:
-    """Variances (n, 3), m^2 east, north, up, as a receiver states them: 0 without a fix.
-
-    Those of the noise and of the slow error of the fix's state under an open sky, times the square of the
-    dilution of precision where that exceeds 1. Multipath, of which a receiver does not know, is not in them.
-    """
-    states = [STATES[name] for name in NAMES]
-    sizes = np.nan_to_num([np.hypot(state.white, state.bias) for state in states])[fixes.state]
-    dop = np.nan_to_num(np.maximum(fixes.dop[:, :2], 1.0), nan=1.0)
-    return np.asarray((sizes * dop)[:, [0, 0, 1]] ** 2, float)
 
 
 def gnss_columns(fixes: Fixes) -> dict[str, NDArray[Any]]:

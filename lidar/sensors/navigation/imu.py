@@ -11,19 +11,18 @@ of the local vertical due to travel); f includes the Coriolis acceleration.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.support.columns import Columns
 from geoscene.support.csv_tables import table_blocks
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
 from lidar.geometry.poses import Trajectory, release, room
 from lidar.geometry.random_streams import generator
+from lidar.sensors.navigation.measurements import Inertial
 from lidar.sensors.navigation.satellite_visibility import E2, A
 from lidar.sensors.rig.specs import ImuSpec
 
@@ -34,22 +33,6 @@ _AROUND = 4  # poses around a time that its differences depend on
 
 EARTH_RATE = 7.292115e-5
 """Angular rate of the Earth, rad/s (WGS 84)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Inertial(Columns):
-    """Measurements of a unit and ground truth, in its own axes, one row per time.
-
-    time_ns     : (n,) int64, since the drive's start
-    gyro, accel : (n, 3) rad/s and m/s^2, measured
-    true_gyro, true_accel : (n, 3) without noise and bias
-    """
-
-    time_ns: NDArray[np.int64]
-    gyro: Float
-    accel: Float
-    true_gyro: Float
-    true_accel: Float
 
 
 def normal_gravity(lat_deg: ArrayLike, h: ArrayLike) -> Float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.sensors.navigation.gnss import Fixes
+from lidar.sensors.navigation.measurements import Fixes
 
 HEIGHTS = {"flat": "an assumed level ground", "orthometric": "the geoid", "ellipsoidal": "the ellipsoid"}
 """What heights are above, by `geoscene.geometry.frames.Frame.vertical`."""

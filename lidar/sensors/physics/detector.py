@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
-from lidar.sensors.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
+from lidar.sensors.physics.echoes import Echoes, EchoesT, artificial_echoes
 from lidar.sensors.physics.link import (
     amplitude,
     apparent_of,
@@ -18,6 +18,7 @@ from lidar.sensors.physics.link import (
     false_alarm_probability,
     noise_of,
 )
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code
 from lidar.sensors.physics.range_error import quantise, signal_sigma, stretch_sigma, walk
 from lidar.sensors.physics.reflect import RETRO

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +14,7 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import inline
 from lidar.sensors.physics.footprint import AXIS_ONLY, Gap
+from lidar.sensors.physics.origin import Origin
 
 _MODES = ("strongest", "first", "last", "dual", "all")
 _STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)
@@ -43,18 +43,6 @@ class Echoes(Columns):
     cosine: Float
     true_range: Float
     axis: NDArray[np.bool_]
-
-
-class Origin(IntEnum):
-    """Cause of an echo or a return."""
-
-    SURFACE = 0
-    WEATHER = 1
-    INTERFERENCE = 2
-    INJECTED = 3
-    REPLAYED = 4
-    MOVED = 5
-    RECEIVER = 6  # false alarms and blooming
 
 
 @dataclass(frozen=True, slots=True)

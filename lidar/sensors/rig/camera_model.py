@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Float
 from lidar.sensors.rig.specs import CameraSpec
@@ -17,6 +17,16 @@ _TOLERANCE = 1e-12
 def intrinsic_matrix(camera: CameraSpec) -> Float:
     """K (3, 3), which maps normalised image coordinates (x, y, 1) to pixels (u, v, 1)."""
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+
+
+def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> NDArray[np.int64]:
+    """Times at which poses are needed of one frame: ``samples`` over the exposure.
+
+    Each sample is one time, or, for a rolling shutter, one for each row from the top.
+    """
+    within = (2 * np.arange(samples) + 1) * camera.exposure_ns // (2 * samples)
+    rows = np.arange(camera.height) * camera.row_ns if camera.row_ns else np.zeros(1, np.int64)
+    return (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
 
 
 def pixel_rays(camera: CameraSpec) -> Float:

@@ -15,8 +15,9 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast.geometry import ALL
-from lidar.sensors.physics.echoes import Origin, TracedEchoes, join, number_echoes
+from lidar.sensors.physics.echoes import TracedEchoes, join, number_echoes
 from lidar.sensors.physics.link import amplitude
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS, has_code
 from lidar.signal.attacks.attacker import DEVICES, Attacker, sent_back
 from lidar.signal.attacks.remove import POWER_SPREAD

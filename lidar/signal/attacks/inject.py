@@ -8,7 +8,8 @@ import numpy as np
 
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of, sent_back
 from lidar.signal.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges

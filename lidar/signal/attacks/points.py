@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.typing import Float, Ints
 from lidar.sensors.laser.cloud import TracedCloud
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import LABELS, Stage, parameter
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.sensors.navigation.gnss import Fixes
+from lidar.sensors.navigation.measurements import Fixes
 from lidar.sensors.navigation.satellite_visibility import E2, A
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter

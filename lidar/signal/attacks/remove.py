@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import DEVICES, Aim, Attacker, sent_back
 from lidar.signal.situation import Situation

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.intensity import apparent_of_code
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, power_of, sent_back
 from lidar.signal.situation import Situation

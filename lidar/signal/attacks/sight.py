@@ -8,7 +8,8 @@ from typing import cast
 import numpy as np
 
 from lidar.errors import InputError
-from lidar.sensors.physics.echoes import Origin, TracedEchoes, artificial_echoes, trace
+from lidar.sensors.physics.echoes import TracedEchoes, artificial_echoes, trace
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.scanner import Sensor, firings
 from lidar.signal.attacks.attacker import Attacker
 from lidar.signal.registry import Stages

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, added_echoes
 from lidar.signal.weather.backscatter import (

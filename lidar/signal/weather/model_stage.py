@@ -11,7 +11,7 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import TracedCloud
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import parameter
 from lidar.signal.weather.camera import add_weather

@@ -20,9 +20,9 @@ from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset
+from lidar.dataset.png import write_png
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.random_streams import generator
-from lidar.sensors.camera.png import write_png
 from lidar.tools.defences.calibration import Calibration, Joint, calibration_text, tail_of
 from lidar.tools.defences.fusion import FUSED, fuse_verdicts, fused_threshold, joint_of
 from lidar.tools.defences.observation import Observation

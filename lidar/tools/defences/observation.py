@@ -49,7 +49,7 @@ class Picture:
 @functools.lru_cache(maxsize=4)
 def pixels_of(file: Path) -> NDArray[np.uint8]:
     """Colours (h, w, 3) of a PNG file."""
-    from lidar.sensors.camera.png import read_png  # noqa: PLC0415
+    from lidar.dataset.png import read_png  # noqa: PLC0415
 
     return read_png(file)[..., :3].astype(np.uint8)
 

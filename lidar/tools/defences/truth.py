@@ -13,7 +13,7 @@ from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import acts_on, attack_names
 
 ATTACKS = (Origin.INJECTED, Origin.REPLAYED, Origin.MOVED)

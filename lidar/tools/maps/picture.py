@@ -1,4 +1,4 @@
-"""Illustrations: scenes and point clouds from above or obliquely, depth and class images, legends."""
+"""Illustrations: point clouds from above or obliquely, depth and class images, legends."""
 
 # mypy: disallow-untyped-decorators=False
 from __future__ import annotations
@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,17 +19,14 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses
-from lidar.motion.vehicle import Vehicle
-from lidar.sensors.camera.render import RenderOptions, render
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.maps.colors import ramp
-from lidar.world.world import World
+
+if TYPE_CHECKING:
+    from lidar.motion.vehicle import Vehicle
 
 Pixels = NDArray[np.uint8]
-
-AFTERNOON = (-0.52, -0.37, 0.77)
-"""Direction towards a sun in the south-west, 50° above the horizon."""
 
 BACKGROUND = (16, 18, 24)
 """Background colour of pictures of point clouds, sRGB."""
@@ -56,36 +54,8 @@ VIEWS = {
 """Views by name; ``top`` is a map with north up."""
 
 
-def scene_picture(
-    world: World,
-    *,
-    view: str | PictureView = "oblique",
-    size: tuple[int, int] = (1600, 1000),
-    bounds: tuple[float, float, float, float] | None = None,
-    sun: ArrayLike = AFTERNOON,
-    options: RenderOptions | None = None,
-) -> Pixels:
-    """A rendered picture (h, w, 3) of a scene.
-
-    view   : name in `VIEWS`, or a `PictureView`
-    size   : width and height in pixels
-    bounds : (xmin, ymin, xmax, ymax) to show, scene metres; the whole world by default
-    sun    : (3,) direction towards the sun
-
-    Raises InputError for an unknown view.
-    """
-    area = bounds or world.region or world.scene.bounds
-    low, high = _heights(world, area)
-    corners = np.array([[x, y, z] for x in area[0::2] for y in area[1::2] for z in (low, high)])
-    camera, pose = _eye(corners, _view(view), size=size)
-    settings = options or RenderOptions(supersample=2, visibility=np.inf)
-    picture = render(camera, pose, world=world, sun=sun, options=settings).rgb
-    if picture is None:
-        raise InputError("the camera of a picture records colour")
-    return picture
-
-
-def _view(view: str | PictureView) -> PictureView:
+def view_named(view: str | PictureView) -> PictureView:
+    """A view by its name, or the view itself; raises InputError for an unknown name."""
     if isinstance(view, PictureView):
         return view
     if view not in VIEWS:
@@ -93,19 +63,7 @@ def _view(view: str | PictureView) -> PictureView:
     return VIEWS[view]
 
 
-def _heights(world: World, area: tuple[float, float, float, float]) -> tuple[float, float]:
-    """Lowest and 98th percentile height of the surfaces in an area, sampled on a grid of vertical rays."""
-    x, y = np.meshgrid(np.linspace(area[0], area[2], 96), np.linspace(area[1], area[3], 96))
-    top = 1e4
-    origins = np.stack([x.ravel(), y.ravel(), np.full(x.size, top)], axis=1)
-    hits = world.caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
-    z = top - hits.range[np.isfinite(hits.range)]
-    if not len(z):
-        raise InputError(f"the scene has no surfaces within {area}")
-    return float(z.min()), float(np.percentile(z, 98))
-
-
-def _eye(corners: Float, view: PictureView, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
+def camera_around(corners: Float, view: PictureView, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
     """The nearest camera that sees all corners (n, 3)."""
     width, height = size
     a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
@@ -152,7 +110,7 @@ def cloud_picture(
     box = np.percentile(xyz, [0.5, 99.5], axis=0) if bounds is None else np.asarray(bounds, float)
     box[1] = np.maximum(box[1], box[0] + 1e-3)
     corners = np.array([[x, y, z] for x in box[:, 0] for y in box[:, 1] for z in box[:, 2]])
-    camera, pose = _eye(corners, _view(view), size=size)
+    camera, pose = camera_around(corners, view_named(view), size=size)
     pixels, z = project(camera, (xyz - pose.position) @ pose.rotation[0])
     width, height = size
     image = np.empty((height, width, 3), np.uint8)

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from geoscene.scene import Scene
+from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
-from lidar.raycast.nearest import lower_to_nearest
-from lidar.raycast.tree import Tree, tree_of
-from lidar.world.world import OVERHANG
+from lidar.geometry.box_tree import Tree, tree_of
+from lidar.geometry.nearest import lower_to_nearest
 
 _KEPT = 12
 """Tiles whose triangles are in memory: those around a place, and some of the way."""

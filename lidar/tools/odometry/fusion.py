@@ -21,8 +21,8 @@ from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.layout import Dataset
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.errors import DatasetError
-from lidar.sensors.navigation.gnss import NAMES, STATES
-from lidar.sensors.navigation.imu import EARTH_RATE, Inertial, normal_gravity
+from lidar.sensors.navigation.imu import EARTH_RATE, normal_gravity
+from lidar.sensors.navigation.measurements import NAMES, STATES, Inertial
 from lidar.sensors.rig.imu_grades import Noise
 from lidar.tools.odometry.estimate import along_axes
 from lidar.tools.odometry.settings import OdometrySettings

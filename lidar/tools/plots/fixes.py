@@ -14,7 +14,7 @@ from lidar.dataset.layout import Dataset
 from lidar.dataset.navigation_files import read_fixes
 from lidar.errors import DatasetError, InputError
 from lidar.options import PlotOptions
-from lidar.sensors.navigation.gnss import Fixes, fix_variances
+from lidar.sensors.navigation.measurements import Fixes, fix_variances
 from lidar.tools.plots.drawn import WIDE, Drawn, plain, thin
 
 _DIRECTIONS = ("east", "north", "up")

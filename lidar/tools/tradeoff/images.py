@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
+from lidar.dataset.png import depth_to_counts, encode_png, feature_to_image
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.camera.png import depth_to_counts, encode_png, feature_to_image
-from lidar.sensors.camera.render import CameraImage, exposure_times, render
+from lidar.sensors.camera.render import CameraImage, render
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.camera.signal_lamps import Lamps
+from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.tradeoff.errors import ImageError

@@ -8,8 +8,8 @@ from math import inf, nan
 
 import numpy as np
 
+from lidar.dataset.png import counts_to_depth, depth_to_counts
 from lidar.options import PERCENTS
-from lidar.sensors.camera.png import counts_to_depth, depth_to_counts
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.devices import Camera
 from lidar.tools.tradeoff.errors import IMAGE_STATISTICS, ImageError, percentile

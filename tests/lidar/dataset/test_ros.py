@@ -28,10 +28,10 @@ from lidar.dataset.layouts.ros_drive import RosDrive, ros_name
 from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
 from lidar.dataset.layouts.ros_topics import topics_of
 from lidar.dataset.navigation_files import FixHeights, read_fixes
+from lidar.dataset.png import counts_to_depth, image_to_feature, read_png
 from lidar.errors import DatasetError, FormatError, InputError
 from lidar.options import DriveOptions
-from lidar.sensors.camera.png import counts_to_depth, image_to_feature, read_png
-from lidar.sensors.navigation.gnss import fix_variances
+from lidar.sensors.navigation.measurements import fix_variances
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.patterns.scanner2d import Scan2d
 from lidar.sensors.rig.specs import load_rig

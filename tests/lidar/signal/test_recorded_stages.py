@@ -12,10 +12,10 @@ from helpers.programs import run_program
 
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.png import read_png
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.sensors.camera.png import read_png
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import NamedStage, number_stages, read_stage, read_stages
 from lidar.signal.stage import Stage, parameter
 from lidar.signal.weather.setting import read_weather

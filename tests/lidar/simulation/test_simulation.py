@@ -14,9 +14,9 @@ import pytest
 import lidar
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import cloud_table
+from lidar.dataset.png import depth_to_counts, encode_png, flow_to_image, image_to_feature, read_png
 from lidar.errors import InputError
 from lidar.options import DriveOptions
-from lidar.sensors.camera.png import depth_to_counts, encode_png, flow_to_image, image_to_feature, read_png
 from lidar.signal.registry import read_attacks, read_stages
 from lidar.simulation.drive import drive
 from lidar.traffic.populate import TrafficOptions

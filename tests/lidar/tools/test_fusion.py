@@ -16,12 +16,12 @@ from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.dataset.layouts.bev import REACH
 from lidar.dataset.layouts.range_images import points
+from lidar.dataset.png import image_to_feature, write_png
 from lidar.dataset.recorded import cloud_points, scanner_clouds, still_points
 from lidar.dataset.seen_points import motions_of, returns_of, views_of
 from lidar.errors import DatasetError
 from lidar.geometry.georeference import Georeference
 from lidar.options import DriveOptions, MapOptions
-from lidar.sensors.camera.png import image_to_feature, write_png
 from lidar.tools.evaluation.objects import evaluate_objects
 from lidar.tools.maps.aggregate import aggregate
 from lidar.traffic.populate import TrafficOptions

@@ -10,9 +10,9 @@ import pytest
 
 import lidar
 from geoscene.classes import Class
+from lidar.dataset.png import counts_to_depth, read_png
 from lidar.errors import DatasetError, InputError
 from lidar.options import DriveOptions
-from lidar.sensors.camera.png import counts_to_depth, read_png
 from lidar.simulation.drive import drive
 from lidar.traffic.populate import TrafficOptions
 

@@ -9,14 +9,14 @@ import pytest
 from geoscene.classes import Class
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
+from lidar.dataset.png import depth_to_counts, encode_png
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.sensors.camera.png import depth_to_counts, encode_png
 from lidar.sensors.camera.render import RenderOptions, render
 from lidar.sensors.camera.sun import sun_direction
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.maps.picture import scene_picture
+from lidar.tools.plots.scene_picture import scene_picture
 from lidar.world.world import World
 
 pytestmark = pytest.mark.shared

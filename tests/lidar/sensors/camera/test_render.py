@@ -10,15 +10,15 @@ from helpers.sensor_worlds import MeshWorld, box, plate, world
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import ROOF, WALL, Mesh, concatenate
+from lidar.dataset.png import encode_png
 from lidar.errors import InputError
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels
-from lidar.sensors.camera.png import encode_png
-from lidar.sensors.camera.render import RenderOptions, _shared_rays, exposure_times, optical_flow, render
+from lidar.sensors.camera.render import RenderOptions, _shared_rays, optical_flow, render
 from lidar.sensors.camera.shade import straight_rays
-from lidar.sensors.rig.camera_model import pixel_rays, project
+from lidar.sensors.rig.camera_model import exposure_times, pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 

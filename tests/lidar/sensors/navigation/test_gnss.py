@@ -20,15 +20,8 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.navigation.constellations import constellations, satellite_names, satellites
 from lidar.sensors.navigation.geoid import geoid_at
-from lidar.sensors.navigation.gnss import (
-    NAMES,
-    STATES,
-    antenna_motion,
-    epochs,
-    gauss_markov,
-    gnss_columns,
-    observe_gnss,
-)
+from lidar.sensors.navigation.gnss import antenna_motion, epochs, gauss_markov, gnss_columns, observe_gnss
+from lidar.sensors.navigation.measurements import NAMES, STATES
 from lidar.sensors.navigation.nmea import checksum, height_note, latitude, longitude, nmea, sentence
 from lidar.sensors.navigation.satellite_visibility import (
     Sky,

@@ -12,13 +12,13 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.navigation.imu import (
     EARTH_RATE,
-    Inertial,
     imu_columns,
     inertial_noise,
     normal_gravity,
     observe_imu,
     true_inertial,
 )
+from lidar.sensors.navigation.measurements import Inertial
 from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.sensors.rig.specs import ImuSpec
 

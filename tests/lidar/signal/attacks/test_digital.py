@@ -15,8 +15,8 @@ from lidar.geometry.mounts import OPTICAL_QUAT, Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.navigation.gnss import Fixes
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.navigation.measurements import Fixes
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.registry import stages_of
 from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered

@@ -13,7 +13,7 @@ from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.scanner import firings, load_sensor

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import stages_of
 from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lidar.dataset.png import read_png
 from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.sensors.camera.png import read_png
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

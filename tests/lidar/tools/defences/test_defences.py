@@ -9,9 +9,9 @@ from helpers.forgery import CAR, in_box, observed, with_car, without
 from helpers.sensor_worlds import box, driven, world
 
 from geoscene.classes import Class
+from lidar.dataset.png import write_png
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.sensors.camera.png import write_png
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec

@@ -18,15 +18,15 @@ from lidar.tools.maps.picture import (
     BACKGROUND,
     VIEWS,
     PictureView,
-    _eye,
+    camera_around,
     class_colors,
     cloud_picture,
     depth_picture,
-    scene_picture,
     sheet,
     sweep_picture,
     with_legend,
 )
+from lidar.tools.plots.scene_picture import scene_picture
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
 PLAIN = RenderOptions(detail=False, visibility=np.inf)
@@ -49,7 +49,7 @@ def _where(image, color):
 )
 def test_all_points_are_in_view_and_fill_it(azimuth, elevation, fov, size, span):
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * span + [50, -70, 9]
-    camera, pose = _eye(corners, PictureView(azimuth, elevation, fov), size=size)
+    camera, pose = camera_around(corners, PictureView(azimuth, elevation, fov), size=size)
     pixels, depth = project(camera, (corners - pose.position) @ pose.rotation[0])
     assert (depth > 0).all()
     share = (pixels + 0.5) / size

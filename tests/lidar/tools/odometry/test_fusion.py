@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar.errors import DatasetError, InputError
 from lidar.options import OdometryOptions
-from lidar.sensors.navigation.gnss import NAMES, Fixes
-from lidar.sensors.navigation.imu import Inertial
+from lidar.sensors.navigation.measurements import NAMES, Fixes, Inertial
 from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.tools.odometry.fusion import Fixed, Unit, fixes_of, fuse_measurements
 from lidar.tools.odometry.run import estimate_motion

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
-from lidar.errors import FormatError
-from lidar.sensors.camera.png import (
+from lidar.dataset.png import (
     counts_to_depth,
     depth_to_counts,
     encode_png,
@@ -22,6 +21,7 @@ from lidar.sensors.camera.png import (
     read_png,
     write_png,
 )
+from lidar.errors import FormatError
 
 SIZES = st.tuples(st.integers(1, 40), st.integers(1, 40))
 IMAGES = st.one_of(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.raycast.tree import DEPTH, FIRST, LEAF, RIGHT
+from lidar.geometry.box_tree import DEPTH, FIRST, LEAF, RIGHT
 
 
 @njit(cache=True, nogil=True)
@@ -21,7 +21,7 @@ def lower_to_nearest(
 
     points       : (n, 3) metres
     corners      : (k, 3, 3) float64, of the triangles, in the same frame
-    nodes, order : of the triangles' boxes, see `lidar.raycast.tree.Tree`; of at least one triangle
+    nodes, order : of the triangles' boxes, see `lidar.geometry.box_tree.Tree`; of at least one triangle
     """
     links = nodes.view(np.int32)
     stack = np.empty(DEPTH, np.int64)
