@@ -43,7 +43,7 @@ from readers import readable, reader_of
 from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from geoscene.support.console import main as main_of
-from geoscene.support.files import digest_of
+from geoscene.support.digests import file_digest
 from geoscene.support.memory import peak_memory
 from lidar.errors import InputError, LidarError
 
@@ -96,7 +96,7 @@ def _share_shapes() -> None:
     read, known = layout.read_shapes, {}
 
     def read_once(path: Path) -> Any:
-        digest = digest_of(path)
+        digest = file_digest(path)
         if digest not in known:
             known[digest] = read(path)
         return known[digest]

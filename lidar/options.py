@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import re
 from collections.abc import Iterable, Sequence
@@ -19,6 +18,7 @@ from cyclopts import Group, Parameter, Token
 from geoscene.classes import Class
 from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
+from geoscene.support.digests import recipe_digest
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
@@ -1170,4 +1170,4 @@ def _add_digest(name: str | Path) -> str:
     path = Path(name)
     if not str(name) or not path.is_file():
         return str(name)
-    return f"{name} ({hashlib.blake2b(path.read_bytes(), digest_size=6).hexdigest()})"
+    return f"{name} ({recipe_digest(path.read_bytes())})"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +21,8 @@ from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.sources.data import Credit, OsmData
-from geoscene.support.files import atomic_path, digest_of, temporary_folder
+from geoscene.support.digests import digest, file_digest, value_digest
+from geoscene.support.files import atomic_path, temporary_folder
 from geoscene.support.progress import Progress, silent
 from geoscene.support.report import Problem
 
@@ -72,7 +71,7 @@ def with_clouds(
         if moved:
             work = work._replace(shift=(east_m, north_m))
             grounds = grounds_of(work, workers=workers, progress=progress)
-        keys = [digest_of(file.path) for file in files]
+        keys = [file_digest(file.path) for file in files]
         raster, bridged = _ground_file(
             grounds, work, frame=frame, extent=extent, files=files, keys=keys, cloud=cloud,
             options=options, cache_dir=cache_dir, footprints=footprints,
@@ -204,9 +203,8 @@ def _ground_file(
     void = np.isnan(heights)
     heights = np.where(gap, np.nan, bridged_by_blocks(heights))
     about = [_CACHE_VERSION, frame.to_json(), list(extent), list(keys), work.shift, cloud.cloud_crs,
-             cloud.cloud_unit, hashlib.sha256(heights.tobytes()).hexdigest()]  # fmt: skip
-    name = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:16]
-    path = cache_dir / f"cloud-ground-{name}.tif"
+             cloud.cloud_unit, digest(heights.tobytes())]  # fmt: skip
+    path = cache_dir / f"cloud-ground-{value_digest(about)}.tif"
     if not path.exists():
         _write_raster(
             path, heights, grid=grid, frame=frame, file=files[0], attribution=cloud.cloud_attribution

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -20,7 +19,7 @@ from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.support.cluster import DaskCluster
-from geoscene.support.files import digest, digest_of, sources_digest
+from geoscene.support.digests import file_digest, sources_digest, value_digest
 from geoscene.support.progress import Progress, silent
 from geoscene.support.report import Problem
 from geoscene.uses import USES
@@ -98,7 +97,7 @@ def build(
                 plan=plan,
                 reports=reports,
                 problems=problems,
-                fingerprint=_digest(keys),
+                fingerprint=value_digest(asdict(keys)),
             ),
         )
     return open_scene(out)
@@ -125,19 +124,14 @@ def _keys(osm: OsmData, options: BuildOptions, *, digest: str) -> Keys:
         "colors": USES[options.use].colors,
     }
     rest = {name: chosen[name] for name in _NOT_IN_GROUND}
-    return Keys(ground=_digest(common), solids=_digest(common | rest))
+    return Keys(ground=value_digest(common), solids=value_digest(common | rest))
 
 
 def elevation_digests(dem: Sequence[str]) -> list[str]:
     """Digests of the contents of elevation files and of the files beside them."""
-    return [digest_of(path) for name in dem for path in _with_companions(Path(name))]
+    return [file_digest(path) for name in dem for path in _with_companions(Path(name))]
 
 
 def _with_companions(path: Path) -> list[Path]:
     """A raster, and the files beside it from which GDAL may read its place (``.tfw``, ``.aux.xml``)."""
     return [path, *sorted(set(path.parent.glob(f"{glob.escape(path.stem)}.*")) - {path})]
-
-
-def _digest(value: object) -> str:
-    plain = asdict(value) if isinstance(value, Keys) else value
-    return digest(json.dumps(plain).encode())

@@ -35,7 +35,8 @@ from geoscene.scene import SceneFiles
 from geoscene.scene.tile_files import Extras, Tile, read_tile, write_tile
 from geoscene.structures import StructureOptions, built_structures
 from geoscene.support.cluster import DaskCluster
-from geoscene.support.files import digest_of, naming, write_atomically
+from geoscene.support.digests import file_digest
+from geoscene.support.files import naming, write_atomically
 from geoscene.support.processes import run_tasks
 from geoscene.support.report import Problem, describe_unexpected, described, make_without_failures
 from geoscene.typing import Bools, Ints
@@ -411,7 +412,7 @@ class _Former:
     def build(self, plan: BuildPlan, folder: Path, *, tile: tuple[int, int], lod: int) -> TileReport:
         """Copy or build a tile; see `build_tile`."""
         former = self.files.tile(*tile)
-        if tile not in self.reports or digest_of(former) != self.reports[tile].digest:
+        if tile not in self.reports or file_digest(former) != self.reports[tile].digest:
             return build_tile(plan, folder, tile=tile, lod=lod, former=None)
         if self.all:
             write_atomically(SceneFiles(folder).tile(*tile), former.read_bytes())
@@ -470,7 +471,7 @@ def _read_journal(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]
             report = _report(document)
         except (ValueError, LookupError, TypeError, AttributeError):  # the incomplete or a damaged line
             continue
-        if same and digest_of(files.tile(report.i, report.j)) == report.digest:
+        if same and file_digest(files.tile(report.i, report.j)) == report.digest:
             reports[report.i, report.j] = report
     return reports
 

@@ -21,7 +21,8 @@ from geoscene.objects.forests import Forests
 from geoscene.roadgraph import RoadGraph, read_graphml
 from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
-from geoscene.support.files import digest, digest_of, write_atomically
+from geoscene.support.digests import digest, file_digest, value_digest
+from geoscene.support.files import write_atomically
 from geoscene.support.notebooks import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
@@ -372,7 +373,7 @@ def _open_stored(url: str) -> Scene:
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
     """Digest of a manifest but for its own entry of it."""
     rest = {key: value for key, value in manifest.items() if key != "digest"}
-    return digest(json.dumps(rest, sort_keys=True).encode())
+    return value_digest(rest)
 
 
 def changed_files(scene: Scene) -> list[Path]:
@@ -382,7 +383,7 @@ def changed_files(scene: Scene) -> list[Path]:
         reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
         stated |= {SceneFiles(scene.path).tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
     here = {path: value for path, value in stated.items() if scene.stored is None or path.exists()}
-    return [path for path, value in here.items() if digest_of(path) != value]
+    return [path for path, value in here.items() if file_digest(path) != value]
 
 
 @contextmanager

@@ -18,7 +18,8 @@ from geoscene.classes import Class
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.forests import Forests, forest_instances
-from geoscene.support.files import digest, write_atomically
+from geoscene.support.digests import digest
+from geoscene.support.files import write_atomically
 from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float
 

@@ -23,7 +23,8 @@ from geoscene.scene.geopackage import Layer, write_geopackage
 from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
 from geoscene.support.csv_tables import write_columns
-from geoscene.support.files import digest_of, exclusive, write_json
+from geoscene.support.digests import file_digest
+from geoscene.support.files import exclusive, write_json
 from geoscene.support.report import Problem
 from geoscene.typing import Ints
 from geoscene.uses import USES, Needed, Use
@@ -163,7 +164,7 @@ class SceneWriter:
             **({"cut": cut} if cut else {}),
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
-            "files": {file.name: digest_of(file) for file in tables if file.exists()},
+            "files": {file.name: file_digest(file) for file in tables if file.exists()},
         }
         write_json(self.files.manifest, document | {"digest": manifest_digest(document)}, indent=1)
         if self.path.exists():

@@ -11,7 +11,8 @@ from typing import Any, TypeVar, cast
 
 from geoscene import __version__
 from geoscene.errors import InputError, WorkersLostError, need
-from geoscene.support.files import digest_of, sources_digest, write_atomically
+from geoscene.support.digests import file_digest, sources_digest
+from geoscene.support.files import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class DaskCluster:
         """
         probe = out / f"{secrets.token_hex(8)}.part"
         write_atomically(probe, secrets.token_bytes(16))
-        wanted = {path: digest_of(path) for path in (probe, *inputs)}
+        wanted = {path: file_digest(path) for path in (probe, *inputs)}
         try:
             found = self._client.run(_worker_sees, list(wanted))
         except ModuleNotFoundError as error:
@@ -118,7 +119,7 @@ def connect(address: str) -> Iterator[DaskCluster]:
 
 def _worker_sees(paths: Sequence[Path]) -> tuple[str, str, list[str]]:
     """Version of this package, digest of its sources, and digests of files; run by workers."""
-    return __version__, sources_digest("geoscene"), [digest_of(path) for path in paths]
+    return __version__, sources_digest("geoscene"), [file_digest(path) for path in paths]
 
 
 def _first_line(error: Exception) -> str:

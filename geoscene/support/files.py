@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import hashlib
 import importlib
 import json
 import logging
@@ -14,10 +13,6 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
-from importlib import resources
-from importlib.resources.abc import Traversable
-from operator import itemgetter
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -235,38 +230,6 @@ def _try_lock(file: IO[bytes]) -> bool:
     except OSError as error:
         return error.errno not in (errno.EACCES, errno.EAGAIN)
     return True
-
-
-def digest(data: bytes) -> str:
-    """Digest of bytes."""
-    return hashlib.sha256(data).hexdigest()[:20]
-
-
-def digest_of(path: Path) -> str:
-    """Digest of a file's bytes; empty if the file cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:20]
-    except OSError:
-        return ""
-
-
-@cache
-def sources_digest(package: str) -> str:
-    """Digest of the Python sources and TOML tables of a package, such as ``geoscene``, by name."""
-    found = hashlib.sha256()
-    for name, file in sorted(_sources(resources.files(package), ""), key=itemgetter(0)):
-        data = file.read_bytes()
-        found.update(f"{name}\n{len(data)}\n".encode() + data)
-    return found.hexdigest()[:20]
-
-
-def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, Traversable]]:
-    for entry in folder.iterdir():
-        if entry.is_dir():
-            yield from _sources(entry, f"{prefix}{entry.name}/")
-        elif entry.name.endswith((".py", ".toml")):
-            yield prefix + entry.name, entry
 
 
 def write_atomically(path: Path, *data: bytes | NDArray[Any]) -> None:

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import GeosceneError, InputError, MissingExtraError, StorageError, need
-from geoscene.support.files import atomic_path, digest, digest_of, exclusive
+from geoscene.support.digests import digest, file_digest
+from geoscene.support.files import atomic_path, exclusive
 from geoscene.support.progress import Progress, silent
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?")
@@ -96,7 +97,7 @@ class StoredFolder:
         with atomic_path(path) as part:
             with self._reached() as (system, root):
                 system.get_file(f"{root}/{name}", str(part))
-            if self.digests.get(name) not in (None, digest_of(part)):
+            if self.digests.get(name) not in (None, file_digest(part)):
                 raise StorageError(f"{self.url}/{name}: differs from what the build wrote; publish it again")
 
     def local(self, name: str, folder: Path) -> Path:
@@ -182,7 +183,7 @@ class StoredFolder:
         if re.fullmatch("[0-9a-f]{32}", stated):
             with path.open("rb") as file:
                 return hashlib.file_digest(file, "md5").hexdigest() == stated
-        return digest(self.read(name)) == digest_of(path)
+        return digest(self.read(name)) == file_digest(path)
 
     def _each(
         self, work: Callable[[str], None], names: Sequence[str], *, stage: str, progress: Progress

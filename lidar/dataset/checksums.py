@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from geoscene.support.digests import file_sha256
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
 
@@ -51,12 +52,6 @@ class Checksums:
     sha256: dict[str, bytes]
     digest: str
     intact: bool
-
-
-def file_digest(path: Path) -> bytes:
-    """SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").digest()
 
 
 def files_in(folder: Path) -> Iterator[str]:
@@ -101,7 +96,7 @@ def add_to_checksums(folder: Path, *, below: str, known: Mapping[str, bytes]) ->
         return
     start = f"{below}/"
     found = {name: sha for name, sha in read_checksums(path).sha256.items() if not name.startswith(start)}
-    fresh = {start + name: file_digest(folder / below / name) for name in files_in(folder / below)}
+    fresh = {start + name: file_sha256(folder / below / name) for name in files_in(folder / below)}
     write_atomically(path, _to_bytes({**found, **fresh, **known}))
 
 
@@ -141,7 +136,7 @@ def differences(folder: Path, stated: Checksums, *, progress: Progress = silent)
             continue
         path = folder / name
         try:
-            same = path.is_file() and file_digest(path) == stated.sha256[name]
+            same = path.is_file() and file_sha256(path) == stated.sha256[name]
         except OSError as error:
             yield Difference("cannot be read", name, error.strerror or type(error).__name__)
             continue
@@ -155,7 +150,7 @@ def _digests(
 ) -> dict[str, bytes]:
     """SHA-256 of files of a folder."""
     names = filter(own, files_in(folder))
-    return {name: known.get(name) or file_digest(folder / name) for name in names}
+    return {name: known.get(name) or file_sha256(folder / name) for name in names}
 
 
 def _to_bytes(sha256: Mapping[str, bytes]) -> bytes:

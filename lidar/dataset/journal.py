@@ -6,7 +6,7 @@ import csv
 import hashlib
 import threading
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
 from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.digests import digest
 from geoscene.support.files import naming
 from geoscene.typing import Ints
-from lidar.dataset.checksums import file_digest
 
 _HEADER = ("sensor", "frame", "points", "digest")
 _DIGEST = 20
@@ -26,17 +26,9 @@ _DIGEST = 20
 _LARGEST, _DIGITS = 1 << 62, 20
 
 
-def digests_of_files(paths: Iterable[Path]) -> bytes:
-    """SHA-256 of files, one after another; empty if one of them cannot be read."""
-    try:
-        return b"".join(file_digest(path) for path in paths)
-    except OSError:
-        return b""
-
-
 def frame_digest(digests: bytes) -> str:
     """Digest of a frame by the digests of its files; empty without any."""
-    return hashlib.sha256(digests).hexdigest()[:_DIGEST] if digests else ""
+    return digest(digests) if digests else ""
 
 
 @dataclass(frozen=True, slots=True)

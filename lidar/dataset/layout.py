@@ -34,7 +34,8 @@ from pyproj import CRS
 
 from geoscene.errors import reading
 from geoscene.geometry.frames import Frame
-from geoscene.support.files import delete_leftovers, digest, write_json
+from geoscene.support.digests import digest
+from geoscene.support.files import delete_leftovers, write_json
 from geoscene.support.notebooks import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints

@@ -34,7 +34,8 @@ from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
-from geoscene.support.files import digest, digest_of, exclusive, sources_digest, write_atomically
+from geoscene.support.digests import file_digest, sources_digest, value_digest
+from geoscene.support.files import exclusive, write_atomically
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import cache_folder
 from lidar.errors import InputError, LidarError
@@ -105,7 +106,7 @@ class _Map:
         self.place, self.clouds = place, clouds
         self.name = re.sub(r"\.(osm|pbf|gz|bz2|json|o5m)\b", "", path.name) if path else place.place
         self.options = replace(options, name=self.name)
-        self.digest = digest_of(path) if path else self.data.digest
+        self.digest = file_digest(path) if path else self.data.digest
 
     @cached_property
     def data(self) -> OsmData:
@@ -135,9 +136,9 @@ def _folder(source: _Map) -> Path:
     chosen = asdict(replace(source.options, name=""))
     chosen |= {"bbox": place.bbox, "dem": elevation_digests(place.dem)}
     if clouds.cloud:
-        chosen |= asdict(clouds) | {"cloud": [digest_of(Path(name)) for name in clouds.cloud]}
+        chosen |= asdict(clouds) | {"cloud": [file_digest(Path(name)) for name in clouds.cloud]}
     made_of = [sources_digest("geoscene"), SCHEMA, source.digest, place.dem == ("tiles",), chosen]
-    key = digest(json.dumps(made_of).encode())
+    key = value_digest(made_of)
     cache = place.scene_cache or cache_folder() / "scenes"
     slug = re.sub(r"[^\w.-]+", "-", source.name).strip("-.")[:32] or "map"
     return next(iter(sorted(cache.glob(f"*-{key}"))), cache / f"{slug}-{key}")
@@ -193,8 +194,8 @@ class _CachedScene:
 
     def _drive_area(self, scene: Scene) -> Any:
         """The area that the drive needs, as planned in the scene; it holds if the scene covers it."""
-        recipe = json.dumps([sources_digest("lidar"), self.drive.recipe(scene)], default=str, sort_keys=True)
-        known = self.folder / "drives" / f"{digest(recipe.encode())}.wkb"
+        recipe = value_digest([sources_digest("lidar"), self.drive.recipe(scene)])
+        known = self.folder / "drives" / f"{recipe}.wkb"
         with suppress(OSError, shapely.errors.GEOSException):
             return shapely.from_wkb(known.read_bytes())
         self.progress("planning", 0, total=0)

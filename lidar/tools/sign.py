@@ -8,10 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from geoscene.support.digests import file_sha256
 from geoscene.support.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.dataset.checksums import add_to_checksums, file_digest, write_checksums
+from lidar.dataset.checksums import add_to_checksums, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import table_cloud
@@ -202,7 +203,7 @@ def frame_rate(dataset: Dataset, sensor: str) -> float:
 
 def frame_digests(folder: Path, names: list[str], *, rate_hz: float) -> FrameDigests:
     """Digests of the files of a frame."""
-    sha256 = {name: file_digest(folder / name) for name in names}
+    sha256 = {name: file_sha256(folder / name) for name in names}
     found = {name: _cloud_blocks(folder / name, rate_hz=rate_hz) for name in names}
     return FrameDigests(sha256, {name: blocks for name, blocks in found.items() if blocks is not None})
 
@@ -242,7 +243,7 @@ def _chain(
             done += 1
         write_atomically(folder / f"{sensor}.csv", links_bytes(links))
         heads[sensor] = len(links), head
-    tables = {name: file_digest(dataset.path / name) for name in files.others}
+    tables = {name: file_sha256(dataset.path / name) for name in files.others}
     document = {
         "schema": SCHEMA,
         "algorithm": signer.algorithm,

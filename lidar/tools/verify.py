@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from geoscene.scene.layout import SceneFiles
-from geoscene.support.files import digest
+from geoscene.support.digests import digest, file_sha256
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
 from geoscene.typing import Ints
-from lidar.dataset.checksums import CHECKSUMS, differences, file_digest, read_checksums
+from lidar.dataset.checksums import CHECKSUMS, differences, read_checksums
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.signable import is_truth, signed_files
 from lidar.errors import DatasetError, InputError, LidarError
@@ -377,7 +377,7 @@ def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[s
         path = _inside(dataset, name)
         if path is None or not path.is_file():
             found.append(Finding("missing", name))
-        elif file_digest(path) != sha256:
+        elif file_sha256(path) != sha256:
             found.append(Finding("changed", name))
     return found
 
@@ -462,7 +462,7 @@ def _files_found(
             if path is None or not path.is_file():
                 yield Finding("missing", name, **where)
                 continue
-            got = file_digest(path)
+            got = file_sha256(path)
             if got == sha256:
                 continue
             other = frame_of.get((Path(name).parent.as_posix(), got))

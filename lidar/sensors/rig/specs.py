@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
+from geoscene.support.digests import recipe_digest
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, RigError
 from lidar.geometry.attitude import quat_from_euler, quat_product
@@ -331,7 +331,7 @@ def rig_digest(name: str | Path) -> str:
     Raises RigError as `load_rig` does, and for a scanner's file that cannot be read.
     """
     rig = load_rig(name)
-    inside, digest = resources.files("lidar.sensors.rig"), hashlib.blake2b(digest_size=6)
+    inside = resources.files("lidar.sensors.rig")
     parts: list[bytes] = []
     try:
         own = Path(name) if str(name).endswith(".toml") else inside / "rigs" / f"{name}.toml"
@@ -345,9 +345,7 @@ def rig_digest(name: str | Path) -> str:
             parts += [(Path(spec.preset).parent / listed).read_bytes()] if listed else []
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise RigError(f"rig {name}: a sensor's file cannot be read: {error}") from error
-    for part in parts:
-        digest.update(len(part).to_bytes(8) + part)
-    return digest.hexdigest()
+    return recipe_digest(b"".join(len(part).to_bytes(8) + part for part in parts))
 
 
 def names_folder(name: str) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
+from geoscene.support.digests import recipe_digest
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -298,9 +298,9 @@ def point_of(place: str, *, geo: Frame, at: Situation) -> Float:
     return np.array([x, y, height + (0.0 if at.ground is None else at.ground(x, y))])
 
 
-def file_digest(file: str, *, known: str) -> str:
+def checked_digest(file: str, *, known: str) -> str:
     """Digest of a file's bytes, empty without a file; raises InputError if another one is known."""
-    found = hashlib.blake2b(Path(file).read_bytes(), digest_size=6).hexdigest() if file else ""
+    found = recipe_digest(Path(file).read_bytes()) if file else ""
     if known and found != known:
         raise InputError(f"{file}: has changed since the drive (digest {found}, was {known})")
     return found

@@ -15,7 +15,7 @@ from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.camera.shade import linear_table
 from lidar.sensors.rig.camera_model import pixel_rays
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.signal.attacks.attacker import degrees_of, file_digest, point_of
+from lidar.signal.attacks.attacker import checked_digest, degrees_of, point_of
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, parameter
 
@@ -90,7 +90,7 @@ class Patch(Stage):
         """Validate the parameters; the picture must be readable."""
         super().__post_init__()
         _picture(self.file)
-        object.__setattr__(self, "digest", file_digest(self.file, known=self.digest))
+        object.__setattr__(self, "digest", checked_digest(self.file, known=self.digest))
         if self.place:
             degrees_of(self.place)
 

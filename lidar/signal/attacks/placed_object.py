@@ -16,7 +16,7 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
-from lidar.signal.attacks.attacker import file_digest
+from lidar.signal.attacks.attacker import checked_digest
 from lidar.signal.registry import Stages
 from lidar.signal.stage import Stage, parameter
 from lidar.world.actor_shapes import ActorShape
@@ -70,7 +70,7 @@ class PlacedObject(Stage):
         """Validate the parameters and read the mesh."""
         super().__post_init__()
         _read_mesh(self.mesh)
-        object.__setattr__(self, "digest", file_digest(self.mesh, known=self.digest))
+        object.__setattr__(self, "digest", checked_digest(self.mesh, known=self.digest))
         if self.place:
             _position(self.place)
 

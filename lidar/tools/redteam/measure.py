@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from geoscene import __version__
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
-from geoscene.support.files import digest_of, write_json
+from geoscene.support.digests import file_digest
+from geoscene.support.files import write_json
 from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.boxes import read_boxes
@@ -102,7 +103,7 @@ def kept(case: AttackCase) -> dict[str, Any] | None:
 def _key(case: AttackCase) -> str:
     drives = [Paths(path).journal for path in (case.path, case.twin) if path is not None]
     identity = read_detector(case.detector).identity
-    made_of = [__version__, case.score, identity, [digest_of(path) for path in drives]]
+    made_of = [__version__, case.score, identity, [file_digest(path) for path in drives]]
     return json.dumps([*made_of, [named.to_json() for named in case.defences]])
 
 

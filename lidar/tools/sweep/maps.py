@@ -20,7 +20,8 @@ from geoscene.scene.layout import changed_files
 from geoscene.sources import read_osm, with_elevation
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.console import DEFAULTS, guard_numbers
-from geoscene.support.files import digest_of, sources_digest, write_json
+from geoscene.support.digests import file_digest, sources_digest
+from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import cache_folder
 from lidar.errors import InputError
@@ -63,7 +64,7 @@ class MapScene:
             "program": sources_digest("geoscene"),
             "bounds": self.bounds,
             "options": asdict(self.options),
-            "files": {str(path): digest_of(path) for path in self.inputs},
+            "files": {str(path): file_digest(path) for path in self.inputs},
         }
         if not _is_made_of(target, stamp, made_of=made_of):
             data = read_osm(self.osm, bounds=self.bounds)

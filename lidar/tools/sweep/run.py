@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import time
@@ -20,7 +19,8 @@ from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
 from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.csv_tables import write_columns
-from geoscene.support.files import digest_of, exclusive, write_json
+from geoscene.support.digests import digest, file_digest
+from geoscene.support.files import exclusive, write_json
 from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.journal import read_journal
@@ -276,7 +276,7 @@ def _record_drive(task: _Task) -> tuple[int, DriveRow]:
         points=sum(done.points.values()),
         seconds=done.duration,
         metres=round(done.length, 3),
-        digest=digest_of(Paths(out).journal),
+        digest=file_digest(Paths(out).journal),
         files=_digest_of_folder(out),
         picked=task.pick.label if task.pick else "",
         reached=checked.reached.reached.to_text("are") if checked.reached else "",
@@ -304,8 +304,8 @@ def _is_unchanged(task: _Task, scene: Scene, *, options: DriveOptions) -> bool:
 def _digest_of_folder(folder: Path) -> str:
     """Digest of the names and contents of all files in a folder."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    text = "".join(f"{path.relative_to(folder)} {digest_of(path)}\n" for path in files)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
+    text = "".join(f"{path.relative_to(folder)} {file_digest(path)}\n" for path in files)
+    return digest(text.encode())
 
 
 class _Table:

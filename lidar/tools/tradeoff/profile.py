@@ -19,7 +19,8 @@ from typing import Any
 from geoscene import __version__
 from geoscene.errors import reading
 from geoscene.scene import Scene
-from geoscene.support.files import digest, write_json
+from geoscene.support.digests import value_digest
+from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import cache_folder
 from lidar.errors import InputError
@@ -214,7 +215,7 @@ def _key(scene: Scene, options: DriveOptions, *, ladders: Ladders, own_course: b
 
 
 def _path(folder: Path, key: dict[str, Any]) -> Path:
-    return folder / f"{digest(json.dumps(key, sort_keys=True).encode())}.json"
+    return folder / f"{value_digest(key)}.json"
 
 
 def _read(folder: Path, key: dict[str, Any]) -> Profile | None:

@@ -18,7 +18,7 @@ from geoscene.ground.terrain import open_terrain
 from geoscene.options import BuildOptions, CloudOptions
 from geoscene.pipeline.build import build
 from geoscene.sources.data import Area, OsmData, TaggedNode, Way
-from geoscene.support.files import digest_of
+from geoscene.support.digests import file_digest
 
 CENTRE = (9.5, 47.1)
 FRAME = Frame.at(*CENTRE)
@@ -118,7 +118,7 @@ def test_heights_roofs_trees_and_ground_of_a_village_are_measured(cloud_file, tm
 
     scene = build(osm, tmp_path / "scene", options=options)
     assert scene.manifest["heights"] == {"cloud": 3, "inferred-neighbours": 1}
-    assert scene.manifest["cloud"]["files"][0]["digest"] == digest_of(cloud_file)
+    assert scene.manifest["cloud"]["files"][0]["digest"] == file_digest(cloud_file)
     row = next(row for row in scene.manifest["sources"] if row["kind"] == "cloud")
     assert row["licence"] == "CC-BY-4.0"
     assert scene.manifest["counts"]["trees"] == 2

@@ -22,7 +22,7 @@ from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
-from geoscene.support.files import sources_digest
+from geoscene.support.digests import sources_digest
 from geoscene.support.processes import run_tasks
 
 SMALL, BOX = (24.9430, 60.1669, 24.9455, 60.1684), (24.9425, 60.1665, 24.9465, 60.1690)
