@@ -27,7 +27,7 @@ from lidar.sensors.laser.scan import cast, measure
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.run import Altered, altered_sweep, cloud_truth
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 from lidar.simulation.frame_loop import chunks
 from lidar.simulation.plan import DrivePlan, plan_drive
 from lidar.simulation.recording import Recording
@@ -59,13 +59,13 @@ class Side:
     def __init__(self, plan: DrivePlan, options: DriveOptions) -> None:
         self.recording: Recording = replace(plan, options=options).recording(Path("unwritten"))
         self.scanner = next(sensor for sensor in plan.sensors if isinstance(sensor, Scanner))
-        self._worlds = Worlds(plan.scene, plan.max_range, settings=self.recording.contents.world)
+        self._worlds = Worlds(plan.scene, plan.max_range, settings=self.recording.settings.world)
         _, region = next(iter(chunks(plan.jobs, plan.trajectory)))
         self._worlds.follow(region)
 
     def frame(self, frame: int) -> Altered | None:
         """A frame; None in clear air."""
-        scanner, contents = self.scanner, self.recording.contents
+        scanner, settings = self.scanner, self.recording.settings
         world = self._worlds.during(*scanner.sensor.window_ns(frame))
         sweep = cast(
             scanner.sensor,
@@ -73,14 +73,14 @@ class Side:
             trajectory=self.recording.trajectory,
             world=world,
             frame=frame,
-            seed=contents.seed,
-            settings=contents.scanner,
+            seed=settings.seed,
+            settings=settings.scanner,
         )
-        if not contents.stages.at("echoes", scanner.name):
+        if not settings.stages.at("echoes", scanner.name):
             measure(sweep)
             return None
         at = situation_of(self.recording, scanner, frame=frame, world=world)
-        return altered_sweep(sweep, contents.stages, at=at)
+        return altered_sweep(sweep, settings.stages, at=at)
 
 
 def timed(work: Callable[[], Any]) -> tuple[float, Any]:

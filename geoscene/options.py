@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from geoscene.errors import InputError
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
+from geoscene.support.registry import unknown_name
 from geoscene.uses import USES
 
 RELIEFS = ("off", "plain", "full")
@@ -83,7 +84,7 @@ class BuildOptions:
         if self.lod not in (0, 1, 2):
             raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.relief not in RELIEFS:
-            raise InputError(f"`relief` {self.relief}: {', '.join(RELIEFS[:-1])} or {RELIEFS[-1]}")
+            raise InputError(unknown_name("`relief`", self.relief, known=RELIEFS))
         if self.dem_gaps not in ("error", "nearest"):
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
@@ -91,9 +92,9 @@ class BuildOptions:
         if self.dem_tolerance is not None and not self.dem:
             raise InputError("`dem_tolerance`: has no effect without `dem`; leave it out")
         if unknown := sorted(set(self.only) - set(KINDS)):
-            raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(KINDS)}")
+            raise InputError(unknown_name("`only`", unknown[0], known=KINDS))
         if self.use not in USES:
-            raise InputError(f"`use` {self.use}: one of {', '.join(USES)}")
+            raise InputError(unknown_name("`use`", self.use, known=USES))
         if self.driving_side not in ("", "left", "right"):
             raise InputError(f"`driving_side` {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:

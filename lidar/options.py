@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
-from difflib import get_close_matches
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -19,9 +19,11 @@ from geoscene.classes import Class
 from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.digests import recipe_digest
+from geoscene.support.registry import unknown_name
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
+from lidar.grammar import split_pairs
 from lidar.sensors.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
@@ -35,12 +37,11 @@ if TYPE_CHECKING:
     from lidar.traffic.fcd import TrafficFile
     from lidar.traffic.populate import TrafficOptions
 
-    WeatherList = tuple[WeatherSetting, ...]
     Traffic = TrafficOptions | TrafficFile
     StageList = tuple[NamedStage, ...]
 else:  # types that help shows; converters make the values, whose classes take a second to import; Any, as
     # cyclopts checks values against these types where pydantic is imported
-    Spec, Traffic, StageList, WeatherList = (list[str] | Any, str | Any, *(tuple[str, ...] | Any,) * 2)
+    Spec, Traffic, StageList = (list[str] | Any, str | Any, tuple[str, ...] | Any)
 
 OUTPUT = Group("Output", sort_key=3)
 
@@ -73,6 +74,9 @@ FILM_COLORS = ("class", "height", "intensity", "time", "origin")
 
 METHODS = ("kiss-icp", "genz-icp", "small_gicp", "orb", "orb+depth", "stereo", "fused")
 """Methods of odometry."""
+
+FUSE = ("harmonic", "max", "fisher", "none")
+"""Verdicts of several defences together."""
 
 ECHOES = ("all", "first", "last", "single")
 """Echoes of a pulse that a map can be made of."""
@@ -167,17 +171,16 @@ def _lower(_: object, tokens: Sequence[Token]) -> str:
     return tokens[0].value.lower()
 
 
-def _name_of(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
-    """Names in lower case, each with parameters as they are: values may be paths."""
-    pairs = (text.strip().partition(":") for text in tokens[0].value.split(",") if text.strip())
-    return tuple(name.lower() + colon + rest for name, colon, rest in pairs)
+def _texts(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    return tuple(token.value for token in tokens)
 
 
-NAMED = Parameter(converter=_name_of, n_tokens=1, metavar="NAME,...")
+NAMED = Parameter(converter=_texts, n_tokens=1, metavar="NAME,...")
+"""Parameter of an option that takes names with parameters, ``NAME:KEY=VALUE,KEY=VALUE``, as texts."""
 
 
 def _settings(_: object, tokens: Sequence[Token]) -> tuple[tuple[str, str], ...]:
-    return tuple(_pair(token.value) for token in tokens)
+    return tuple(pair for token in tokens for pair in split_pairs(token.value))
 
 
 def _stages(_: object, tokens: Sequence[Token]) -> Any:
@@ -193,7 +196,7 @@ def _attacks(_: object, tokens: Sequence[Token]) -> Any:
 
 
 def _weather(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.signal.weather.setting import read_weather  # noqa: PLC0415
+    from lidar.signal.weather.read import read_weather  # noqa: PLC0415
 
     return tuple(setting for token in tokens for setting in read_weather(token.value))
 
@@ -203,13 +206,11 @@ _ATTACK = Parameter(name="--attack", converter=_attacks, n_tokens=1, accepts_key
 _WEATHER = Parameter(name="--weather", converter=_weather, n_tokens=1, accepts_keys=False, metavar="WEATHER")
 
 
-def chosen_stages(
-    weather: Iterable[WeatherSetting], attacks: Iterable[NamedStage], *, stages: Iterable[NamedStage]
-) -> tuple[NamedStage, ...]:
+def chosen_stages(*groups: Iterable[NamedStage]) -> tuple[NamedStage, ...]:
     """All stages in the order in which they act: weather, attacks, others."""
-    from lidar.signal.registry import number_stages, read_stage  # noqa: PLC0415
+    from lidar.signal.registry import number_stages  # noqa: PLC0415
 
-    return number_stages([*(read_stage(setting.table()) for setting in weather), *attacks, *stages])
+    return number_stages(chain.from_iterable(groups))
 
 
 def with_stage_settings(
@@ -221,50 +222,10 @@ def with_stage_settings(
     return (*dict.fromkeys(pair for pair in by_stages if pair[0] not in given), *settings)
 
 
-def _pair(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"{text}: give NAME=VALUE, such as rays=7")
-    return name.strip(), value.strip()
-
-
 def _traffic(_: object, tokens: Sequence[Token]) -> Any:
-    text = tokens[0].value
-    if text == "off":
-        return None
-    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415
-    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
-    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
+    from lidar.traffic.read import read_traffic  # noqa: PLC0415
 
-    if text == "on":
-        return TrafficOptions()
-    first, *rest = text.split(",")
-    densities = dict.fromkeys(("vehicles", "cyclists", "pedestrians", "parked", "radius"), float)
-    if first.lower().endswith((".xml", ".xml.gz")):
-        of_file = {"net": Path, "begin": float, "parked": float, "radius": float}
-        return TrafficFile(Path(first), **_values(text, rest, known=of_file))
-    if first == "sumo":
-        return SumoOptions(**_values(text, rest, known=densities))
-    return TrafficOptions(**_values(text, [first, *rest], known=densities))
-
-
-def _values(text: str, words: Sequence[str], *, known: dict[str, Any]) -> dict[str, Any]:
-    """Values by name of words NAME=VALUE of an option's text."""
-    values: dict[str, Any] = {}
-    for word in words:
-        name, equals, value = (part.strip() for part in word.partition("="))
-        if name not in known:
-            raise ValueError(f"{text}: {name or 'nothing'} is none of on, off, sumo, {', '.join(known)}")
-        if not equals or not value:
-            raise ValueError(f"{text}: give a value for {name}, as in {name}={_EXAMPLES[known[name]]}")
-        try:
-            values[name] = known[name](value)
-        except ValueError:
-            raise ValueError(f"{text}: {name} = {value} is not a number") from None
-    return values
-
-
-_EXAMPLES = {float: "0.5", Path: "map.net.xml"}
+    return read_traffic(tokens[0].value)
 
 
 _ROADS = ("dry", "by-weather", "wet", "snow", "ice")
@@ -351,16 +312,17 @@ class DriveOptions:
     traffic: Annotated[
         Traffic | None, Parameter(converter=_traffic, n_tokens=1, accepts_keys=False, metavar="STR")
     ] = None
-    """Other road users: on, or densities such as vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles
-    and cyclists per km of lane, pedestrians per km of sidewalk, parked as a share of the places); sumo or
-    sumo,vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output wrote, with
-    net=FILE.net.xml, begin=SECONDS, parked=0.6 as needed."""
+    """Other road users: on, on:vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles and cyclists per km
+    of lane, pedestrians per km of sidewalk, parked as a share of the places; on: may be left out);
+    sumo:vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output wrote,
+    FILE.xml:net=FILE.net.xml,begin=SECONDS,parked=0.6 as needed."""
 
     settings: Annotated[
         tuple[tuple[str, str], ...],
         Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
     ] = ()
-    """One setting that differs from the fidelity level; repeat for more. lidar settings lists them."""
+    """Settings that differ from the fidelity level: NAME=VALUE,NAME=VALUE, or repeat. lidar settings
+    lists them."""
 
     relief: str = ""
     """What is used of the relief of surfaces, short for --set relief: off (walls are planes and the ground is
@@ -373,9 +335,9 @@ class DriveOptions:
 
     stages: Annotated[StageList, _STAGE] = ()
     """Change echoes, clouds, images, fixes or inertial samples by a stage: NAME, NAME:KEY=VALUE,KEY=VALUE or
-    a TOML file with tables [[stage]]; repeat for more. lidar stages lists them."""
+    a TOML file with tables [[stage]]; several separated by commas, or repeat. lidar stages lists them."""
 
-    weather: Annotated[WeatherList, _WEATHER] = ()
+    weather: Annotated[StageList, _WEATHER] = ()
     """Weather for all sensors: rain=10mm/h, fog=50m (visibility), snow=2mm/h (as water), dust, spray, several
     separated by commas, or a TOML file with tables [[weather]] of time and place; repeat for more. Echoes
     that are too weak are then lost at every fidelity level (--set link=on)."""
@@ -406,7 +368,7 @@ class DriveOptions:
         if self.duration is not None and not 0.1 <= self.duration <= 86400:
             raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
         if self.side not in ("", "left", "right"):
-            raise InputError(f"`side` {self.side}: left or right")
+            raise InputError(unknown_name("`side`", self.side, known=("left", "right")))
         if not 1 <= self.workers <= 256:
             raise InputError(f"`workers` {self.workers}: give 1 to 256")
         if not 0 <= self.seed < 1 << 63:
@@ -416,7 +378,7 @@ class DriveOptions:
         if not 0 <= self.overlap < 1:
             raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
         if self.road not in _ROADS:
-            raise InputError(f"`road` {self.road}: one of {', '.join(_ROADS)}")
+            raise InputError(unknown_name("`road`", self.road, known=_ROADS))
         if self.road == "by-weather" and not self._weather():
             raise InputError("`road` by-weather: give `weather`, too")
         _ = self.recording_settings
@@ -432,7 +394,7 @@ class DriveOptions:
         ground = self.recording_settings.world
         return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)
 
-    def _weather(self) -> WeatherList:
+    def _weather(self) -> tuple[WeatherSetting, ...]:
         """Weather among the stages."""
         from lidar.signal.weather.setting import WeatherSetting  # noqa: PLC0415
 
@@ -472,9 +434,7 @@ class DriveOptions:
     @property
     def all_stages(self) -> StageList:
         """Weather, attacks and other stages in the order in which they act."""
-        if not (self.weather or self.attacks):
-            return self.stages
-        return chosen_stages(self.weather, self.attacks, stages=self.stages)
+        return chosen_stages(self.weather, self.attacks, self.stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
         """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""
@@ -792,7 +752,7 @@ class MapOptions:
         """Validate the options."""
         for name, known in (("color", COLORS), ("echo", ECHOES), ("tile_format", TILE_FORMATS)):
             if getattr(self, name) not in known:
-                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
+                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
         for name in ("voxel", "resolution"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
@@ -810,7 +770,7 @@ class MapOptions:
         classes_of(self.only, option="only")
         for name, words in (("origin", ORIGINS), ("raster", RASTERS)):
             if unknown := [word for word in getattr(self, name) if word not in words]:
-                raise InputError(f"`{name}` {unknown[0]}: one of {', '.join(words)}")
+                raise InputError(unknown_name(f"`{name}`", unknown[0], known=words))
         if self.poses != "truth" and not self.poses.lower().endswith(".tum"):
             raise InputError(
                 f"`poses` {self.poses}: give truth or FILE.tum; lidar odometry --method fused writes"
@@ -856,7 +816,7 @@ class OdometryOptions:
         tuple[tuple[str, str], ...],
         Parameter(name="--set", converter=_settings, n_tokens=1, metavar="NAME=VALUE"),
     ] = ()
-    """One setting of the method; repeat for more. docs/reference/odometry.md lists them."""
+    """Settings of the method: NAME=VALUE,NAME=VALUE, or repeat. lidar settings lists them."""
 
     settings_file: Path | None = None
     """TOML file of settings; --set goes before it."""
@@ -864,12 +824,12 @@ class OdometryOptions:
     def __post_init__(self) -> None:
         """Validate the options."""
         if self.method not in METHODS:
-            raise InputError(f"`method` {self.method}: one of {', '.join(METHODS)}")
+            raise InputError(unknown_name("`method`", self.method, known=METHODS))
         others = [name for name in METHODS if name != "fused"]
         if self.relative not in ("", "none", *others):
-            raise InputError(f"`relative` {self.relative}: none, or one of {', '.join(others)}")
+            raise InputError(unknown_name("`relative`", self.relative, known=["none", *others]))
         if self.imu_grade not in ("", *PRESETS):
-            raise InputError(f"`imu_grade` {self.imu_grade}: one of {', '.join(PRESETS)}")
+            raise InputError(unknown_name("`imu_grade`", self.imu_grade, known=PRESETS))
         if self.method != "fused" and (self.relative or self.imu_grade):
             raise InputError("`relative` and `imu_grade` are for the `method` fused")
         if self.method == "fused" and self.start_pose is not None:
@@ -971,7 +931,7 @@ class FilmOptions:
         """Validate the options."""
         for name, known in (("show", SHOWN), ("view", FILM_VIEWS), ("color", FILM_COLORS)):
             if getattr(self, name) not in known:
-                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
+                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
         _ = self.limits
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
@@ -1033,7 +993,7 @@ class EvaluateOptions:
             ("associate", ("interpolated", "nearest")),
         ):
             if getattr(self, name) not in known:
-                raise InputError(f"`{name}` {getattr(self, name)}: one of {', '.join(known)}")
+                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
         if self.max_gap is not None and not 0 <= self.max_gap < math.inf:
             raise InputError(f"`max_gap` {self.max_gap:g}: give seconds, 0 or more")
         for word in self.delta:
@@ -1061,7 +1021,7 @@ class ApplyOptions:
     sensor: str = ""
     """Scanner of KITTI's or nuScenes' clouds: a preset or a TOML file; hdl64e_s2 or hdl32e by default."""
 
-    weather: Annotated[WeatherList, _WEATHER] = ()
+    weather: Annotated[StageList, _WEATHER] = ()
     """Weather for all sensors: rain=10mm/h, fog=50m (visibility), snow=2mm/h (as water), dust, spray, several
     separated by commas, or a TOML file with tables [[weather]]; repeat for more."""
 
@@ -1077,7 +1037,7 @@ class ApplyOptions:
     @property
     def all_stages(self) -> StageList:
         """Weather, attacks and other stages in the order in which they act."""
-        return chosen_stages(self.weather, self.attacks, stages=self.stages)
+        return chosen_stages(self.weather, self.attacks, self.stages)
 
 
 @Parameter(name="*")
@@ -1086,8 +1046,8 @@ class DefendOptions:
     """Options of defences on recorded data."""
 
     defences: Annotated[tuple[str, ...], Parameter(name="--defence"), NAMED]
-    """Defences, separated by commas: NAME or NAME:KEY=VALUE:KEY=VALUE, or all that the data allow; lidar
-    defences lists them."""
+    """Defences, separated by commas: NAME or NAME:KEY=VALUE,KEY=VALUE, or all that the data allow; or a TOML
+    file with tables [[defence]]. lidar defences lists them."""
 
     scene: Path | None = None
     """Scene that the map defence compares with; by default the one that the dataset was driven in."""
@@ -1112,8 +1072,8 @@ class DefendOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.fuse not in ("harmonic", "max", "fisher", "none"):
-            raise InputError(f"`fuse` {self.fuse}: harmonic, max, fisher or none")
+        if self.fuse not in FUSE:
+            raise InputError(unknown_name("`fuse`", self.fuse, known=FUSE))
         if self.calibrate and (self.fuse != "harmonic" or self.calibration is not None):
             raise InputError("`calibrate`: leave out `fuse` and `calibration`")
         if not 0 <= self.seed < 1 << 63:
@@ -1143,7 +1103,7 @@ class DenoiseOptions:
     """Options of filters on recorded clouds."""
 
     methods: Annotated[tuple[str, ...], Parameter(name="--method"), NAMED]
-    """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE:KEY=VALUE.
+    """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE,KEY=VALUE.
     docs/reference/weather.md lists their parameters."""
 
 
@@ -1156,12 +1116,10 @@ def classes_of(names: Iterable[str], *, option: str = "without") -> list[int]:
     """
     vehicles = [k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST and k != Class.PEDESTRIAN]
     known = {k.name.lower(): [k] for k in Class} | {"vehicles": vehicles}
-    if unknown := [name for name in names if name not in known]:
-        near = get_close_matches(unknown[0], known, 3, 0.6)
-        hint = f"is {' or '.join(near)} meant? " if near else ""
-        raise InputError(
-            f"`{option}` {unknown[0]}: {hint}lidar classes lists all names; vehicles is one, too"
-        )
+    for name in names:
+        if name not in known:
+            remedy = "lidar classes lists all names; vehicles is one, too"
+            raise InputError(unknown_name(f"`{option}`", name, known=known, remedy=remedy))
     return [int(code) for name in names for code in known[name]]
 
 

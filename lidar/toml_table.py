@@ -6,11 +6,11 @@ import re
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from geoscene.support.registry import near_name, unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import RigError
 
@@ -59,9 +59,7 @@ class Table:
         if key in self.data:
             return self.data[key]
         if default is ...:
-            near = get_close_matches(key, self.data, 1, 0.75)
-            hint = f"; is {near[0]} a misspelling of it?" if near else ""
-            raise self.error(key, f"this key is missing{hint}")
+            raise self.error(key, f"this key is missing{near_name(key, self.data)}")
         return default
 
     def number(
@@ -99,7 +97,7 @@ class Table:
         if not isinstance(value, str):
             raise self.error(key, f"{value!r} is not a string")
         if (known := tuple(among)) and value not in known:
-            raise self.error(key, f"{value!r} is not known; known are {', '.join(known)}")
+            raise self.error(key, unknown_name("value", value, known=known))
         return value
 
     def texts(self, key: str, default: Any = ..., *, among: Iterable[str] = ()) -> tuple[str, ...]:
@@ -108,7 +106,7 @@ class Table:
         if not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
             raise self.error(key, f"{value!r} is not a list of strings")
         if known and (strange := [v for v in value if v not in known]):
-            raise self.error(key, f"{strange[0]!r} is not known; known are {', '.join(known)}")
+            raise self.error(key, unknown_name("value", strange[0], known=known))
         return tuple(value)
 
     def flag(self, key: str, default: Any = ...) -> bool:
@@ -166,10 +164,7 @@ class Table:
         """Raise RigError for keys that were never read."""
         for key in self.data:
             if key not in self.read:
-                near = get_close_matches(key, self.read, 1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-                known = ", ".join(dict.fromkeys(self.read))
-                raise self.error(key, f"unknown key{hint} (known are {known})")
+                raise self.error(key, unknown_name("key", key, known=dict.fromkeys(self.read)))
 
 
 def read_table(path: Path | Any, *, name: str = "") -> Table:

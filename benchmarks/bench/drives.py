@@ -121,14 +121,14 @@ def _posed(plan: DrivePlan, scanner: Scanner, fired: Firings) -> tuple[Poses, In
 def _image_sides(plan: DrivePlan, *, images: tuple[str, ...] = ()) -> dict[str, Work]:
     """Images of the kinds that the rig asks for, or of others, and their rays alone."""
     world, (camera,) = world_of(plan), plan.sensors
-    spec, contents = camera.spec, plan.options.contents()
+    spec, settings = camera.spec, plan.options.recording_settings
     spec = replace(spec, images=images or spec.images)
     x, y = plan.trajectory.position[0, :2].tolist()
     sun = sun_direction(plan.scene.frame, plan.start, at=(x, y))
 
     def rendered() -> None:
         for frame in range(plan.frames[camera.name]):
-            times = exposure_times(spec, camera.frame_start_ns(frame), samples=contents.camera.moments(spec))
+            times = exposure_times(spec, camera.frame_start_ns(frame), samples=settings.camera.moments(spec))
             render(
                 spec,
                 plan.trajectory.at(times).mounted(spec.mount.translation, spec.mount.rotation),
@@ -136,7 +136,7 @@ def _image_sides(plan: DrivePlan, *, images: tuple[str, ...] = ()) -> dict[str, 
                 sun=sun,
                 times=None,
                 random=generator(0, camera.name, frame, "image"),
-                options=contents.camera.options(spec),
+                options=settings.camera.options(spec),
             )
 
     u, v = np.meshgrid(np.arange(spec.width) + 0.5 - spec.cx, np.arange(spec.height) + 0.5 - spec.cy)

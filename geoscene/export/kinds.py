@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from geoscene.options import ExportOptions
 from geoscene.scene import Scene
 from geoscene.support.files import exclusive
 from geoscene.support.progress import Progress, silent
+from geoscene.support.registry import Registry, load
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,37 +37,41 @@ def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: 
     return ExportFormat(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside)
 
 
-KINDS: dict[str, ExportFormat] = {
-    "cityjson": _kind(
-        "CityJSON 2.0",
-        "cityjson:write_cityjson",
-        suffixes=".city.json .cityjson",
-        options="crs layers relief",
-    ),
-    "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers relief"),
-    "3dtiles": _kind(
-        "3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset relief"
-    ),
-    "obj": _kind(
-        "Wavefront OBJ and MTL",
-        "triangles:write_obj",
-        suffixes=".obj",
-        options="layers relief",
-        beside=".mtl",
-    ),
-    "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief"),
-    "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers relief"),
-    "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
-    "geojson": _kind("GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers"),
-    "geoparquet": _kind(
-        "GeoParquet", "vector:write_geoparquet", suffixes=".parquet .geoparquet", options="crs layers"
-    ),
-    "geotiff": _kind(
-        "GeoTIFF", "raster:write_geotiff", suffixes=".tif .tiff", options="layers model resolution"
-    ),
-    "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", suffixes=".xodr"),
-    "sumo": _kind("SUMO network", "sumo:write_sumo", suffixes=".net.xml"),
-}
+KINDS: Registry[ExportFormat] = Registry(
+    "`kind`",
+    {
+        "cityjson": _kind(
+            "CityJSON 2.0",
+            "cityjson:write_cityjson",
+            suffixes=".city.json .cityjson",
+            options="crs layers relief",
+        ),
+        "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers relief"),
+        "3dtiles": _kind(
+            "3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset relief"
+        ),
+        "obj": _kind(
+            "Wavefront OBJ and MTL",
+            "triangles:write_obj",
+            suffixes=".obj",
+            options="layers relief",
+            beside=".mtl",
+        ),
+        "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief"),
+        "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers relief"),
+        "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
+        "geojson": _kind("GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers"),
+        "geoparquet": _kind(
+            "GeoParquet", "vector:write_geoparquet", suffixes=".parquet .geoparquet", options="crs layers"
+        ),
+        "geotiff": _kind(
+            "GeoTIFF", "raster:write_geotiff", suffixes=".tif .tiff", options="layers model resolution"
+        ),
+        "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", suffixes=".xodr"),
+        "sumo": _kind("SUMO network", "sumo:write_sumo", suffixes=".net.xml"),
+    },
+    error=InputError,
+)
 """All formats by name."""
 
 
@@ -97,9 +101,7 @@ def export_scene(
     """
     out = Path(out)
     name = kind_of(out) if options.kind is None else options.kind
-    if name not in KINDS:
-        raise InputError(f"`kind` {name}: there are {', '.join(KINDS)}")
-    kind = KINDS[name]
+    kind = KINDS.find(name)
     others = [suffix for other in KINDS.values() for suffix in other.suffixes if suffix not in kind.suffixes]
     if out.name.lower().endswith(tuple(others)):
         known = " or ".join(kind.suffixes) or "a folder"
@@ -120,8 +122,7 @@ def export_scene(
         raise InputError(f"{out}: is a folder; {kind.title} needs a file name")
     if scene.has_tiles:
         scene.require("tables")
-    module, function = kind.writer.split(":")
-    write = getattr(importlib.import_module(f"geoscene.export.{module}"), function)
+    write = load(f"geoscene.export.{kind.writer}")
     with exclusive(out) if kind.suffixes else nullcontext():  # writers of folders see to that
         summary: Summary = write(scene, out, **given, progress=progress)
     return replace(summary, notes=(*summary.notes, _relief_note(scene))) if modelled else summary

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from geoscene.errors import InputError
 from geoscene.sources.data import Bounds, Credit, OsmData, Progress, Tags
 from geoscene.sources.tags import is_building
+from geoscene.support.registry import Registry, load, unknown_name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,37 +46,53 @@ _TERRAIN_TILES = (
     " Survey"
 )
 
-SOURCES: dict[str, MapSourceKind] = {
-    source.name: source
-    for source in (
-        MapSourceKind(
-            name="osm",
-            gives="map",
-            suffixes=(".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".o5m", ".json", ".json.gz", ".json.bz2"),
-            reader="files:read_osm",
-            licence="ODbL-1.0",
-            attribution=_OSM,
+_SOURCES = (
+    MapSourceKind(
+        name="osm",
+        gives="map",
+        suffixes=(
+            ".osm",
+            ".osm.gz",
+            ".osm.bz2",
+            ".osm.pbf",
+            ".o5m",
+            ".json",
+            ".json.gz",
+            ".json.bz2",
         ),
-        MapSourceKind(
-            name="overpass", gives="map", reader="network:fetch_bbox", licence="ODbL-1.0", attribution=_OSM
-        ),
-        MapSourceKind(
-            name="terrain-tiles",
-            gives="heights",
-            reader="elevation:fetch_elevation",
-            licence="open licences of several providers, named in the attribution",
-            attribution=_TERRAIN_TILES,
-        ),
-        MapSourceKind(
-            name="overture",
-            gives="buildings",
-            suffixes=(".parquet", ".geoparquet"),
-            reader="overture:read_overture",
-            licence="ODbL-1.0",
-            attribution="(c) Overture Maps Foundation, https://overturemaps.org",
-        ),
-    )
-}
+        reader="files:read_osm",
+        licence="ODbL-1.0",
+        attribution=_OSM,
+    ),
+    MapSourceKind(
+        name="overpass",
+        gives="map",
+        reader="network:fetch_bbox",
+        licence="ODbL-1.0",
+        attribution=_OSM,
+    ),
+    MapSourceKind(
+        name="terrain-tiles",
+        gives="heights",
+        reader="elevation:fetch_elevation",
+        licence="open licences of several providers, named in the attribution",
+        attribution=_TERRAIN_TILES,
+    ),
+    MapSourceKind(
+        name="overture",
+        gives="buildings",
+        suffixes=(".parquet", ".geoparquet"),
+        reader="overture:read_overture",
+        licence="ODbL-1.0",
+        attribution="(c) Overture Maps Foundation, https://overturemaps.org",
+    ),
+)
+
+SOURCES: Registry[MapSourceKind] = Registry(
+    "source",
+    {row.name: row for row in _SOURCES},
+    error=InputError,
+)
 """All sources by name."""
 
 _LAYERS: dict[str, tuple[Callable[[Tags], bool], frozenset[str]]] = {
@@ -87,8 +103,7 @@ _LAYERS: dict[str, tuple[Callable[[Tags], bool], frozenset[str]]] = {
 
 def reader_of(name: str) -> Callable[..., Any]:
     """The reader of a source; its module is imported here, not before."""
-    module, function = SOURCES[name].reader.split(":")
-    reader: Callable[..., Any] = getattr(importlib.import_module(f"geoscene.sources.{module}"), function)
+    reader: Callable[..., Any] = load(f"geoscene.sources.{SOURCES[name].reader}")
     return reader
 
 
@@ -101,7 +116,7 @@ def read_source(
     """
     known = sorted(source.name for source in SOURCES.values() if source.suffixes)
     if name not in known:
-        raise InputError(f"`source` {name}: give one of {', '.join(known)}")
+        raise InputError(unknown_name("`source`", name, known=known))
     found: OsmData = reader_of(name)(path, bounds=bounds, progress=progress)
     return found
 

@@ -17,6 +17,7 @@ def stages(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from lidar.parameters import COLUMNS, parameter_cells  # noqa: PLC0415
     from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.signal.registry import stage_rows  # noqa: PLC0415
 
@@ -24,14 +25,12 @@ def stages(*, json: JsonFlag = False) -> int:
     if json:
         print_json({"stages": rows})
         return 0
-    cells = [["name", "parameter", "default", "from", "to", "meaning"]]
+    cells = []
     for row in rows:
         meaning = f"{row['meaning']} Acts on: {', '.join(row['acts_on'])}."
-        cells.append([row["name"], "", "", "", "", meaning])
-        for p in row["parameters"]:
-            ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
-            cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
-    print(columns(cells))
+        cells.append([row["name"], "", "", "", "", "", meaning])
+        cells += [["", *line] for line in parameter_cells(row["parameters"])]
+    print(columns([["name", "parameter", *COLUMNS], *cells]))
     print(
         "\nEvery stage also takes seed (of its random numbers; the drive's by default) and sensor (the only"
         "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE"
@@ -122,24 +121,33 @@ def settings(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from lidar.parameters import COLUMNS, parameter_cells, parameter_rows  # noqa: PLC0415
     from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.settings import levels, list_settings  # noqa: PLC0415
+    from lidar.tools.odometry.settings import OdometrySettings  # noqa: PLC0415
 
-    rows = list_settings()
+    rows, of_odometry = list_settings(), parameter_rows(OdometrySettings)
     if json:
         documents = [
-            {"name": s.name, "of": s.of, **dict(zip(levels(), s.values, strict=True)), "meaning": s.meaning}
+            {
+                "name": s.name,
+                "of": s.of,
+                **dict(zip(levels(), s.values, strict=True)),
+                "unit": s.unit,
+                "meaning": s.meaning,
+            }
             for s in rows
         ]
-        print_json({"settings": documents})
+        print_json({"settings": documents, "odometry": of_odometry})
         return 0
-    cells = [[s.name, s.of, *s.values, s.meaning] for s in rows]
-    print(columns([["name", "of", *levels(), "meaning"], *cells]))
+    cells = [[s.name, s.of, *s.values, s.unit, s.meaning] for s in rows]
+    print(columns([["name", "of", *levels(), "unit", "meaning"], *cells]))
     print(
         "\n--fidelity takes a level, --set NAME=VALUE changes one setting. Separate options: --exact"
         "\n(the full projection for every point), --deskew, --crs; of scenes: geoscene build --lod, --dem,"
-        "\n--along."
+        "\n--along.\n\nSettings of lidar odometry, by its own --set:\n"
     )
+    print(columns([["name", *COLUMNS], *parameter_cells(of_odometry)]))
     return 0
 
 

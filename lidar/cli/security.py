@@ -170,6 +170,7 @@ def defences(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from lidar.parameters import COLUMNS, parameter_cells  # noqa: PLC0415
     from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.defences.registry import defence_rows  # noqa: PLC0415
 
@@ -177,17 +178,15 @@ def defences(*, json: JsonFlag = False) -> int:
     if json:
         print_json({"defences": rows})
         return 0
-    cells = [["name", "parameter", "default", "from", "to", "meaning"]]
+    cells = []
     for row in rows:
         needs = f" Needs: {', '.join(row['needs'])}." if row["needs"] else ""
         past = f" Earlier frames: {row['history']}." if row["history"] else ""
-        cells.append([row["name"], "", "", "", "", f"{row['meaning']}{needs}{past}"])
-        for p in row["parameters"]:
-            ends = [f"{p[end]:g}" if end in p else "" for end in ("low", "high")]
-            cells.append(["", p["name"], str(p["default"]), *ends, p["meaning"]])
-    print(columns(cells))
+        cells.append([row["name"], "", "", "", "", "", f"{row['meaning']}{needs}{past}"])
+        cells += [["", *line] for line in parameter_cells(row["parameters"])]
+    print(columns([["name", "parameter", *COLUMNS], *cells]))
     print(
-        "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE:KEY=VALUE judges recorded data"
+        "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE,KEY=VALUE judges recorded data"
         "\n(docs/reference/defences.md)."
     )
     return 0

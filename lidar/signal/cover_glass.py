@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, Stage, parameter
+from lidar.signal.stage import Pulses, Stage
 
 
 @dataclass(frozen=True)
@@ -17,9 +18,9 @@ class CoverGlass(Stage):
 
     transmission: float = parameter(0.9, "share of the power that passes, one way", low=0, high=1)
     azimuth: float = parameter(
-        0.0, "middle of the sector, degrees from forward to the left", low=-360, high=360
+        0.0, "middle of the sector, from forward to the left", unit="degrees", low=-360, high=360
     )
-    width: float = parameter(360.0, "width of the sector, degrees", low=0, high=360)
+    width: float = parameter(360.0, "width of the sector", unit="degrees", low=0, high=360)
 
     def echoes(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator

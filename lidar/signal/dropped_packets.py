@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 
 
 @dataclass(frozen=True)

@@ -4,42 +4,52 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from difflib import get_close_matches
-from importlib import import_module
-from pathlib import Path
-from typing import Any, cast
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from geoscene.support.untrusted import read_toml
+from geoscene.support.registry import Registry
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
+from lidar.grammar import Item, item_of, read_items
+from lidar.parameters import build, parameter_rows
 from lidar.signal.effects import Counts
-from lidar.signal.stage import Stage, parameter_rows
+from lidar.signal.stage import Stage
 
-_STAGES = {
-    "cover_glass": "signal.cover_glass.CoverGlass",
-    "dropped_packets": "signal.dropped_packets.DroppedPackets",
-    "lost_rows": "signal.lost_rows.LostRows",
-    "inject": "signal.attacks.inject.Inject",
-    "replay": "signal.attacks.replay.Replay",
-    "relay": "signal.attacks.relay.Relay",
-    "remove": "signal.attacks.remove.Remove",
-    "placed_object": "signal.attacks.placed_object.PlacedObject",
-    "high_frequency_removal": "signal.attacks.high_frequency_removal.HighFrequencyRemoval",
-    "perturb": "signal.attacks.points.Perturb",
-    "insert": "signal.attacks.points.Insert",
-    "delete": "signal.attacks.points.Delete",
-    "move": "signal.attacks.points.Move",
-    "false_weather": "signal.attacks.points.FalseWeather",
-    "gnss_spoof": "signal.attacks.poses.GnssSpoof",
-    "camera_blind": "signal.attacks.images.CameraBlind",
-    "patch": "signal.attacks.images.Patch",
-    "weather": "signal.weather.stage.Weather",
-    "weather_model": "signal.weather.model_stage.WeatherModel",
+_ATTACKS = {
+    "inject": "lidar.signal.attacks.inject:Inject",
+    "replay": "lidar.signal.attacks.replay:Replay",
+    "relay": "lidar.signal.attacks.relay:Relay",
+    "remove": "lidar.signal.attacks.remove:Remove",
+    "placed_object": "lidar.signal.attacks.placed_object:PlacedObject",
+    "high_frequency_removal": "lidar.signal.attacks.high_frequency_removal:HighFrequencyRemoval",
+    "perturb": "lidar.signal.attacks.points:Perturb",
+    "insert": "lidar.signal.attacks.points:Insert",
+    "delete": "lidar.signal.attacks.points:Delete",
+    "move": "lidar.signal.attacks.points:Move",
+    "false_weather": "lidar.signal.attacks.points:FalseWeather",
+    "gnss_spoof": "lidar.signal.attacks.poses:GnssSpoof",
+    "camera_blind": "lidar.signal.attacks.images:CameraBlind",
+    "patch": "lidar.signal.attacks.images:Patch",
 }
-"""Module within `lidar` and class, by name."""
+
+ATTACKS: Registry[type[Stage]] = Registry("attack", _ATTACKS, error=InputError)
+"""Classes of the stages that are attacks, by name."""
+
+STAGES: Registry[type[Stage]] = Registry(
+    "stage",
+    {
+        "cover_glass": "lidar.signal.cover_glass:CoverGlass",
+        "dropped_packets": "lidar.signal.dropped_packets:DroppedPackets",
+        "lost_rows": "lidar.signal.lost_rows:LostRows",
+        **_ATTACKS,
+        "weather": "lidar.signal.weather.stage:Weather",
+        "weather_model": "lidar.signal.weather.model_stage:WeatherModel",
+    },
+    error=InputError,
+)
+"""Classes of all stages by name."""
 
 SEAMS = {
     "echoes": "lidar",
@@ -78,7 +88,7 @@ class NamedStage:
         return f"{self.name} {self.number + 1}" if self.number else self.name
 
     def to_json(self) -> dict[str, Any]:
-        """What `read_stage` reads."""
+        """The table that `read_stage` reads."""
         extra = {"seed": self.seed, "sensor": self.sensor}
         return {
             "name": self.name,
@@ -156,53 +166,21 @@ class Stages:
 NO_STAGES = Stages()
 
 
-def stage_class(name: str) -> type[Stage]:
-    """The class of a stage; raises InputError if the name is unknown."""
-    if name not in _STAGES:
-        near = get_close_matches(name, _STAGES, 1)
-        hint = f"; is {near[0]} meant?" if near else ""
-        raise InputError(f"stage {name!r} is unknown{hint} (known are {', '.join(_STAGES)})")
-    module, _, kind = _STAGES[name].rpartition(".")
-    return cast("type[Stage]", getattr(import_module(f"lidar.{module}"), kind))
-
-
-def attack_names() -> list[str]:
-    """Names of the stages that are attacks."""
-    return [name for name, place in _STAGES.items() if place.startswith("signal.attacks.")]
-
-
 def read_stage(table: Mapping[str, Any]) -> NamedStage:
     """A stage from its name, its parameters and optionally ``seed`` and ``sensor``.
 
     Raises InputError for a stage or parameter that is unknown, or a value out of its bounds.
     """
-    name = table.get("name")
-    if not isinstance(name, str):
-        raise InputError("a stage has no name")
-    kind = stage_class(name)
-    values = {key: value for key, value in table.items() if key not in ("name", "seed", "sensor")}
-    known = [f.name for f in fields(kind)]
-    if unknown := [key for key in values if key not in known]:
-        raise InputError(
-            f"stage {name}: no parameter {unknown[0]!r} (known are {', '.join([*known, 'seed', 'sensor'])})"
-        )
-    seed, sensor = table.get("seed"), table.get("sensor", "")
-    if seed is not None and (type(seed) is not int or not 0 <= seed < 1 << 63):
-        raise InputError(f"stage {name}: seed = {seed!r} is not a whole number of 0 or more")
-    if not isinstance(sensor, str):
-        raise InputError(f"stage {name}: sensor = {sensor!r} is not a name")
-    try:
-        return NamedStage(name, kind(**values), seed, sensor)
-    except InputError as error:
-        raise InputError(f"stage {name}: {error}") from None
+    return _build_stage(item_of(table))
 
 
 def read_stages(texts: Iterable[str], *, seed: int = 0) -> Stages:
-    """Stages from texts ``NAME``, ``NAME:KEY=VALUE,KEY=VALUE`` or ``FILE.toml`` with tables ``[[stage]]``.
+    """Stages from texts ``NAME:KEY=VALUE,KEY=VALUE,NAME,...``, and from files with tables ``[[stage]]``.
 
     Raises InputError as `read_stage` does, and for a file that cannot be read.
     """
-    return Stages(number_stages(_read_all(texts, "stage")), seed)
+    items = read_items(texts, STAGES, table="stage")
+    return Stages(number_stages(map(_build_stage, items)), seed)
 
 
 def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
@@ -210,7 +188,22 @@ def read_attacks(texts: Iterable[str]) -> tuple[NamedStage, ...]:
 
     Raises InputError as `read_stages` does, and for a stage that is no attack.
     """
-    return number_stages(_read_all(texts, "attack"))
+    items = read_items(texts, ATTACKS, table="attack")
+    return number_stages(_build_stage(item, ATTACKS) for item in items)
+
+
+def _build_stage(item: Item, registry: Registry[type[Stage]] = STAGES) -> NamedStage:
+    """A stage from its name and values; raises InputError."""
+    values = dict(item.values)
+    seed, sensor = values.pop("seed", None), values.pop("sensor", "")
+    seed = int(seed) if isinstance(seed, str) and seed.isdecimal() else seed
+    stage = build(registry, replace(item, values=values), also=("seed", "sensor"))
+    where = f"{item.source}{registry.what} {item.name}"
+    if seed is not None and (type(seed) is not int or not 0 <= seed < 1 << 63):
+        raise InputError(f"{where}: seed = {seed!r} is not a whole number of 0 or more")
+    if not isinstance(sensor, str):
+        raise InputError(f"{where}: sensor = {sensor!r} is not a name")
+    return NamedStage(item.name, stage, seed, sensor)
 
 
 def stages_of(tables: Iterable[Mapping[str, Any]], *, seed: int = 0) -> Stages:
@@ -233,94 +226,26 @@ def number_stages(stages: Iterable[NamedStage], *, after: Sequence[str] = ()) ->
 
 def dimming(tables: Iterable[Mapping[str, Any]]) -> tuple[NamedStage, ...]:
     """Those of some stages, as `NamedStage.to_json` writes them, that take light: weather."""
-    known = [table for table in tables if table["name"] in _STAGES]
+    known = [(table, STAGES[table["name"]]) for table in tables if table["name"] in STAGES]
     return tuple(
         read_stage(table)
-        for table in known
-        if hasattr(stage_class(table["name"]), "echoes")
-        and stage_class(table["name"]).clearness is not Stage.clearness
+        for table, kind in known
+        if hasattr(kind, "echoes") and kind.clearness is not Stage.clearness
     )
 
 
 def acts_on(table: Mapping[str, Any], sensor: str, *, kind: str) -> bool:
     """Whether a stage, as `NamedStage.to_json` writes it, acts on a sensor of a kind of `SEAMS`."""
-    if table.get("sensor", "") not in ("", sensor) or table["name"] not in _STAGES:
+    if table.get("sensor", "") not in ("", sensor) or table["name"] not in STAGES:
         return False
-    stage = stage_class(table["name"])
+    stage = STAGES[table["name"]]
     return any(hasattr(stage, seam) for seam, of in SEAMS.items() if of == kind)
-
-
-def _read_all(texts: Iterable[str], kind: str) -> list[NamedStage]:
-    """Stages from texts, and from files with tables ``[[kind]]``; an error names the file and the table."""
-    found = []
-    for text in texts:
-        if not text.endswith(".toml"):
-            found.append(_read_kind(_text_table(text), kind))
-            continue
-        for number, table in enumerate(_file_tables(Path(text), kind), 1):
-            try:
-                found.append(_read_kind(table, kind))
-            except InputError as error:
-                raise InputError(f"{text}: [[{kind}]] {number}: {error}") from None
-    return found
-
-
-def _read_kind(table: Mapping[str, Any], kind: str) -> NamedStage:
-    """A stage from a table; raises InputError, also for a stage that is no attack where attacks are read."""
-    named = read_stage(table)
-    if kind == "attack" and named.name not in attack_names():
-        raise InputError(f"stage {named.name} is no attack (attacks are {', '.join(attack_names())})")
-    return named
-
-
-def _file_tables(path: Path, kind: str) -> list[Mapping[str, Any]]:
-    try:
-        document = read_toml(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
-    tables = document.pop(kind, None)
-    if document or not tables or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
-        raise InputError(f"{path}: give tables [[{kind}]] with a name and parameters, and nothing else")
-    return tables
-
-
-def _text_table(text: str) -> Mapping[str, Any]:
-    name, _, rest = text.partition(":")
-    kinds = {f.name: type(f.default) for f in fields(stage_class(name.strip()))} | {
-        "seed": int,
-        "sensor": str,
-    }
-    table: dict[str, Any] = {"name": name.strip()}
-    key = ""
-    for pair in filter(None, rest.split(",")):
-        left, equals, value = (part.strip() for part in pair.partition("="))
-        if equals:
-            key = left
-            if key in table:
-                raise InputError(f"stage {text}: {key} is given twice")
-            table[key] = _value(value, kinds.get(key, str))
-        elif key and kinds.get(key) is str:
-            table[key] += f",{left}"  # a value with commas, such as a place
-        else:
-            raise InputError(f"stage {text}: give NAME:KEY=VALUE,KEY=VALUE")
-    return table
-
-
-def _value(text: str, kind: type) -> Any:
-    """A value of a kind; the text itself, which `Stage` refuses, if it is none."""
-    if kind is bool:
-        return {"true": True, "on": True, "false": False, "off": False}.get(text.lower(), text)
-    try:
-        return kind(text)
-    except ValueError:
-        return text
 
 
 def stage_rows() -> list[dict[str, Any]]:
     """Name, seams, meaning and parameters of every stage."""
     rows = []
-    for name in _STAGES:
-        kind = stage_class(name)
+    for name, kind in STAGES.items():
         seams = [seam for seam in SEAMS if hasattr(kind, seam)]
         meaning = (kind.__doc__ or "").partition("\n")[0]
         rows.append({"name": name, "acts_on": seams, "meaning": meaning, "parameters": parameter_rows(kind)})

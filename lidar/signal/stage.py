@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from math import inf, isfinite
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from dataclasses import dataclass
+from math import inf
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from geoscene.classes import Class
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.parameters import Parameters
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.detector import receive
 from lidar.sensors.physics.echoes import Echoes, TracedEchoes, artificial_echoes, trace
@@ -31,47 +32,14 @@ ROAD_USERS = "road users (lidar drive --traffic)"
 LABELS = "labelled road users (lidar drive --traffic, in a format with classes and instances)"
 """What some drives and recorded data know, and others do not."""
 
-T = TypeVar("T", bool, int, float, str)
-
-
-def parameter(
-    default: T, meaning: str, *, low: float = -inf, high: float = inf, among: tuple[str, ...] = ()
-) -> T:
-    """A field of a stage.
-
-    meaning   : one line with the unit, for ``lidar stages``
-    low, high : bounds of a number, both allowed
-    among     : allowed words of a text; any if empty
-    """
-    bounds = {"meaning": meaning, "low": low, "high": high, "among": among}
-    return field(default=default, metadata=bounds)
-
-
-def parameter_rows(kind: type[Stage]) -> list[dict[str, Any]]:
-    """Name, default, bounds or words, and meaning of each parameter of a class."""
-    return [
-        {
-            "name": f.name,
-            "default": f.default,
-            **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
-            **({"among": f.metadata["among"]} if f.metadata["among"] else {}),
-            "meaning": f.metadata["meaning"],
-        }
-        for f in fields(kind)
-    ]
-
 
 @dataclass(frozen=True)
-class Stage:
-    """Base of all stages; its fields are made by `parameter`.
-
-    Raises InputError for a parameter that is not of its default's type or not within its bounds.
-    """
+class Stage(Parameters):
+    """Base of all stages."""
 
     def __post_init__(self) -> None:
-        """Validate the parameters, all faults in one message."""
-        if faults := [fault for f in fields(self) if (fault := _fault(f, getattr(self, f.name)))]:
-            raise InputError("; ".join(faults))
+        """Validate the parameters, and their times."""
+        super().__post_init__()
         start, stop = getattr(self, "start", -inf), getattr(self, "stop", inf)
         if stop <= start:
             raise InputError(f"stop = {stop:g} is not after start = {start:g}")
@@ -100,29 +68,6 @@ class Stage:
         """Share of light that reaches the sensor through the stage's air, one way, along a pulse (row)."""
         del pulses, row, distance, at
         return 1.0
-
-
-def _fault(declared: Any, value: Any) -> str:
-    """What is wrong with the value of a parameter; empty if nothing is."""
-    name, kind, bounds = declared.name, type(declared.default), declared.metadata
-    if kind in (bool, str):
-        if type(value) is not kind:
-            return f"{name} = {value!r} is not {'true or false' if kind is bool else 'a text'}"
-        if bounds["among"] and value not in bounds["among"]:
-            return f"{name} = {value!r} is none of {', '.join(bounds['among'])}"
-        return ""
-    if isinstance(value, bool) or not isinstance(value, int if kind is int else int | float):
-        return f"{name} = {value!r} is not {'a whole number' if kind is int else 'a number'}"
-    if not (isfinite(value) and bounds["low"] <= value <= bounds["high"]):
-        return f"{name} = {value:g} is not {_interval(bounds['low'], bounds['high'])}"
-    return ""
-
-
-def _interval(low: float, high: float) -> str:
-    """The bounds of a parameter in words."""
-    if isfinite(high):
-        return f"within {low:g} to {high:g}"
-    return f"a finite number of {low:g} or more" if isfinite(low) else "a finite number"
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from geoscene.support.console import command_line
 from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
+from geoscene.support.registry import unknown_name
 from geoscene.typing import Float
-from lidar.dataset import formats, layouts
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
 from lidar.dataset.formats import ALL, FORMATS, Format
@@ -63,8 +63,8 @@ def convert(
     if to in EXPORTERS:
         return EXPORTERS[to].export(open_dataset(source), out, overwrite=overwrite, progress=progress)
     if to not in CONVERTED_FORMATS:
-        known = f"one of {', '.join([*EXPORTERS, *CONVERTED_FORMATS])}"
-        raise InputError(f"`to` {to}: {(layouts.REMOVED | formats.REMOVED).get(to, known)}")
+        known, removed = [*EXPORTERS, *CONVERTED_FORMATS], {**EXPORTERS.removed, **FORMATS.removed}
+        raise InputError(unknown_name("`to`", to, known=known, removed=removed))
     return _with_clouds_as(FORMATS[to], open_dataset(source), out=out, overwrite=overwrite, progress=progress)
 
 

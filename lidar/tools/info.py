@@ -27,7 +27,7 @@ from lidar.dataset.provenance import read_folder_provenance
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.geometry.mounts import OPTICAL
-from lidar.signal.registry import attack_names
+from lidar.signal.registry import ATTACKS
 
 _TABLE_BYTES = 2**24
 """Size of tables beyond which they are read only when everything is."""
@@ -143,7 +143,7 @@ def _dataset(dataset: Dataset, name: str, *, full: bool, progress: Progress) -> 
 def _stage(table: Mapping[str, Any]) -> dict[str, Any]:
     """A stage with its group: weather, attack or stage."""
     name = str(table["name"])
-    group = "attack" if name in attack_names() else "weather" if name.startswith("weather") else "stage"
+    group = "attack" if name in ATTACKS else "weather" if name.startswith("weather") else "stage"
     return {"group": group, **table}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from lidar.errors import InputError
 from lidar.sensors.rig.catalog import columns
-from lidar.signal.registry import stage_class
+from lidar.signal.registry import STAGES
 
 _TOLD = ("kind", "amount", "shape")
 """Parameters of stages that are stated also if they have their default."""
@@ -96,7 +96,7 @@ def _stage_text(stage: Mapping[str, Any]) -> str:
     """Name of a stage, with what it is of and its parameters that are not the default."""
     usual: dict[str, Any] = {"seed": None, "sensor": ""}
     with suppress(InputError):  # a stage of another version
-        usual |= {f.name: f.default for f in fields(stage_class(stage["name"])) if f.name not in _TOLD}
+        usual |= {f.name: f.default for f in fields(STAGES.find(stage["name"])) if f.name not in _TOLD}
     own = {k: v for k, v in stage.items() if k not in ("group", "name") and v != usual.get(k)}
     return ": ".join(filter(None, (stage["name"], ", ".join(f"{k}={_short(v)}" for k, v in own.items()))))
 

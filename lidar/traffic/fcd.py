@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.errors import FormatError, InputError
+from lidar.errors import FormatError
+from lidar.parameters import check_parameters, parameter
 
 if TYPE_CHECKING:
     from pyproj import Transformer
@@ -63,28 +64,33 @@ _OTHER = {"private": "passenger", "evehicle": "passenger", "hov": "passenger", "
 class TrafficFile:
     """Traffic from a file of SUMO, with parked vehicles.
 
-    path   : floating car data, ``.xml`` or ``.xml.gz``
-    net    : SUMO network that the coordinates refer to; by default the one that the file names. Not needed
-             for longitudes and latitudes (``--fcd-output.geo``)
-    begin  : SUMO's time in seconds at which the drive starts; the first in the file by default
-    parked : share of the spaces along kerbs and in parking lots that are occupied
-    radius : true metres from the ego vehicle within which there are road users
-    side   : driving side
+    path  : floating car data, ``.xml`` or ``.xml.gz``
+    net   : SUMO network that the coordinates refer to; by default the one that the file names. Not needed
+            for longitudes and latitudes (``--fcd-output.geo``)
+    begin : SUMO's time in seconds at which the drive starts; the first in the file by default
+    side  : driving side
+
+    Raises InputError for values that are out of bounds.
     """
 
     path: Path
     net: Path | None = None
     begin: float | None = None
-    parked: float = 0.6
-    radius: float = 200.0
+    parked: float = parameter(
+        0.6, "share of the spaces along kerbs and in parking lots that are occupied", low=0, high=1
+    )
+    radius: float = parameter(
+        200.0,
+        "distance from the ego vehicle within which there are road users",
+        unit="m",
+        low=50,
+        high=1000,
+    )
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
-        """Raise InputError for values out of range."""
-        if not 0 <= self.parked <= 1:
-            raise InputError(f"traffic: parked = {self.parked} is not within 0 to 1")
-        if not 50 <= self.radius <= 1000:
-            raise InputError(f"traffic: radius = {self.radius} is not within 50 to 1000")
+        """Validate the values."""
+        check_parameters(self)
 
 
 @dataclass(frozen=True, slots=True)

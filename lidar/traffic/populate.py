@@ -17,10 +17,10 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from geoscene.support.columns import row_blocks
-from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.vehicle import Vehicle
+from lidar.parameters import check_parameters, parameter
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
 from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
@@ -37,45 +37,33 @@ _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
 _BOXES = 1 << 14  # boxes of the ego vehicle that are made at once
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
-_BOUNDS = {
-    "vehicles": (0, 60),
-    "cyclists": (0, 30),
-    "pedestrians": (0, 400),
-    "parked": (0, 1),
-    "radius": (50, 1000),
-}
 
 
 @dataclass(frozen=True, slots=True)
 class TrafficOptions:
-    """Densities of simulated road users.
+    """Densities of simulated road users, and the side of the road that they drive on.
 
-    vehicles    : moving vehicles per kilometre of lane
-    cyclists    : per kilometre of lane
-    pedestrians : per kilometre of sidewalk
-    parked      : share of the spaces along kerbs and in parking lots that are occupied
-    radius      : true metres around the ego vehicle within which road users are simulated
-    side        : side of the road that traffic drives on
+    Raises InputError for values that are out of bounds.
     """
 
-    vehicles: float = 12.0
-    cyclists: float = 1.0
-    pedestrians: float = 15.0
-    parked: float = 0.6
-    radius: float = 200.0
+    vehicles: float = parameter(12.0, "moving vehicles", unit="per km of lane", low=0, high=60)
+    cyclists: float = parameter(1.0, "cyclists", unit="per km of lane", low=0, high=30)
+    pedestrians: float = parameter(15.0, "pedestrians", unit="per km of sidewalk", low=0, high=400)
+    parked: float = parameter(
+        0.6, "share of the spaces along kerbs and in parking lots that are occupied", low=0, high=1
+    )
+    radius: float = parameter(
+        200.0,
+        "distance from the ego vehicle within which road users are simulated",
+        unit="m",
+        low=50,
+        high=1000,
+    )
     side: Literal["right", "left"] = "right"
 
     def __post_init__(self) -> None:
-        """Raise InputError for values out of range."""
-        faults = [
-            f"{name} = {getattr(self, name)} is not within {low} to {high}"
-            for name, (low, high) in _BOUNDS.items()
-            if not low <= getattr(self, name) <= high
-        ]
-        if self.side not in ("left", "right"):
-            faults.append(f"side = {self.side!r} is neither left nor right")
-        if faults:
-            raise InputError("traffic: " + "; ".join(faults))
+        """Validate the values."""
+        check_parameters(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import numpy as np
 from geoscene.pipeline.limits import Limit
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.parameters import check_parameters, parameter
 from lidar.raycast.device import CPU, name_fault
 
 if TYPE_CHECKING:
@@ -34,52 +35,48 @@ _BUILT = {"plain": ("plain", "full"), "mesh": ("plain", "full"), "full": ("full"
 class WorldSettings:
     """Settings of the world around the vehicle. The defaults are the whole scene within range.
 
-    origin    : of Embree's float32 coordinates, of `ORIGINS`: the point of a grid of 2,048 m near the
-                vehicle, or the scene's origin, from which the margins of faces grow with the distance
-    reach     : metres around the vehicle beyond which no tiles are loaded and nothing is hit; inf: the
-                sensors' maximum range
-    forests   : the trees of forests
-    trees     : single trees and those of rows
-    furniture : poles, lamps, signs, traffic lights, bollards, benches and wires
-    barriers  : walls, fences and hedges
-    relief    : of `RELIEFS`: ``scene``, what the scene holds; ``plain``: without the small parts
-                that full relief adds; ``off``: walls are planes and the ground is smooth, too; ``full``:
-                only of a scene that has them; ``mesh``: openings of walls as triangles
-    wetness   : share of surfaces open to the sky that is soaked and under a film of water, 0 to 1
-    snow      : share of surfaces open to the sky that is under snow, 0 to 1
-    device    : that casts rays and shades images: ``cpu``, or, with the extra ``gpu``, ``cuda``,
-                ``cuda:N`` or ``warp-cpu``
+    Raises InputError for values that are out of bounds.
     """
 
-    origin: str = "near"
-    reach: float = inf
-    forests: bool = True
-    trees: bool = True
-    furniture: bool = True
-    barriers: bool = True
-    relief: str = "scene"
-    wetness: float = 0.0
-    snow: float = 0.0
-    device: str = CPU
+    origin: str = parameter(
+        "near",
+        "origin of Embree's float32 coordinates: the point of a grid of 2,048 m near the vehicle, or the"
+        " scene's, from which the margins of faces grow with the distance",
+        among=ORIGINS,
+    )
+    reach: float = parameter(
+        inf,
+        "distance from the vehicle beyond which no tiles are loaded and nothing is hit; inf: the sensors'"
+        " maximum range",
+        unit="m",
+        low=1e-3,
+        endless=True,
+    )
+    forests: bool = parameter(default=True, meaning="the trees of forests")
+    trees: bool = parameter(default=True, meaning="single trees and those of rows")
+    furniture: bool = parameter(
+        default=True, meaning="poles, lamps, signs, traffic lights, bollards, benches and wires"
+    )
+    barriers: bool = parameter(default=True, meaning="walls, fences and hedges")
+    relief: str = parameter(
+        "scene",
+        "scene: what the scene holds; plain: without the small parts that full relief adds; off: walls are"
+        " planes and the ground is smooth, too; full: only of a scene that has them; mesh: openings of walls"
+        " as triangles",
+        among=RELIEFS,
+    )
+    wetness: float = parameter(
+        0.0, "share of surfaces open to the sky that is soaked and under a film of water", low=0, high=1
+    )
+    snow: float = parameter(0.0, "share of surfaces open to the sky that is under snow", low=0, high=1)
+    device: str = parameter(
+        CPU,
+        "casts rays and shades images: cpu, or, with the extra gpu, cuda, cuda:N or warp-cpu",
+    )
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
-        faults = []
-        if self.origin not in ORIGINS:
-            faults.append(f"origin={self.origin}: known are {', '.join(ORIGINS)}")
-        if self.relief not in RELIEFS:
-            faults.append(f"relief={self.relief}: known are {', '.join(RELIEFS)}")
-        if not self.reach > 0:
-            faults.append(f"reach={self.reach:g}: give metres above 0, or inf")
-        if fault := name_fault(self.device):
-            faults.append(fault)
-        faults += [
-            f"{name}={value:g}: give 0 to 1"
-            for name, value in (("wetness", self.wetness), ("snow", self.snow))
-            if not 0 <= value <= 1
-        ]
-        if faults:
-            raise InputError("; ".join(faults))
+        check_parameters(self, name_fault(self.device))
 
 
 PLAIN = WorldSettings()

@@ -50,11 +50,12 @@ def test_settings_that_need_each_other_may_come_in_any_order():
 
 
 def test_a_setting_that_scanners_and_cameras_share_changes_both():
-    chosen = settings_of("standard", [("precision", "float32"), ("retrace", "off"), ("reach", "40")])
-    assert chosen.lidar.precision == chosen.camera.precision == "float32"
-    assert not chosen.lidar.retrace
-    assert not chosen.camera.retrace
-    assert chosen.world == WorldSettings(reach=40.0)
+    pairs = [("precision", "float32"), ("retrace", "off"), ("reach", "40")]
+    scanner, camera, world = settings_of("standard", pairs)
+    assert scanner.precision == camera.precision == "float32"
+    assert not scanner.retrace
+    assert not camera.retrace
+    assert world == WorldSettings(reach=40.0)
 
 
 @pytest.mark.parametrize(
@@ -65,15 +66,15 @@ def test_a_setting_that_scanners_and_cameras_share_changes_both():
         ("standard", [("qqq", "1")], "lidar settings lists all"),
         ("standard", [("rays", "many")], "whole number"),
         ("standard", [("shadows", "perhaps")], "on or off"),
-        ("standard", [("supersample", "99")], "supersample=99"),
-        ("standard", [("poses", "pulse")], "known are firing, column, frame"),
-        ("standard", [("precision", "half")], "known are exact, refined, float32"),
-        ("standard", [("origin", "far")], "known are near, scene"),
-        ("standard", [("reach", "0")], "reach=0: give metres above 0, or inf"),
-        ("standard", [("reach", "nan")], "reach=nan: give metres above 0, or inf"),
+        ("standard", [("supersample", "99")], "supersample = 99 is not within 1 to 16"),
+        ("standard", [("poses", "colum")], "is none of firing, column, frame; is column meant?"),
+        ("standard", [("precision", "half")], "is none of exact, refined, float32"),
+        ("standard", [("origin", "far")], "is none of near, scene"),
+        ("standard", [("reach", "0")], "reach = 0 is not at least 0.001 m, or inf"),
+        ("standard", [("reach", "nan")], "reach = nan is not at least 0.001 m"),
         ("standard", [("daylight_lux", "20000")], "no effect without detection or false_alarms"),
         ("survey", [("stretch", "on")], "no effect with rays=19"),
-        ("best", [], "one of standard, survey"),
+        ("surve", [], "is survey meant? (known are standard, survey)"),
     ],
 )
 def test_unknown_settings_are_named_with_similar_ones(level, given, says):
@@ -123,14 +124,15 @@ def test_a_bad_rig_or_sensor_is_named_with_line_and_key(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("vehicles=abc", "vehicles=abc: vehicles = abc is not a number"),
-        ("vehicles", "vehicles: give a value for vehicles, as in vehicles=0.5"),
-        ("parked=0.5,radius=", "parked=0.5,radius=: give a value for radius"),
-        ("cars=3", "cars=3: cars is none of on, off, sumo, vehicles"),
-        ("vehicles=3,", "vehicles=3,: nothing is none of on"),
-        ("sumo,pedestrians=x", "sumo,pedestrians=x: pedestrians = x is not a number"),
-        ("fcd.xml,net=", "fcd.xml,net=: give a value for net, as in net=map.net.xml"),
-        ("fcd.xml,begin=soon", "fcd.xml,begin=soon: begin = soon is not a number"),
+        ("vehicles=abc", "vehicles = 'abc' is not a number within 0 to 60"),
+        ("vehicles", "traffic 'vehicles' is unknown (known are on, off, sumo, FILE.xml)"),
+        ("parked=0.5,radius=", "parked=0.5,radius=: radius has no value"),
+        ("cars=3", "parameter 'cars' is unknown (known are vehicles, cyclists"),
+        ("on:vehicle=3", "is vehicles meant?"),
+        ("on,sumo", "give one of on, off, sumo"),
+        ("sumo,pedestrians=x", "traffic sumo: pedestrians = 'x' is not a number"),
+        ("fcd.xml,net=", "fcd.xml,net=: net has no value"),
+        ("fcd.xml,begin=soon", "traffic fcd.xml: begin = 'soon' is not a number"),
     ],
 )
 def test_values_of_traffic_are_named_with_what_is_expected(text, said, tmp_path):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from geoscene.errors import need
+from geoscene.support.registry import Registry
 from lidar.errors import FormatError, InputError
 
 if TYPE_CHECKING:
@@ -141,53 +142,61 @@ class LabelFormat:
         importlib.import_module(f"{__name__}.{self.module}").write_labels(path, labels)
 
 
-FORMATS = {
-    row.name: row
-    for row in (
-        Format("pcd", "pcd", ".pcd", maps=True),
-        Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
-        Format("ply", "ply", ".ply", maps=True),
-        Format("csv", "text", ".csv", exact=False),
-        Format("npz", "npz", ".npz"),
-        Format("parquet", "parquet", ".parquet", framed=True, extra="pyarrow gis"),
-        Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True, exact=False),
-        Format("las", "las", ".las", frame="world", columns=_LAS, maps=True, exact=False),
-        Format(
-            "e57",
-            "e57",
-            ".e57",
-            frame="world",
-            columns=_E57,
-            maps=True,
-            framed=True,
-            exact=False,
-            extra="pye57 e57",
-        ),
-        Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", kitti=True),
-        Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring")),
-    )
-}
+_FORMATS = (
+    Format("pcd", "pcd", ".pcd", maps=True),
+    Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
+    Format("ply", "ply", ".ply", maps=True),
+    Format("csv", "text", ".csv", exact=False),
+    Format("npz", "npz", ".npz"),
+    Format("parquet", "parquet", ".parquet", framed=True, extra="pyarrow gis"),
+    Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True, exact=False),
+    Format("las", "las", ".las", frame="world", columns=_LAS, maps=True, exact=False),
+    Format(
+        "e57",
+        "e57",
+        ".e57",
+        frame="world",
+        columns=_E57,
+        maps=True,
+        framed=True,
+        exact=False,
+        extra="pye57 e57",
+    ),
+    Format("kitti", "kitti", ".bin", columns=ALL[:4], folder="velodyne", kitti=True),
+    Format("nuscenes", "nuscenes", ".pcd.bin", columns=(*ALL[:4], "ring")),
+)
+
+FORMATS: Registry[Format] = Registry(
+    "format",
+    {row.name: row for row in _FORMATS},
+    error=InputError,
+    removed={"pcd-compressed": "no longer written; use pcd, or npz or parquet, which are compressed"},
+)
 """Point-cloud formats by name."""
 
-REMOVED = {"pcd-compressed": "no longer written; use pcd, or npz or parquet, which are compressed"}
-"""Names of former formats, and what to use instead."""
 
-MAPS = {
-    row.name: row
-    for row in (
-        *(row for row in FORMATS.values() if row.maps),
-        Format("copc", "copc", ".copc.laz", frame="world", columns=_LAS, maps=True),
-    )
-}
+_MAPS = (
+    *(row for row in FORMATS.values() if row.maps),
+    Format("copc", "copc", ".copc.laz", frame="world", columns=_LAS, maps=True),
+)
+
+MAPS: Registry[Format] = Registry(
+    "format",
+    {row.name: row for row in _MAPS},
+    error=InputError,
+)
 """Formats of aggregated maps by name; COPC sorts points, so that clouds of frames are not written in it."""
 
-LABELS = {
-    row.name: row
-    for row in (
-        LabelFormat("semantickitti", "kitti", ".label", "labels", kitti=True),
-        LabelFormat("nuscenes", "nuscenes", "_lidarseg.bin", "lidarseg"),
-    )
-}
+_LABELS = (
+    LabelFormat("semantickitti", "kitti", ".label", "labels", kitti=True),
+    LabelFormat("nuscenes", "nuscenes", "_lidarseg.bin", "lidarseg"),
+)
+
+LABELS: Registry[LabelFormat] = Registry(
+    "labels",
+    {row.name: row for row in _LABELS},
+    error=InputError,
+)
 """Label formats by name."""
 
 
@@ -196,11 +205,9 @@ def format_of(path: Path, name: str = "") -> Format:
 
     Raises InputError for an unknown name or suffix.
     """
-    known = FORMATS | MAPS
     if name:
-        if name not in known:
-            raise InputError(f"format {name}: one of {', '.join(known)}")
-        return known[name]
+        return MAPS[name] if name in MAPS else FORMATS.find(name)
+    known = {**FORMATS, **MAPS}
     found = [row for row in known.values() if path.name.lower().endswith(row.suffix)]
     if not found:
         suffixes = ", ".join(row.suffix for row in known.values())

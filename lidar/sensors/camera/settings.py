@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import TYPE_CHECKING
 
-from lidar.errors import InputError
+from lidar.parameters import check_parameters, parameter
 from lidar.raycast import PRECISIONS
 from lidar.sensors.rig.specs import CameraSpec
 
@@ -18,46 +18,45 @@ if TYPE_CHECKING:
 class CameraSettings:
     """Settings of images. The defaults are a camera without noise, and one ray per pixel but four at edges.
 
-    precision    : of the depths of pixels, of `lidar.raycast.PRECISIONS`
-    retrace      : trace pixels that miss a second time, as rays towards a vertex may pass between faces
-    shadows      : the sun casts shadows
-    detail       : windows, joints and grain are drawn on surfaces of uniform colour
-    supersample  : rays along each side of a pixel, for colour: 1 to 16
-    edge_rays    : the same for pixels at edges (`camera.edges`), where it is more than ``supersample``
-    blur         : samples of the exposure (the camera's ``exposure_ns``) that are averaged: motion blur
-    haze         : distance in metres at which haze removes 98 % of contrast; inf for clear air
-    cloud        : share of the sky that clouds cover, 0 to 1; overcast light casts no shadows
-    camera_noise : shot noise and read noise (the camera's ``full_well``, ``read_noise``)
+    Raises InputError for values that are out of bounds.
     """
 
-    precision: str = "exact"
-    retrace: bool = True
-    shadows: bool = True
-    detail: bool = True
-    supersample: int = 1
-    edge_rays: int = 2
-    blur: int = 5
-    haze: float = 20_000.0
-    cloud: float = 0.0
-    camera_noise: bool = False
+    precision: str = parameter("exact", "precision of the depths of pixels", among=PRECISIONS)
+    retrace: bool = parameter(
+        default=True,
+        meaning="trace pixels that miss a second time, as rays towards a vertex may pass between faces",
+    )
+    shadows: bool = parameter(default=True, meaning="the sun casts shadows")
+    detail: bool = parameter(
+        default=True, meaning="windows, joints and grain are drawn on surfaces of uniform colour"
+    )
+    supersample: int = parameter(1, "rays along each side of a pixel, for colour", low=1, high=16)
+    edge_rays: int = parameter(
+        2, "the same for pixels at edges, where it is more than supersample", low=1, high=16
+    )
+    blur: int = parameter(
+        5,
+        "samples of the exposure (the camera's exposure_ns) that are averaged: motion blur",
+        low=1,
+        high=64,
+    )
+    haze: float = parameter(
+        20_000.0,
+        "distance at which haze removes 98 % of contrast; inf for clear air",
+        unit="m",
+        low=1e-3,
+        endless=True,
+    )
+    cloud: float = parameter(
+        0.0, "share of the sky that clouds cover; overcast light casts no shadows", low=0, high=1
+    )
+    camera_noise: bool = parameter(
+        default=False, meaning="shot noise and read noise (the camera's full_well, read_noise)"
+    )
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
-        faults = []
-        if self.precision not in PRECISIONS:
-            faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
-        if not 1 <= self.supersample <= 16:
-            faults.append(f"supersample={self.supersample}: give 1 to 16")
-        if not 1 <= self.edge_rays <= 16:
-            faults.append(f"edge_rays={self.edge_rays}: give 1 to 16")
-        if not 1 <= self.blur <= 64:
-            faults.append(f"blur={self.blur}: give 1 to 64")
-        if not self.haze > 0:
-            faults.append(f"haze={self.haze}: give metres above 0, or inf")
-        if not 0 <= self.cloud <= 1:
-            faults.append(f"cloud={self.cloud:g}: give 0 to 1")
-        if faults:
-            raise InputError("; ".join(faults))
+        check_parameters(self)
 
     def moments(self, camera: CameraSpec) -> int:
         """Number of samples of an exposure that are rendered."""

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 
-from lidar.errors import InputError
+from lidar.parameters import check_parameters, parameter
 from lidar.raycast import PRECISIONS
 from lidar.sensors.physics.reflect import INCIDENCE_LAWS
 
@@ -23,80 +22,85 @@ MOST_RAYS = 999
 class ScannerSettings:
     """Settings of the returns. The defaults are a scanner that measures exactly.
 
-    poses        : of `POSES`: pulses have the sensor's pose and time at their own ``firing``, at the first
-                   pulse of their ``column`` (block of firings), or at the first of the ``frame``
-    precision    : of the ranges of pulses, of `lidar.raycast.PRECISIONS`
-    retrace      : trace pulses that miss a second time, as pulses towards a vertex may pass between faces
-    law          : incidence law, of `lidar.sensors.physics.reflect.INCIDENCE_LAWS`
-    spread       : spread of the reflectance from object to object, as the deviation of its logarithm
-    link         : lose echoes below the detection threshold
-    detection    : lose echoes near the threshold with a probability; includes ``link``
-    daylight_lux : illuminance of the scene, which raises the receiver's noise; with ``detection`` or
-                   ``false_alarms``
-    extinction   : extinction coefficient of the air, 1/m one way; dims intensity too, which assumes clear air
-    rays         : rays per pulse, 1 to 999; more than 1: a beam with a size, mixed pixels, several echoes
-    mirrors      : glass transmits and reflects, water reflects
-    foliage      : tree crowns and hedges let rays pass between their leaves
-    blooming     : pulses that pass close to a retro-reflector may return its range
-    interference : number of other scanners whose pulses may be received
-    false_alarms : noise may pass the threshold
-    range_noise  : ``constant`` (the preset's sigma), ``signal`` (more for dim targets) or ``none``
-    stretch      : range noise of a pulse on a slanted surface, for ``rays`` = 1, which does not trace it
-    bias         : each laser has a constant range error
-    walk         : bright targets appear nearer
-    angle_noise  : true beam directions differ at random from the reported ones
-    quantise     : round ranges and intensity codes to the sensor's steps
+    Raises InputError for values that are out of bounds or have no effect.
     """
 
-    poses: str = "firing"
-    precision: str = "exact"
-    retrace: bool = True
-    law: str = "lambert"
-    spread: float = 0.0
-    link: bool = False
-    detection: bool = False
-    daylight_lux: float = 0.0
-    extinction: float = 0.0
-    rays: int = 1
-    mirrors: bool = False
-    foliage: bool = False
-    blooming: bool = False
-    interference: int = 0
-    false_alarms: bool = False
-    range_noise: str = "none"
-    stretch: bool = False
-    bias: bool = False
-    walk: bool = False
-    angle_noise: bool = False
-    quantise: bool = False
+    poses: str = parameter(
+        "firing",
+        "pulses have the sensor's pose and time at their own firing, at the first pulse of their column"
+        " (block of firings), or at the first of the frame",
+        among=POSES,
+    )
+    precision: str = parameter("exact", "precision of the ranges of pulses", among=PRECISIONS)
+    retrace: bool = parameter(
+        default=True,
+        meaning="trace pulses that miss a second time, as pulses towards a vertex may pass between faces",
+    )
+    law: str = parameter("lambert", "incidence law", among=INCIDENCE_LAWS)
+    spread: float = parameter(
+        0.0,
+        "spread of the reflectance from object to object, as the deviation of its logarithm",
+        low=0,
+    )
+    link: bool = parameter(default=False, meaning="lose echoes below the detection threshold")
+    detection: bool = parameter(
+        default=False, meaning="lose echoes near the threshold with a probability; includes link"
+    )
+    daylight_lux: float = parameter(
+        0.0,
+        "illuminance of the scene, which raises the receiver's noise; with detection or false_alarms",
+        unit="lux",
+        low=0,
+    )
+    extinction: float = parameter(
+        0.0,
+        "extinction coefficient of the air, one way; dims intensity too, which assumes clear air",
+        unit="1/m",
+        low=0,
+    )
+    rays: int = parameter(
+        1,
+        "rays per pulse; more than 1: a beam with a size, mixed pixels, several echoes",
+        low=1,
+        high=MOST_RAYS,
+    )
+    mirrors: bool = parameter(default=False, meaning="glass transmits and reflects, water reflects")
+    foliage: bool = parameter(
+        default=False, meaning="tree crowns and hedges let rays pass between their leaves"
+    )
+    blooming: bool = parameter(
+        default=False, meaning="pulses that pass close to a retro-reflector may return its range"
+    )
+    interference: int = parameter(0, "number of other scanners whose pulses may be received", low=0)
+    false_alarms: bool = parameter(default=False, meaning="noise may pass the threshold")
+    range_noise: str = parameter(
+        "none", "constant (the preset's sigma), signal (more for dim targets) or none", among=NOISES
+    )
+    stretch: bool = parameter(
+        default=False,
+        meaning="range noise of a pulse on a slanted surface, for rays = 1, which does not trace it",
+    )
+    bias: bool = parameter(default=False, meaning="each laser has a constant range error")
+    walk: bool = parameter(default=False, meaning="bright targets appear nearer")
+    angle_noise: bool = parameter(
+        default=False, meaning="true beam directions differ at random from the reported ones"
+    )
+    quantise: bool = parameter(
+        default=False, meaning="round ranges and intensity codes to the sensor's steps"
+    )
 
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
-        faults = []
-        if self.poses not in POSES:
-            faults.append(f"poses={self.poses}: known are {', '.join(POSES)}")
-        if self.precision not in PRECISIONS:
-            faults.append(f"precision={self.precision}: known are {', '.join(PRECISIONS)}")
-        if self.law not in INCIDENCE_LAWS:
-            faults.append(f"law={self.law}: known are {', '.join(INCIDENCE_LAWS)}")
-        if self.range_noise not in NOISES:
-            faults.append(f"range_noise={self.range_noise}: known are {', '.join(NOISES)}")
-        if not 1 <= self.rays <= MOST_RAYS:
-            faults.append(f"rays={self.rays}: give 1 to {MOST_RAYS}")
-        amounts = {n: getattr(self, n) for n in ("spread", "daylight_lux", "extinction", "interference")}
-        faults += [
-            f"{name}={value}: give 0 or more"
-            for name, value in amounts.items()
-            if not (isfinite(value) and value >= 0)
-        ]
-        if self.daylight_lux and not (self.detection or self.false_alarms):
-            faults.append(
-                f"daylight_lux={self.daylight_lux:g}: has no effect without detection or false_alarms"
-            )
-        if self.stretch and self.rays > 1:
-            faults.append(f"stretch: has no effect with rays={self.rays}, which trace the surface")
-        if faults:
-            raise InputError("; ".join(faults))
+        noisy = self.detection or self.false_alarms
+        check_parameters(
+            self,
+            f"daylight_lux={self.daylight_lux:g}: has no effect without detection or false_alarms"
+            if self.daylight_lux and not noisy
+            else "",
+            f"stretch: has no effect with rays={self.rays}, which trace the surface"
+            if self.stretch and self.rays > 1
+            else "",
+        )
 
 
 PLAIN = ScannerSettings()

@@ -14,13 +14,14 @@ from geoscene.support.digests import recipe_digest
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
+from lidar.parameters import parameter
 from lidar.raycast.geometry import ALL
 from lidar.sensors.physics.echoes import TracedEchoes, join, number_echoes
 from lidar.sensors.physics.link import amplitude
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.signal.situation import Situation
-from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, parameter
+from lidar.signal.stage import POSES, Pulses, Stage, added_echoes
 from lidar.world.surfaces import GLASS
 from lidar.world.world import World
 
@@ -100,18 +101,22 @@ class Attacker(Stage):
     place: str = parameter(
         "", "LAT,LON,HEIGHT: degrees, and metres above the ground there; empty: moves along"
     )
-    bearing: float = parameter(0.0, "without place: degrees from forward to the left", low=-360, high=360)
-    distance: float = parameter(10.0, "without place: metres from the sensor", low=0.5, high=500)
-    height: float = parameter(0.0, "without place: metres above the sensor", low=-50, high=50)
+    bearing: float = parameter(
+        0.0, "without place: bearing from forward to the left", unit="degrees", low=-360, high=360
+    )
+    distance: float = parameter(10.0, "without place: distance from the sensor", unit="m", low=0.5, high=500)
+    height: float = parameter(0.0, "without place: height above the sensor", unit="m", low=-50, high=50)
     device: str = parameter("pla_2023", "hardware, which limits points and angles", among=(*DEVICES,))
     points: int = parameter(0, "most pulses a frame; 0: all that the device can", low=0, high=10_000_000)
-    width: float = parameter(0.0, "degrees of azimuth around the device; 0: all that it can", low=0, high=360)
+    width: float = parameter(
+        0.0, "sector of azimuth around the device; 0: all that it can", unit="degrees", low=0, high=360
+    )
     power: float = parameter(
         1000.0, "received power over the detection threshold from 10 m away", low=0, high=1e9
     )
-    reach: float = parameter(110.0, "most metres from the sensor", low=0.5, high=500)
-    start: float = parameter(0.0, "seconds since the drive's start from which it attacks", low=0)
-    stop: float = parameter(1e9, "seconds since the drive's start until which it attacks", low=0)
+    reach: float = parameter(110.0, "greatest distance from the sensor", unit="m", low=0.5, high=500)
+    start: float = parameter(0.0, "time since the drive's start from which it attacks", unit="s", low=0)
+    stop: float = parameter(1e9, "time since the drive's start until which it attacks", unit="s", low=0)
 
     def __post_init__(self) -> None:
         """Validate the parameters, also against the device's limits."""
@@ -247,10 +252,10 @@ class TimedAttacker(Attacker):
     """A device that answers each pulse after a time of its own choice."""
 
     jitter: float = parameter(
-        RANGE_SIGMA, "metres, standard deviation of a range ahead of the device", low=0, high=100
+        RANGE_SIGMA, "standard deviation of a range ahead of the device", unit="m", low=0, high=100
     )
     jitter_per_degree: float = parameter(
-        RANGE_SIGMA_PER_DEGREE, "metres by which it grows per degree of azimuth", low=0, high=10
+        RANGE_SIGMA_PER_DEGREE, "growth of it per degree of azimuth", unit="m", low=0, high=10
     )
 
     def errors(self, aim: Aim, *, rng: np.random.Generator) -> Float:
@@ -267,10 +272,10 @@ class SynchronisedAttacker(TimedAttacker):
     """
 
     frame_jitter: float = parameter(
-        0.2, "degrees of azimuth, standard deviation from frame to frame", low=0, high=30
+        0.2, "standard deviation of the azimuth from frame to frame", unit="degrees", low=0, high=30
     )
     sync: float = parameter(
-        0.0, "ns, standard deviation of the synchronisation from frame to frame", low=0, high=1e6
+        0.0, "standard deviation of the synchronisation from frame to frame", unit="ns", low=0, high=1e6
     )
 
     def errors(self, aim: Aim, *, rng: np.random.Generator) -> Float:

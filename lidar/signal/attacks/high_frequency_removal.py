@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS, has_code
 from lidar.signal.attacks.attacker import DEVICES, Attacker, sent_back
 from lidar.signal.attacks.remove import POWER_SPREAD
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import Pulses
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class HighFrequencyRemoval(Attacker):
     """
 
     device: str = parameter("pra_2023", "hardware, which limits points and angles", among=(*DEVICES,))
-    frequency: float = parameter(5.0, "MHz, of its pulses; typical value", low=1e-3, high=100)
+    frequency: float = parameter(5.0, "rate of its pulses; typical value", unit="MHz", low=1e-3, high=100)
 
     def echoes(
         self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator

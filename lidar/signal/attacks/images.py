@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.camera.shade import linear_table
 from lidar.sensors.rig.camera_model import pixel_rays
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.attacks.attacker import checked_digest, degrees_of, point_of
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 
 _TINTS = {
     "white": (1.0, 1.0, 1.0),
@@ -40,12 +41,16 @@ class CameraBlind(Stage):
     """
 
     power: float = parameter(100.0, "light at its middle over the camera's full scale", low=0, high=1e9)
-    core: float = parameter(0.5, "degrees from it at which the light has fallen to a half", low=0.01, high=90)
-    right: float = parameter(0.0, "degrees to the right of the optical axis", low=-180, high=180)
-    up: float = parameter(0.0, "degrees above it", low=-90, high=90)
+    core: float = parameter(
+        0.5, "angle from it at which the light has fallen to a half", unit="degrees", low=0.01, high=90
+    )
+    right: float = parameter(
+        0.0, "angle to the right of the optical axis", unit="degrees", low=-180, high=180
+    )
+    up: float = parameter(0.0, "angle above it", unit="degrees", low=-90, high=90)
     tint: str = parameter("white", "colour", among=(*_TINTS,))
-    start: float = parameter(0.0, "seconds since the drive's start from which it shines", low=0)
-    stop: float = parameter(1e9, "seconds since the drive's start until which it shines", low=0)
+    start: float = parameter(0.0, "time since the drive's start from which it shines", unit="s", low=0)
+    stop: float = parameter(1e9, "time since the drive's start until which it shines", unit="s", low=0)
 
     def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame with the light added."""
@@ -78,13 +83,17 @@ class Patch(Stage):
     place: str = parameter(
         "", "in the world: LAT,LON,HEIGHT of its middle above the ground; empty: moves along"
     )
-    facing: float = parameter(0.0, "of a place: degrees clockwise from north", low=-360, high=360)
-    ahead: float = parameter(10.0, "without place: metres in front of the camera", low=0.2, high=500)
-    left: float = parameter(0.0, "without place: metres to its left", low=-500, high=500)
-    up: float = parameter(0.0, "without place: metres above it", low=-500, high=500)
-    wide: float = parameter(1.0, "in the world: metres", low=0.01, high=100)
-    start: float = parameter(0.0, "seconds since the drive's start from which it is there", low=0)
-    stop: float = parameter(1e9, "seconds since the drive's start until which it is there", low=0)
+    facing: float = parameter(
+        0.0, "of a place: direction, clockwise from north", unit="degrees", low=-360, high=360
+    )
+    ahead: float = parameter(
+        10.0, "without place: distance in front of the camera", unit="m", low=0.2, high=500
+    )
+    left: float = parameter(0.0, "without place: distance to its left", unit="m", low=-500, high=500)
+    up: float = parameter(0.0, "without place: height above it", unit="m", low=-500, high=500)
+    wide: float = parameter(1.0, "in the world: its width", unit="m", low=0.01, high=100)
+    start: float = parameter(0.0, "time since the drive's start from which it is there", unit="s", low=0)
+    stop: float = parameter(1e9, "time since the drive's start until which it is there", unit="s", low=0)
 
     def __post_init__(self) -> None:
         """Validate the parameters; the picture must be readable."""

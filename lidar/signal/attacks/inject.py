@@ -8,13 +8,14 @@ import numpy as np
 
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.parameters import parameter
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of, sent_back
 from lidar.signal.attacks.phantoms import OBJECTS, far_trace_ranges, ground_below, object_ranges, wall_ranges
 from lidar.signal.situation import Situation
-from lidar.signal.stage import POSES, Pulses, parameter
+from lidar.signal.stage import POSES, Pulses
 
 
 @dataclass(frozen=True)
@@ -27,21 +28,25 @@ class Inject(SynchronisedAttacker):
         among=("random", "wall", "object", "occluded", "far"),
     )
     kind: str = parameter("sedan", "road user that the phantom resembles", among=OBJECTS)
-    range: float = parameter(7.0, "metres from the sensor to the phantom", low=0.1, high=1000)
-    closing: float = parameter(0.0, "m/s by which it comes nearer", low=-100, high=100)
+    range: float = parameter(7.0, "distance from the sensor to the phantom", unit="m", low=0.1, high=1000)
+    closing: float = parameter(0.0, "speed by which it comes nearer", unit="m/s", low=-100, high=100)
     standing: bool = parameter(
         False, "stays where it was at start, in the scene; else at the same range and bearing"
     )
     offset: float = parameter(
-        0.0, "degrees of azimuth of the phantom from the device to the left", low=-180, high=180
+        0.0, "azimuth of the phantom from the device to the left", unit="degrees", low=-180, high=180
     )
-    wide: float = parameter(4.0, "metres, width of a wall", low=0.1, high=1000)
-    high: float = parameter(2.0, "metres, height of a wall", low=0.1, high=100)
-    deep: float = parameter(10.0, "metres behind range over which random points lie", low=0, high=1000)
+    wide: float = parameter(4.0, "width of a wall", unit="m", low=0.1, high=1000)
+    high: float = parameter(2.0, "height of a wall", unit="m", low=0.1, high=100)
+    deep: float = parameter(
+        10.0, "depth behind range over which random points lie", unit="m", low=0, high=1000
+    )
     strip: float = parameter(
         0.3, "share of the width of an occluded road user that is seen", low=0.01, high=1
     )
-    seen_at: float = parameter(40.0, "metres away at which a far road user was recorded", low=1, high=200)
+    seen_at: float = parameter(
+        40.0, "distance at which a far road user was recorded", unit="m", low=1, high=200
+    )
     predicts: bool = parameter(True, "fires before the sensor does, so that phantoms may be nearer than it")
     dimmest: float = parameter(0.3, "least apparent reflectance of a point", low=0, high=1)
     brightest: float = parameter(1.0, "greatest apparent reflectance of a point", low=0, high=1)

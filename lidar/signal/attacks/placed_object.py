@@ -16,9 +16,10 @@ from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
+from lidar.parameters import parameter
 from lidar.signal.attacks.attacker import checked_digest
 from lidar.signal.registry import Stages
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 from lidar.world.actor_shapes import ActorShape
 from lidar.world.actors import Actors, join_actors
 from lidar.world.ground import ground_height, ground_heights
@@ -53,11 +54,13 @@ class PlacedObject(Stage):
         "", "FILE.obj, .stl or .ply in metres: x forward, y left, z up, on z = 0; empty: a cube of 1 m"
     )
     place: str = parameter("", "LAT,LON in degrees; empty: moves along with the vehicle")
-    ahead: float = parameter(10.0, "without place: metres before the vehicle's rear axle", low=-200, high=200)
-    left: float = parameter(0.0, "without place: metres to the left", low=-100, high=100)
-    lift: float = parameter(0.0, "metres above the ground, such as on a roof", low=-10, high=100)
+    ahead: float = parameter(
+        10.0, "without place: distance before the vehicle's rear axle", unit="m", low=-200, high=200
+    )
+    left: float = parameter(0.0, "without place: distance to the left", unit="m", low=-100, high=100)
+    lift: float = parameter(0.0, "height above the ground, such as on a roof", unit="m", low=-10, high=100)
     yaw: float = parameter(
-        0.0, "degrees to the left, from east or from the vehicle's heading", low=-360, high=360
+        0.0, "turn to the left, from east or from the vehicle's heading", unit="degrees", low=-360, high=360
     )
     size: float = parameter(1.0, "factor of the mesh's size", low=1e-4, high=1e4)
     material: str = parameter("metal", "material of all faces", among=(*materials(),))

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Float, Ints
+from lidar.parameters import parameter
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
-from lidar.signal.stage import LABELS, Stage, parameter
+from lidar.signal.stage import LABELS, Stage
 
 _LEAST = 10
 """Returns of a road user that counts as a target."""
@@ -26,8 +27,8 @@ class Tampering(Stage):
     """Changes of recorded data between two times; budget: a number of returns a frame."""
 
     points: int = parameter(0, "most returns a frame, drawn at random; 0: all", low=0, high=10_000_000)
-    start: float = parameter(0.0, "seconds since the drive's start from which data are changed", low=0)
-    stop: float = parameter(1e9, "seconds since the drive's start until which data are changed", low=0)
+    start: float = parameter(0.0, "time since the drive's start from which data are changed", unit="s", low=0)
+    stop: float = parameter(1e9, "time since the drive's start until which data are changed", unit="s", low=0)
 
     def is_on(self, at: Situation) -> bool:
         """Whether data of a frame are changed."""
@@ -44,12 +45,16 @@ class Tampering(Stage):
 class Region(Tampering):
     """A box in the sensor frame, or the nearest road user."""
 
-    distance: float = parameter(10.0, "metres from the sensor to the middle of the box", low=0, high=500)
-    bearing: float = parameter(0.0, "of that, degrees from forward to the left", low=-360, high=360)
-    height: float = parameter(-1.0, "of that, metres above the sensor", low=-50, high=50)
-    long: float = parameter(4.5, "metres of the box along the bearing", low=0.01, high=500)
-    wide: float = parameter(1.8, "metres of the box across it", low=0.01, high=500)
-    high: float = parameter(1.5, "metres of the box upwards", low=0.01, high=500)
+    distance: float = parameter(
+        10.0, "distance from the sensor to the middle of the box", unit="m", low=0, high=500
+    )
+    bearing: float = parameter(
+        0.0, "bearing of that, from forward to the left", unit="degrees", low=-360, high=360
+    )
+    height: float = parameter(-1.0, "height of that above the sensor", unit="m", low=-50, high=50)
+    long: float = parameter(4.5, "length of the box along the bearing", unit="m", low=0.01, high=500)
+    wide: float = parameter(1.8, "width of the box across it", unit="m", low=0.01, high=500)
+    high: float = parameter(1.5, "height of the box", unit="m", low=0.01, high=500)
 
     @property
     def middle(self) -> Float:
@@ -109,7 +114,7 @@ def _nearest_road_user(cloud: TracedCloud) -> Ints:
 class Perturb(Tampering):
     """Returns are shifted at random, by at most a bound."""
 
-    bound: float = parameter(0.1, "most metres by which a return is shifted", low=0, high=10)
+    bound: float = parameter(0.1, "greatest shift of a return", unit="m", low=0, high=10)
     share: float = parameter(1.0, "share of the returns", low=0, high=1)
     how: str = parameter("ball", "to all sides, or along the beam", among=("ball", "beam"))
 
@@ -144,10 +149,10 @@ class Delete(TargetReturns):
 class Move(TargetReturns):
     """Returns in a box, or of the nearest road user, are shifted together and turned about their middle."""
 
-    ahead: float = parameter(0.0, "metres forward", low=-500, high=500)
-    left: float = parameter(3.0, "metres to the left", low=-500, high=500)
-    up: float = parameter(0.0, "metres upwards", low=-50, high=50)
-    turn: float = parameter(0.0, "degrees to the left", low=-360, high=360)
+    ahead: float = parameter(0.0, "shift forward", unit="m", low=-500, high=500)
+    left: float = parameter(3.0, "shift to the left", unit="m", low=-500, high=500)
+    up: float = parameter(0.0, "shift upwards", unit="m", low=-50, high=50)
+    turn: float = parameter(0.0, "turn to the left", unit="degrees", low=-360, high=360)
 
     def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:
         """The cloud with the returns at the other place; no shadow moves with them."""
@@ -165,7 +170,7 @@ class Move(TargetReturns):
 class Insert(Region):
     """Insert returns on a box where beams with a return intersect it."""
 
-    noise: float = parameter(0.02, "standard deviation of their ranges, metres", low=0, high=1)
+    noise: float = parameter(0.02, "standard deviation of their ranges", unit="m", low=0, high=1)
     intensity: float = parameter(40.0, "of them", low=0, high=255)
     replaces: bool = parameter(True, "the returns behind are deleted: the box casts a shadow")
 
@@ -199,9 +204,9 @@ class FalseWeather(Tampering):
     """Returns are replaced by near ones at random ranges, to look like fog or rain."""
 
     share: float = parameter(0.1, "share of the returns", low=0, high=1)
-    nearest: float = parameter(1.5, "least range, metres", low=0.1, high=100)
+    nearest: float = parameter(1.5, "least range", unit="m", low=0.1, high=100)
     mean: float = parameter(
-        6.0, "mean range beyond that, metres; exponentially distributed", low=0.1, high=200
+        6.0, "mean range beyond that; exponentially distributed", unit="m", low=0.1, high=200
     )
     intensity: float = parameter(3.0, "mean of their intensities", low=0, high=255)
 

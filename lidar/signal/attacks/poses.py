@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from geoscene.typing import Float
+from lidar.parameters import parameter
 from lidar.sensors.navigation.measurements import Fixes
 from lidar.sensors.navigation.satellite_visibility import E2, A
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 
 
 @dataclass(frozen=True)
@@ -23,16 +24,18 @@ class GnssSpoof(Stage):
     """
 
     kind: str = parameter("ramp", "step, ramp (constant drift) or smooth", among=("step", "ramp", "smooth"))
-    east: float = parameter(0.0, "metres to the east in the end", low=-1e5, high=1e5)
-    north: float = parameter(0.0, "metres to the north in the end", low=-1e5, high=1e5)
-    left: float = parameter(3.0, "metres to the left of the driven direction in the end", low=-1e5, high=1e5)
-    ahead: float = parameter(0.0, "metres along the driven direction in the end", low=-1e5, high=1e5)
-    up: float = parameter(0.0, "metres upwards in the end", low=-1e4, high=1e4)
-    start: float = parameter(5.0, "seconds since the drive's start at which it begins", low=0)
-    ramp: float = parameter(
-        20.0, "seconds until the whole offset is reached; not of a step", low=0.1, high=1e6
+    east: float = parameter(0.0, "shift to the east in the end", unit="m", low=-1e5, high=1e5)
+    north: float = parameter(0.0, "shift to the north in the end", unit="m", low=-1e5, high=1e5)
+    left: float = parameter(
+        3.0, "shift to the left of the driven direction in the end", unit="m", low=-1e5, high=1e5
     )
-    stop: float = parameter(1e9, "seconds since the drive's start at which it ends at once", low=0)
+    ahead: float = parameter(0.0, "shift along the driven direction in the end", unit="m", low=-1e5, high=1e5)
+    up: float = parameter(0.0, "shift upwards in the end", unit="m", low=-1e4, high=1e4)
+    start: float = parameter(5.0, "time since the drive's start at which it begins", unit="s", low=0)
+    ramp: float = parameter(
+        20.0, "time until the whole offset is reached; not of a step", unit="s", low=0.1, high=1e6
+    )
+    stop: float = parameter(1e9, "time since the drive's start at which it ends at once", unit="s", low=0)
 
     def fixes(self, fixes: Fixes, *, at: Situation, rng: np.random.Generator) -> Fixes:
         """The fixes with the offset."""

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.signal.attacks.attacker import TimedAttacker, power_of, sent_back
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import Pulses
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,9 @@ class Relay(TimedAttacker):
     They have the sensor's own code and firing time, so neither codes nor random delays of pulses hinder it.
     """
 
-    delay: float = parameter(100.0, "ns from receiving a pulse to sending it back", low=0, high=1e5)
+    delay: float = parameter(
+        100.0, "time from receiving a pulse to sending it back", unit="ns", low=0, high=1e5
+    )
     dimmest: float = parameter(0.3, "least apparent reflectance of a point", low=0, high=1)
     brightest: float = parameter(1.0, "greatest apparent reflectance of a point", low=0, high=1)
     share: float = parameter(1.0, "share of the pulses that are received and sent back", low=0, high=1)

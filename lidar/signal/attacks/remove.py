@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar.parameters import parameter
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import DEVICES, Aim, Attacker, sent_back
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import Pulses
 
 POWER_SPREAD = (0.5, 1.0)
 """Powers of unsynchronised pulses over the most that arrives, as they meet the receiver's gate; assumed."""

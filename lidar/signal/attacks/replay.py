@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lidar.parameters import parameter
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.intensity import apparent_of_code
@@ -14,7 +15,7 @@ from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.pulse_identity import has_code, shift_by_delay
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, power_of, sent_back
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import Pulses
 
 _REPEATING = ("spinning", "flash", "scan2d")
 """Kinds of scanner whose pulses of the same ring and column have the same direction in each frame."""
@@ -30,7 +31,9 @@ class Replay(SynchronisedAttacker):
     Frames before which there is no earlier one stay as they are.
     """
 
-    seconds: float = parameter(1.0, "seconds between the recorded frame and its replay", low=0.01, high=600)
+    seconds: float = parameter(
+        1.0, "time between the recorded frame and its replay", unit="s", low=0.01, high=600
+    )
     gain: float = parameter(2.0, "power over that of the recorded return; assumed", low=1e-3, high=1e6)
 
     @property

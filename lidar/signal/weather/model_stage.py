@@ -9,11 +9,11 @@ import numpy as np
 from geoscene.classes import Class
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
-from lidar.signal.stage import parameter
 from lidar.signal.weather.camera import add_weather
 from lidar.signal.weather.hahner import hahner_fog, hahner_snow
 from lidar.signal.weather.lisa import LOST, SCATTERED, Lidar, RemainingReturns, goodin, lisa
@@ -31,10 +31,14 @@ class WeatherModel(WeatherSetting):
 
     model: str = parameter("lisa", "the model", among=("lisa", "goodin", "hahner_fog", "hahner_snow"))
     max_range: float = parameter(
-        0.0, "lisa, goodin: metres at which a 90 % target is just seen; 0: the paper's", low=0, high=1e4
+        0.0,
+        "lisa, goodin: distance at which a 90 % target is just seen; 0: the paper's",
+        unit="m",
+        low=0,
+        high=1e4,
     )
     last: bool = parameter(default=False, meaning="lisa: report the last return, not the strongest")
-    fall_speed: float = parameter(1.6, "hahner_snow: fall speed of flakes, m/s", low=0.1, high=10)
+    fall_speed: float = parameter(1.6, "hahner_snow: fall speed of flakes", unit="m/s", low=0.1, high=10)
 
     def __post_init__(self) -> None:
         """Validate the parameters; models on clouds are alike everywhere and have no cover glass."""

@@ -1,17 +1,12 @@
-"""What weather there is: one kind with its amount, where and when; read from text and TOML files."""
+"""Settings of weather: one kind with its amount, place and time."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from math import isfinite
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
-from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
-from lidar.signal.stage import POSES, ROAD_USERS, Stage, parameter
+from lidar.parameters import parameter
+from lidar.signal.stage import POSES, ROAD_USERS, Stage
 
 _TEXTURE = 1.2  # mm of water that fill the texture of a road (Hahner et al. 2022)
 
@@ -74,15 +69,6 @@ MODELS = {
 _PUBLISHED = {"snow": "gunn-marshall"}
 """Media of published models, where they are not the first one of the kind."""
 
-_UNITS = {
-    "mm/h": {"mm/h": 1.0, "cm/h": 10.0},
-    "m": {"m": 1.0, "km": 1000.0},
-    "mm": {"mm": 1.0, "cm": 10.0},
-    "": {},
-}
-_CENTRE = {"longitude", "latitude", "radius"}
-_AMOUNT = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\S*)\s*")
-
 
 @dataclass(frozen=True)
 class WeatherSetting(Stage):
@@ -96,27 +82,33 @@ class WeatherSetting(Stage):
         10.0, "rain and snow: mm/h (as water); fog and dust: visibility, m; spray: mm of water on the road"
     )
     amount_to: float = parameter(-1.0, "amount at the end, approached linearly; -1: amount, all the time")
-    start: float = parameter(0.0, "begin, seconds since the drive's start", low=0, high=FOREVER)
-    end: float = parameter(FOREVER, "end, seconds since the drive's start", low=0, high=FOREVER)
+    start: float = parameter(0.0, "begin, since the drive's start", unit="s", low=0, high=FOREVER)
+    end: float = parameter(FOREVER, "end, since the drive's start", unit="s", low=0, high=FOREVER)
     model: str = parameter("physical", "model of what lasers measure", among=tuple(MODELS))
     medium: str = parameter("", "law of extinction and sizes of the particles; of the kind if empty")
-    longitude: float = parameter(0.0, "centre of the place, degrees, with radius", low=-180, high=180)
-    latitude: float = parameter(0.0, "centre of the place, degrees, with radius", low=-90, high=90)
-    radius: float = parameter(0.0, "radius of the place, metres; 0: everywhere", low=0, high=1e6)
+    longitude: float = parameter(0.0, "centre of the place, with radius", unit="degrees", low=-180, high=180)
+    latitude: float = parameter(0.0, "centre of the place, with radius", unit="degrees", low=-90, high=90)
+    radius: float = parameter(0.0, "radius of the place; 0: everywhere", unit="m", low=0, high=1e6)
     polygon: str = parameter("", "the place as 'LON LAT, LON LAT, ...', degrees; everywhere if empty")
     edge: float = parameter(
-        0.0, "metres over which the weather fades in at the place's edge", low=0, high=1e5
+        0.0, "distance over which the weather fades in at the place's edge", unit="m", low=0, high=1e5
     )
-    wind: float = parameter(0.0, "wind speed, m/s", low=0, high=60)
-    wind_from: float = parameter(270.0, "direction that the wind comes from, degrees", low=0, high=360)
+    wind: float = parameter(0.0, "wind speed", unit="m/s", low=0, high=60)
+    wind_from: float = parameter(270.0, "direction that the wind comes from", unit="degrees", low=0, high=360)
     wetness: float = parameter(-1.0, "wetness of surfaces, 0 to 1; -1: of the kind", low=-1, high=1)
     snow_cover: float = parameter(-1.0, "share of ground under snow; -1: of the kind", low=-1, high=1)
     lens: float = parameter(
-        30.0, "diameter of the receiver's lens, mm, which blurs what is near; 0: none", low=0, high=1000
+        30.0,
+        "diameter of the receiver's lens, which blurs what is near; 0: none",
+        unit="mm",
+        low=0,
+        high=1000,
     )
     drops: float = parameter(0.0, "share of the cover glass under drops of water", low=0, high=1)
     dirt: float = parameter(0.0, "share of light that dirt on the cover glass absorbs", low=0, high=0.99)
-    sunlight: float = parameter(0.0, "direct sunlight, lux, which dazzles the detector", low=0, high=150_000)
+    sunlight: float = parameter(
+        0.0, "direct sunlight, which dazzles the detector", unit="lux", low=0, high=150_000
+    )
 
     def __post_init__(self) -> None:
         """Validate the parameters, and fill in the medium of the kind."""
@@ -179,11 +171,6 @@ class WeatherSetting(Stage):
         pairs = [pair.split() for pair in self.polygon.split(",")] if self.polygon else []
         return [(float(lon), float(lat)) for lon, lat in pairs]
 
-    def table(self) -> dict[str, Any]:
-        """The stage of this setting, as `lidar.signal.registry.read_stage` reads it."""
-        name = "weather" if self.model == "physical" else "weather_model"
-        return {"name": name, **asdict(self)}
-
 
 def _faults(setting: WeatherSetting, kind: WeatherKind) -> list[str]:
     """What is wrong with a setting whose values are each of their type."""
@@ -228,124 +215,3 @@ def _polygon_faults(setting: WeatherSetting) -> list[str]:
     if len(corners) < 3 or not Polygon(corners).is_valid:
         return ["polygon needs three or more corners, and its sides may not cross"]
     return []
-
-
-def read_weather(text: str) -> tuple[WeatherSetting, ...]:
-    """Weather from a text such as ``rain=10mm/h``, ``fog=50m,medium=radiation`` or from a file ``FILE.toml``.
-
-    A text names one or more kinds, separated by commas, each followed by its parameters. A file has a table
-    ``[[weather]]`` for each setting, with ``kind``, ``amount``, optionally ``from`` and ``to`` (seconds),
-    ``polygon`` ([[lon, lat], ...]) or ``centre`` ([lon, lat]) and ``radius`` (metres), ``interpolation``
-    (``step`` or ``linear``, which goes to ``amount_to``), and the other parameters of `WeatherSetting`.
-
-    Raises InputError for what cannot be read.
-    """
-    if text.endswith(".toml"):
-        return _of_file(Path(text))
-    tables: list[dict[str, Any]] = []
-    for part in text.split(","):
-        name, equals, value = (word.strip() for word in part.partition("="))
-        if name in KINDS:
-            tables.append({"kind": name} | ({"amount": value} if equals else {}))
-        elif tables and equals:
-            if name in tables[-1]:
-                raise InputError(f"weather {text!r}: {name} is given twice")
-            tables[-1][name] = _number(value)
-        else:
-            known = ", ".join(KINDS)
-            raise InputError(f"weather {text!r}: {part.strip()!r} is no kind of weather; known are {known}")
-    try:
-        return tuple(_setting(table) for table in tables)
-    except InputError as error:
-        raise InputError(f"weather {text!r}: {error}") from None
-
-
-def _of_file(path: Path) -> tuple[WeatherSetting, ...]:
-    try:
-        document = read_toml(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
-    tables = document.pop("weather", None)
-    if document or not tables or not isinstance(tables, list) or not all(isinstance(t, dict) for t in tables):
-        raise InputError(f"{path}: give tables [[weather]] with kind and amount, and nothing else")
-    found = []
-    for number, table in enumerate(tables, 1):
-        try:
-            found.append(_setting(_row(table)))
-        except InputError as error:
-            raise InputError(f"{path}: [[weather]] {number}: {error}") from None
-    return tuple(found)
-
-
-def _row(table: Mapping[str, Any]) -> dict[str, Any]:
-    """A table of a file with the names of `WeatherSetting`."""
-    names = [{"start": "from", "end": "to"}.get(f.name, f.name) for f in fields(WeatherSetting)]
-    if unknown := [key for key in table if key not in (*names, "start", "end", "centre", "interpolation")]:
-        known = ", ".join([*names, "centre", "interpolation"])
-        raise InputError(f"no parameter {unknown[0]!r} (known are {known})")
-    row = {{"from": "start", "to": "end"}.get(key, key): value for key, value in table.items()}
-    if "kind" not in row:
-        raise InputError("kind is missing")
-    if "centre" in row:
-        centre = row.pop("centre")
-        if not _is_pair(centre) or "radius" not in row:
-            raise InputError("centre is [longitude, latitude] in degrees, with a radius in metres")
-        row["longitude"], row["latitude"] = centre
-    if isinstance(row.get("polygon"), list):
-        if not all(_is_pair(corner) for corner in row["polygon"]):
-            raise InputError("polygon is [[longitude, latitude], ...] in degrees")
-        row["polygon"] = ", ".join(f"{lon!r} {lat!r}" for lon, lat in row["polygon"])
-    way = row.pop("interpolation", "linear" if "amount_to" in row else "step")
-    if way not in ("step", "linear") or (way == "linear") != ("amount_to" in row):
-        raise InputError("interpolation is step, or linear with amount_to")
-    return row
-
-
-def _is_pair(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 2
-        and all(isinstance(x, int | float) and isfinite(x) for x in value)
-    )
-
-
-def _setting(table: Mapping[str, Any]) -> WeatherSetting:
-    known = [f.name for f in fields(WeatherSetting)]
-    if unknown := [key for key in table if key not in known]:
-        raise InputError(f"no parameter {unknown[0]!r} (known are {', '.join(known)})")
-    if missing := _CENTRE - table.keys() if _CENTRE & table.keys() else ():
-        raise InputError(f"a centre needs longitude, latitude and radius; {min(missing)} is missing")
-    values = dict(table)
-    kind = KINDS.get(values["kind"]) if isinstance(values["kind"], str) else None
-    if kind is None:
-        raise InputError(f"kind = {values['kind']!r} is none of {', '.join(KINDS)}")
-    if "amount" not in values and kind.default is None:
-        raise InputError(f"{values['kind']} needs an amount ({kind.meaning}, {kind.unit})")
-    values.setdefault("amount", kind.default)
-    for name in ("amount", "amount_to"):
-        if isinstance(values.get(name), str):
-            values[name] = _amount(values[name], values["kind"])
-    return WeatherSetting(**values)
-
-
-def _amount(text: str, kind: str) -> float:
-    """An amount in the unit of its kind, from a number with or without a unit."""
-    unit = KINDS[kind].unit
-    found = _AMOUNT.fullmatch(text)
-    factors = {"": 1.0, **_UNITS[unit]}
-    if not found or found[2] not in factors:
-        raise InputError(
-            f"amount {text!r} of {kind} is not a number in {' or '.join(_UNITS[unit]) or 'no unit'}"
-        )
-    try:
-        return float(found[1]) * factors[found[2]]
-    except ValueError:
-        raise InputError(f"amount {text!r} of {kind} is not a number") from None
-
-
-def _number(text: str) -> float | str:
-    """A number if the text is one."""
-    try:
-        return float(text)
-    except ValueError:
-        return text

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Pulses, parameter
+from lidar.signal.stage import Pulses
 from lidar.signal.weather.air import through_air
 from lidar.signal.weather.camera import add_weather
 from lidar.signal.weather.fields import amounts, field_of, rays_of

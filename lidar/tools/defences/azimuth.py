@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict
@@ -30,7 +30,7 @@ class Azimuth(Defence):
 
     history: ClassVar[int] = 5
 
-    width: float = parameter(4.0, "width of the sector, degrees", low=1, high=90)
+    width: float = parameter(4.0, "width of the sector", unit="degrees", low=1, high=90)
     turn: float = parameter(
         0.35, "share of the turn that may lack a ring's returns, as towards side streets", low=0, high=0.9
     )

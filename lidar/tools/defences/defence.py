@@ -10,15 +10,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from lidar.signal.stage import Stage
+from lidar.parameters import Parameters
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict
 from lidar.world.world import World
 
 
 @dataclass(frozen=True)
-class Defence(Stage):
-    """Base of all defences; its fields are made by `lidar.signal.stage.parameter`.
+class Defence(Parameters):
+    """Base of all defences; its fields are made by `lidar.parameters.parameter`.
 
     history : number of earlier frames that it looks at
     needs   : what a dataset must have: ``columns`` (ring, column, time and range of returns), ``cameras``,

@@ -9,9 +9,9 @@ from typing import ClassVar
 import numpy as np
 
 from geoscene.typing import Float
+from lidar.parameters import parameter
 from lidar.raycast.geometry import ALL
 from lidar.sensors.physics.link import amplitude
-from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import FEW, Gaps, Verdict, greatest
@@ -27,13 +27,13 @@ class Map(Defence):
 
     needs: ClassVar[frozenset[str]] = frozenset({"scene"})
 
-    tolerance: float = parameter(0.5, "error of the map and the pose, metres", low=0, high=20)
+    tolerance: float = parameter(0.5, "error of the map and the pose", unit="m", low=0, high=20)
     share: float = parameter(0.02, "error that grows with distance, metres per metre", low=0, high=1)
     reflectance: float = parameter(0.1, "reflectance that surfaces have at least", low=0.01, high=1)
     margin: float = parameter(
         3.0, "power over the threshold from which a surface must be seen", low=1, high=100
     )
-    width: float = parameter(3.0, "width of a sector of missing returns, degrees", low=1, high=90)
+    width: float = parameter(3.0, "width of a sector of missing returns", unit="degrees", low=1, high=90)
 
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator

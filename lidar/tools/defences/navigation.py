@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import NavigationMeasurements as Measured
 from lidar.tools.defences.observation import Observation
@@ -49,11 +49,11 @@ class NavigationDefence(Defence):
     history: ClassVar[int] = _LAG
     needs: ClassVar[frozenset[str]] = frozenset({"navigation"})
 
-    sigma: float = parameter(0.05, "error of a matched return along its normal, metres", low=0.001, high=1)
+    sigma: float = parameter(0.05, "error of a matched return along its normal", unit="m", low=0.001, high=1)
     floor: float = parameter(
-        0.02, "least standard deviation of the matched motion, metres", low=0.001, high=1
+        0.02, "least standard deviation of the matched motion", unit="m", low=0.001, high=1
     )
-    drift: float = parameter(0.2, "error of the turn by the gyroscope, degrees", low=0.001, high=10)
+    drift: float = parameter(0.2, "error of the turn by the gyroscope", unit="degrees", low=0.001, high=10)
 
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator

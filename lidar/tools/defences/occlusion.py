@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
@@ -63,7 +63,7 @@ class Occlusion(Defence):
 
     valid: float = parameter(0.05, "share of rays behind a box up to which it is genuine", low=0, high=1)
     spoofed: float = parameter(0.15, "share of rays behind a box from which it is forged", low=0, high=1)
-    cell: float = parameter(0.25, "size of the voxels of free space, metres", low=0.05, high=2)
+    cell: float = parameter(0.25, "size of the voxels of free space", unit="m", low=0.05, high=2)
     core: float = parameter(0.8, "part of the box that rays must cross, of its size", low=0.1, high=1)
 
     def judge(

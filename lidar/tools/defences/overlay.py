@@ -14,8 +14,8 @@ from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from geoscene.typing import Float
+from lidar.parameters import parameter
 from lidar.sensors.rig.camera_model import project
-from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation, Picture, pixels_of
 from lidar.tools.defences.verdict import Verdict, of_objects
@@ -55,8 +55,12 @@ class Overlay(Defence):
 
     needs: ClassVar[frozenset[str]] = frozenset({"cameras"})
 
-    slack: float = parameter(3.0, "error of calibration and time in the image, pixels", low=0, high=100)
-    lag: float = parameter(0.06, "most seconds between the image and the frame's pulses", low=0, high=10)
+    slack: float = parameter(
+        3.0, "error of calibration and time in the image", unit="pixels", low=0, high=100
+    )
+    lag: float = parameter(
+        0.06, "greatest time between the image and the frame's pulses", unit="s", low=0, high=10
+    )
     edge: float = parameter(12.0, "grey levels per pixel of an edge of strength 1/2", low=0.1, high=255)
 
     def judge(

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Bools, Float
+from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
-from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import FEW, Verdict, greatest
@@ -30,9 +30,9 @@ class Physics(Defence):
     """Returns off the ray grid, at wrong times, too many a pulse, or of a power that cannot be."""
 
     angle: float = parameter(
-        0.02, "deviation from the ray that has suspicion 0.5, degrees", low=1e-4, high=10
+        0.02, "deviation from the ray that has suspicion 0.5", unit="degrees", low=1e-4, high=10
     )
-    length: float = parameter(0.01, "difference of range and coordinates that has suspicion 0.5, metres",
+    length: float = parameter(0.01, "difference of range and coordinates that has suspicion 0.5", unit="m",
                               low=1e-4, high=10)  # fmt: skip
     brightness: float = parameter(1.5, "power over that of a white Lambertian target which is unusual", low=1)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
@@ -25,9 +25,9 @@ class Shadow(Defence):
         low=0,
         high=10,
     )
-    length: float = parameter(15.0, "greatest length of a shadow, metres", low=1, high=100)
+    length: float = parameter(15.0, "greatest length of a shadow", unit="m", low=1, high=100)
     margin: float = parameter(
-        0.3, "distance behind the object at which its shadow begins, metres", low=0, high=5
+        0.3, "distance behind the object at which its shadow begins", unit="m", low=0, high=5
     )
 
     def judge(

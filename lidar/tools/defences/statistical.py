@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import FEW, Verdict, greatest

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
@@ -34,10 +34,12 @@ class Temporal(Defence):
 
     history: ClassVar[int] = max(_LAGS)
 
-    near: float = parameter(0.35, "distance of a return that supports another, metres", low=0.05, high=5)
-    acceleration: float = parameter(3.0, "of objects, m/s2: widens the distance with time", low=0, high=20)
-    speed: float = parameter(25.0, "greatest speed of objects that is tried, m/s", low=0, high=100)
-    step: float = parameter(1.0, "step of the speeds that are tried, m/s", low=0.1, high=10)
+    near: float = parameter(0.35, "distance of a return that supports another", unit="m", low=0.05, high=5)
+    acceleration: float = parameter(
+        3.0, "acceleration of objects, which widens the distance with time", unit="m/s^2", low=0, high=20
+    )
+    speed: float = parameter(25.0, "greatest speed of objects that is tried", unit="m/s", low=0, high=100)
+    step: float = parameter(1.0, "step of the speeds that are tried", unit="m/s", low=0.1, high=10)
 
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator

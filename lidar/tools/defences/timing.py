@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from geoscene.typing import Float
+from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
 from lidar.sensors.physics.range_error import signal_sigma
-from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, greatest

@@ -14,10 +14,10 @@ from geoscene.typing import Float
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import DatasetError
 from lidar.sensors.physics.origin import Origin
-from lidar.signal.registry import acts_on, attack_names
+from lidar.signal.registry import ATTACKS, acts_on
 
-ATTACKS = (Origin.INJECTED, Origin.REPLAYED, Origin.MOVED)
-"""Causes of returns that an attack gives."""
+FORGED = (Origin.INJECTED, Origin.REPLAYED, Origin.MOVED)
+"""Origins of returns that an attack adds or moves."""
 
 FORGED_SHARE = 0.5
 """Share of a box's returns from which on attacked ones make it a forged object."""
@@ -58,7 +58,7 @@ def attack_truth(dataset: Dataset, sensor: str, *, frame: int, count: int, secon
     with reading_file(dataset.paths.manifest):
         stages = [table for key in ("stages", "applied_stages") for table in recipe.get(key, ())]
         goes_on = any(
-            table["name"] in attack_names()
+            table["name"] in ATTACKS
             and acts_on(table, sensor, kind="lidar")
             and table["start"] <= seconds < table["stop"]
             for table in stages
@@ -81,7 +81,7 @@ def frame_truth(dataset: Dataset, sensor: str, *, frame: int, count: int) -> Fra
         raise DatasetError(f"{path}: is of {len(origin)} returns, the cloud has {count}")
     by_weather = hidden[(origin == Origin.WEATHER) & (hidden >= 0)]
     missing = ~np.isin(removed, by_weather)
-    return FrameTruth(np.isin(origin, ATTACKS), xyz[missing])
+    return FrameTruth(np.isin(origin, FORGED), xyz[missing])
 
 
 def _read(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.int32], NDArray[np.int32], Float]:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
+from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
-from lidar.signal.stage import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict, greatest
@@ -27,10 +27,10 @@ _CERTAIN = 1.7
 class Void(Defence):
     """Ground without returns that nothing nearer hides (Hau et al. 2022; fake shadows: Cao et al. 2023)."""
 
-    sector: float = parameter(1.0, "azimuth of the cells of the ground, degrees", low=0.2, high=10)
-    least: float = parameter(1.8, "area of a void, square metres", low=0, high=1000)
-    reach: float = parameter(30.0, "distance up to which the ground is looked at, metres", low=5, high=100)
-    half: float = parameter(6.0, "area of a void that has suspicion 0.5, square metres", low=0.1, high=1000)
+    sector: float = parameter(1.0, "azimuth of the cells of the ground", unit="degrees", low=0.2, high=10)
+    least: float = parameter(1.8, "area of a void", unit="m^2", low=0, high=1000)
+    reach: float = parameter(30.0, "distance up to which the ground is looked at", unit="m", low=5, high=100)
+    half: float = parameter(6.0, "area of a void that has suspicion 0.5", unit="m^2", low=0.1, high=1000)
 
     def judge(
         self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from lidar.signal.stage import parameter
+from lidar.parameters import parameter
 from lidar.tools.defences.defence import Defence
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict
@@ -27,8 +27,8 @@ class WatermarkDefence(Defence):
     needs: ClassVar[frozenset[str]] = frozenset({"watermark"})
 
     key: str = parameter("", "file with the key")
-    step: float = parameter(STEP, "metres, as it was embedded with", low=1e-4, high=1)
-    noise: float = parameter(NOISE, "standard deviation of noise since, metres", low=0, high=1)
+    step: float = parameter(STEP, "step with which it was embedded", unit="m", low=1e-4, high=1)
+    noise: float = parameter(NOISE, "standard deviation of noise since", unit="m", low=0, high=1)
     false_alarms: float = parameter(
         0.01, "blocks a cloud above suspicion 0.5 without tampering", low=1e-9, high=100
     )

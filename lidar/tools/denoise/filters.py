@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from difflib import get_close_matches
+from dataclasses import dataclass
 from math import radians
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from geoscene.support.registry import Registry
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.signal.stage import Stage, parameter
+from lidar.grammar import item_text, read_items
+from lidar.parameters import Parameters, build, parameter
 
 Bools = NDArray[np.bool_]
 
@@ -25,7 +25,7 @@ _FACTORS = np.linspace(0.016, 0.034, 10)
 
 
 @dataclass(frozen=True)
-class Filter(Stage):
+class Filter(Parameters):
     """Base of all filters."""
 
     @abstractmethod
@@ -58,8 +58,8 @@ class Dror(Filter):
 
     neighbours: int = parameter(3, "least number of returns within the radius", low=1, high=100)
     multiplier: float = parameter(3.0, "radius over the spacing of columns", low=0.1, high=100)
-    angle: float = parameter(0.16, "spacing of columns, degrees", low=0.001, high=10)
-    radius: float = parameter(0.04, "least radius, metres", low=0, high=10)
+    angle: float = parameter(0.16, "spacing of columns", unit="degrees", low=0.001, high=10)
+    radius: float = parameter(0.04, "least radius", unit="m", low=0, high=10)
 
     def kept(self, xyz: Float, intensity: Float) -> Bools:
         """Returns with enough neighbours."""
@@ -76,7 +76,7 @@ class Dsor(Filter):
 
     neighbours: int = parameter(5, "nearest returns", low=1, high=500)
     deviations: float = parameter(0.01, "standard deviations above the mean", low=0, high=100)
-    factor: float = parameter(0.05, "of the limit per metre of distance", low=1e-4, high=10)
+    factor: float = parameter(0.05, "growth of the limit with the distance", unit="1/m", low=1e-4, high=10)
 
     def kept(self, xyz: Float, intensity: Float) -> Bools:
         """Returns near enough to their neighbours for their distance."""
@@ -92,8 +92,10 @@ class Lior(Filter):
     """Low intensity: dim returns without neighbours, within the range of snow (Park et al. 2020)."""
 
     intensity: float = parameter(5.0, "greatest code of a dim return", low=0, high=255)
-    range: float = parameter(71.2, "metres up to which snow is detected", low=0, high=1e4)
-    radius: float = parameter(0.1, "metres within which neighbours save a dim return", low=0, high=10)
+    range: float = parameter(71.2, "range up to which snow is detected", unit="m", low=0, high=1e4)
+    radius: float = parameter(
+        0.1, "radius within which neighbours save a dim return", unit="m", low=0, high=10
+    )
     neighbours: int = parameter(3, "number of them", low=1, high=100)
 
     def kept(self, xyz: Float, intensity: Float) -> Bools:
@@ -120,56 +122,31 @@ class Ddior(Filter):
         return kept
 
 
-METHODS: dict[str, type[Filter]] = {
-    "statistical": StatisticalFilter,
-    "dror": Dror,
-    "dsor": Dsor,
-    "lior": Lior,
-    "ddior": Ddior,
-}
+METHODS: Registry[type[Filter]] = Registry(
+    "method",
+    {"statistical": StatisticalFilter, "dror": Dror, "dsor": Dsor, "lior": Lior, "ddior": Ddior},
+    error=InputError,
+)
 """Filters by name."""
 
 
 def read_methods(texts: Iterable[str]) -> dict[str, Filter]:
-    """Filters by their text ``NAME`` or ``NAME:KEY=VALUE:KEY=VALUE``.
+    """Filters by their text ``NAME:KEY=VALUE,KEY=VALUE``; several are separated by commas.
+
+    texts : also files ``FILE.toml`` with tables ``[[method]]``
 
     Raises InputError for a filter or parameter that is unknown or given twice, a value out of its bounds, or
     no text.
     """
     found: dict[str, Filter] = {}
-    for text in map(str.strip, texts):
+    for item in read_items(texts, METHODS, table="method"):
+        text = item_text(item)
         if text in found:
             raise InputError(f"method {text}: given twice")
-        found[text] = _read(text)
+        found[text] = build(METHODS, item)
     if not found:
         raise InputError(f"`method`: give one or more of {', '.join(METHODS)}")
     return found
-
-
-def _read(text: str) -> Filter:
-    name, *pairs = (part.strip() for part in text.split(":"))
-    if name not in METHODS:
-        near = get_close_matches(name, METHODS, 1)
-        hint = f"; is {near[0]} meant?" if near else ""
-        raise InputError(f"method {name!r} is unknown{hint} (known are {', '.join(METHODS)})")
-    known: dict[str, Any] = {f.name: type(f.default) for f in fields(METHODS[name])}
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        key, equals, value = (part.strip() for part in pair.partition("="))
-        if not equals:
-            raise InputError(f"method {text}: give NAME:KEY=VALUE:KEY=VALUE")
-        if key not in known:
-            raise InputError(f"method {name}: no parameter {key!r} (known are {', '.join(known)})")
-        if key in values:
-            raise InputError(f"method {name}: {key} is given twice")
-        try:
-            values[key] = known[key](value)
-        except ValueError:
-            values[key] = value
-    try:
-        return METHODS[name](**values)
-    except InputError as error:
-        raise InputError(f"method {name}: {error}") from None
 
 
 def _nearest(xyz: Float, count: int, *, of: Bools | None = None) -> Float:

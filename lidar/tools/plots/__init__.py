@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
+from geoscene.support.registry import Registry, load
 from lidar.errors import InputError
 from lidar.options import PlotOptions
 
@@ -22,7 +22,7 @@ class Figure:
     """A row of `FIGURES`.
 
     name     : by which users choose it
-    function : module and function in this folder; called with a dataset, options and ``progress``
+    function : ``module:function`` in this folder; called with a dataset, options and ``progress``
     meaning  : what is drawn, one line
     takes    : options of `PlotOptions` that it uses
     """
@@ -33,32 +33,50 @@ class Figure:
     takes: tuple[str, ...]
 
 
-FIGURES = {
-    row.name: row
-    for row in (
-        Figure(
-            "range-image",
-            "sweeps.range_image",
-            "range, intensity and class of a sweep by azimuth and ring",
-            ("sensor", "frames"),
-        ),
-        Figure("intensity", "sweeps.intensity", "histogram of intensities by class", ("sensor", "frames")),
-        Figure("returns", "sweeps.returns", "returns by range, class and origin", ("sensor", "frames")),
-        Figure("speed", "motion.speed", "speed and acceleration of the vehicle over time", ()),
-        Figure(
-            "coverage",
-            "coverage.coverage",
-            "returns per square metre on a plan, with the path",
-            ("sensor", "frames", "resolution"),
-        ),
-        Figure(
-            "gnss",
-            "fixes.gnss",
-            "errors of a receiver east, north and up over time, with the stated standard deviation",
-            ("sensor",),
-        ),
-    )
-}
+_FIGURES = (
+    Figure(
+        "range-image",
+        "sweeps:range_image",
+        "range, intensity and class of a sweep by azimuth and ring",
+        ("sensor", "frames"),
+    ),
+    Figure(
+        "intensity",
+        "sweeps:intensity",
+        "histogram of intensities by class",
+        ("sensor", "frames"),
+    ),
+    Figure(
+        "returns",
+        "sweeps:returns",
+        "returns by range, class and origin",
+        ("sensor", "frames"),
+    ),
+    Figure(
+        "speed",
+        "motion:speed",
+        "speed and acceleration of the vehicle over time",
+        (),
+    ),
+    Figure(
+        "coverage",
+        "coverage:coverage",
+        "returns per square metre on a plan, with the path",
+        ("sensor", "frames", "resolution"),
+    ),
+    Figure(
+        "gnss",
+        "fixes:gnss",
+        "errors of a receiver east, north and up over time, with the stated standard deviation",
+        ("sensor",),
+    ),
+)
+
+FIGURES: Registry[Figure] = Registry(
+    "figure",
+    {row.name: row for row in _FIGURES},
+    error=InputError,
+)
 """The figures of a dataset by name."""
 
 
@@ -78,16 +96,12 @@ def plot(
     Raises InputError for an unknown figure and options that it does not take, and DatasetError for a dataset
     that lacks what it shows.
     """
-    if what not in FIGURES:
-        raise InputError(f"no figure {what}; there are {', '.join(FIGURES)}")
-    row, out = FIGURES[what], Path(out)
+    row, out = FIGURES.find(what), Path(out)
     for name in ("sensor", "frames", "resolution"):
         if name not in row.takes and getattr(options, name) != getattr(PlotOptions(), name):
             raise InputError(f"`{name}`: {what} does not take it; leave it out")
     check_out(out, overwrite=overwrite)
-    module, name = row.function.split(".")
-    function = getattr(importlib.import_module(f"lidar.tools.plots.{module}"), name)
-    drawn: Drawn = function(dataset, options, progress=progress)
+    drawn: Drawn = load(f"lidar.tools.plots.{row.function}")(dataset, options, progress=progress)
     write_atomically(out, drawn.canvas.encoded(out.suffix.lower()))
     return drawn
 

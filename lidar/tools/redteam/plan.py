@@ -152,8 +152,8 @@ def _attacks(path: Path, tables: Any) -> tuple[Attack, ...]:
 def _attack(table: Mapping[str, Any]) -> Attack:
     if unknown := sorted(set(table) - {"name", "attack", "goal", "published"}):
         raise InputError(f"unknown {unknown[0]}; there are name, attack, goal and published")
-    for name in ("name", "attack", "goal"):
-        if not table.get(name) or not isinstance(table[name], str):
+    for name, kinds in (("name", str), ("attack", (str, dict)), ("goal", str)):
+        if not table.get(name) or not isinstance(table[name], kinds):
             raise InputError(f"{name}: give a text")
     if table["goal"] not in GOALS:
         raise InputError(f"goal = {table['goal']!r}: one of {', '.join(GOALS)}")
@@ -167,9 +167,9 @@ def _defences(table: Any) -> tuple[NamedDefence, ...]:
     if not isinstance(table, dict) or set(table) - {"use"}:
         raise InputError('give a table with use = ["NAME", ...]')
     use = table.get("use", ["all"])
-    if not isinstance(use, list) or not all(isinstance(name, str) for name in use):
+    if not isinstance(use, list) or not all(isinstance(name, str | dict) for name in use):
         raise InputError('use: give a list of names, such as ["occlusion", "shadow"]')
-    return read_defences(use)
+    return read_defences(map(text_of, use))
 
 
 def _measure(table: Any) -> Measure:

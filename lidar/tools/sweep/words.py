@@ -11,6 +11,7 @@ from cyclopts import CycloptsError
 
 from geoscene.errors import GeosceneError
 from lidar.errors import InputError, LidarError
+from lidar.grammar import item_of, item_text, value_text
 
 _REPEATED = ("set", "stage", "weather", "attack")
 """Options of which each value is given by a flag of its own."""
@@ -29,23 +30,21 @@ def naming(path: Path, what: str) -> Iterator[None]:
 
 
 def text_of(value: Any) -> str:
-    """A value of the grid as one text."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    return " ".join(map(str, value)) if isinstance(value, list) else str(value)
+    """A value of the grid as one text; a table with a name as ``NAME:KEY=VALUE,KEY=VALUE``."""
+    if isinstance(value, dict):
+        return item_text(item_of(value))
+    return " ".join(map(text_of, value)) if isinstance(value, list) else value_text(value)
 
 
 def words_of(key: str, value: Any) -> list[str]:
     """An option and its value as on the command line."""
     flag = f"--{key.replace('_', '-')}"
-    if isinstance(value, dict):
-        raise InputError(f"{key}: give a text, a number or a list")
     if isinstance(value, bool) and key != "traffic":
         return [flag] * value
     if not isinstance(value, list):
         return [flag, text_of(value)] if value != "" else []
     if key in _REPEATED:
-        return [word for item in value for word in (flag, str(item))]
+        return [word for item in value for word in (flag, text_of(item))]
     if key in _JOINED:
         return [flag, ",".join(map(str, value))] if value else []
     return [flag, *map(str, value)]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar
 
 from geoscene.options import RELIEFS
+from lidar.grammar import value_text
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import MOST_RAYS, POSES, ScannerSettings
-from lidar.settings import text_of
 from lidar.world.settings import ORIGINS, WorldSettings
 from lidar.world.settings import PLAIN as WHOLE
 
@@ -102,7 +102,7 @@ class SettingVariant(Generic[S]):
     @property
     def label(self) -> str:
         """Names and values of what is changed; empty for the user's own settings."""
-        return " ".join(f"{name}={text_of(value)}" for name, value in self.changes)
+        return " ".join(f"{name}={value_text(value)}" for name, value in self.changes)
 
     @property
     def names(self) -> frozenset[str]:
@@ -170,7 +170,7 @@ class Basis(Generic[S]):
         """The user's values: of the sensor's settings all, of the world's those that leave something out."""
         shown = [n for n in values if hasattr(self.used, n)]
         shown += [n for n in WORLD_VALUES if getattr(self.world, n) != getattr(WHOLE, n)]
-        return ", ".join(f"{name}={text_of(self.value(name))}" for name in shown)
+        return ", ".join(f"{name}={value_text(self.value(name))}" for name in shown)
 
 
 _Any = TypeVar("_Any", ScannerSettings, CameraSettings, WorldSettings)
@@ -320,7 +320,7 @@ def without_each(basis: Basis[S], variant: SettingVariant[S]) -> Iterator[tuple[
         rest = variant.changes[:k] + variant.changes[k + 1 :]
         left = {n for n, _ in rest}
         yield (
-            f"{name}={text_of(value)}",
+            f"{name}={value_text(value)}",
             basis.variant(
                 rest,
                 scene=variant.scene if "scene" in left else 0,

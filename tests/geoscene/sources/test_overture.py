@@ -206,7 +206,7 @@ def test_files_of_another_kind_are_refused_in_one_line(tmp_path, monkeypatch):
                 read_source("overture", path)
         else:
             assert len(read_source("overture", path).areas) == 1
-    with pytest.raises(InputError, match="maps: give one of osm, overture"):
+    with pytest.raises(InputError, match="known are osm, overture"):
         read_source("maps", path)
 
     def refuse(*_args, **_options):

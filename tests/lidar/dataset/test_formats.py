@@ -134,7 +134,7 @@ def test_a_format_can_be_named(tmp_path):
     assert len(read_table(tmp_path / "a.dat", "kitti")["x"]) == 5
     with pytest.raises(InputError, match="no point-cloud format"):
         read_table(tmp_path / "a.dat")
-    with pytest.raises(InputError, match="one of pcd"):
+    with pytest.raises(InputError, match="known are pcd"):
         read_table(tmp_path / "a.dat", "xyz")
 
 

@@ -9,8 +9,7 @@ from lidar.errors import InputError
 from lidar.motion.road_conditions import DRY, ROADS, RoadConditions, vehicle_on
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
-from lidar.signal.registry import NamedStage
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 from lidar.traffic.trips import DRIVERS, driver_on
 
 CAR = load_vehicle("car")
@@ -58,7 +57,7 @@ def test_weather_makes_roads_slippery_and_the_air_dim():
     assert in_weather("rain=10mm/h,wetness=0.5").grip == pytest.approx((0.85 + 0.6) / 2)
     assert in_weather("dust=20m") == DRY
     assert in_weather("fog=50m,longitude=8,latitude=47,radius=100") == DRY
-    growing = in_weather("clear", replace(read_weather("fog=500m")[0], amount_to=50.0, end=60.0))
+    growing = in_weather("clear", *read_weather("fog=500m,amount_to=50,end=60"))
     assert growing.visibility == pytest.approx(50, rel=0.02)
 
 
@@ -83,9 +82,11 @@ def test_the_option_names_the_road_and_leaves_the_recipe_of_dry_drives(scene):
     assert DriveOptions(route="random", weather=fog).road_conditions() == DRY
     by_weather = DriveOptions(route="random", weather=fog, road="by-weather")
     assert by_weather.road_conditions().visibility == pytest.approx(50, rel=0.02)
-    as_stage = DriveOptions(route="random", stages=(NamedStage("weather", fog[0]),), road="by-weather")
+    as_stage = DriveOptions(route="random", stages=fog, road="by-weather")
     assert as_stage.road_conditions() == by_weather.road_conditions()
-    with pytest.raises(InputError, match="`road` muddy: one of dry, by-weather, wet, snow, ice"):
+    with pytest.raises(
+        InputError, match=r"`road` 'muddy' is unknown \(known are dry, by-weather, wet, snow, ice"
+    ):
         DriveOptions(route="random", road="muddy")
     with pytest.raises(InputError, match="`road` by-weather: give `weather`"):
         DriveOptions(route="random", road="by-weather")

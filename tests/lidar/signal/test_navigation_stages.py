@@ -9,9 +9,10 @@ from lidar.dataset.layout import Paths, open_dataset, read_rows
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.errors import InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
+from lidar.parameters import parameter
 from lidar.sensors.navigation.nmea import height_note, nmea
 from lidar.signal.registry import NamedStage
-from lidar.signal.stage import Stage, parameter
+from lidar.signal.stage import Stage
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
 

@@ -15,10 +15,11 @@ from lidar.dataset.layout import open_dataset
 from lidar.dataset.png import read_png
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
+from lidar.parameters import parameter
 from lidar.sensors.physics.origin import Origin
-from lidar.signal.registry import NamedStage, number_stages, read_stage, read_stages
-from lidar.signal.stage import Stage, parameter
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.registry import NamedStage, number_stages, read_stages
+from lidar.signal.stage import Stage
+from lidar.signal.weather.read import read_weather
 from lidar.simulation import frame_loop
 from lidar.simulation.drive import drive
 from lidar.simulation.frame_loop import chunks, recording_chunks
@@ -155,7 +156,7 @@ def test_no_return_is_added_while_scanners_are_off(plain, tmp_path):
     manifest["scanners_on_ns"] = [[0, 150_000_000]]
     (tmp_path / "in" / "dataset.json").write_text(json.dumps(manifest))
     snow = read_weather("snow=10")
-    stages = number_stages(read_stage(one.table()) for one in snow)
+    stages = number_stages(snow)
     apply_stages(tmp_path / "in", tmp_path / "a", options=ApplyOptions(stages))
     for frame, cloud in enumerate(sorted((tmp_path / "a" / "top" / "pcd").glob("*.pcd"))):
         with np.load(tmp_path / "a" / "top" / "truth" / f"{cloud.stem}.npz") as truth:

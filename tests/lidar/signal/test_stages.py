@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
+from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast, scan
@@ -23,7 +24,7 @@ from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_stage, read_stages, stage_rows, stages_of
 from lidar.signal.run import altered_image, altered_sweep, cloud_truth, image_truth
 from lidar.signal.situation import Situation
-from lidar.signal.stage import Stage, added_echoes, parameter
+from lidar.signal.stage import Stage, added_echoes
 
 ROOF = Mount((1.2, 0.0, 1.9))
 ROOM = world(
@@ -259,13 +260,13 @@ def test_lost_rows_are_black_and_kept_as_truth():
     ("text", "message"),
     [
         ("droped_packets", "stage 'droped_packets' is unknown; is dropped_packets meant"),
-        ("dropped_packets:los=1", "no parameter 'los'"),
+        ("dropped_packets:los=1", "parameter 'los' is unknown; is loss meant"),
         ("dropped_packets:loss", "give NAME:KEY=VALUE"),
         ("dropped_packets:loss=1.5", "loss = 1.5 is not within 0 to 1"),
         ("dropped_packets:loss=nan", "loss = nan is not within 0 to 1"),
         ("dropped_packets:loss=high", "loss = 'high' is not a number"),
         ("dropped_packets:columns=1.5", "columns = '1.5' is not a whole number"),
-        ("dropped_packets:seed=-1", "seed = -1 is not a whole number of 0 or more"),
+        ("dropped_packets:seed=-1", "seed = '-1' is not a whole number of 0 or more"),
         ("missing.toml", "missing.toml: cannot be read as TOML"),
     ],
 )

@@ -14,8 +14,8 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.sensors.physics.origin import Origin
-from lidar.signal.registry import number_stages, read_stage, read_stages
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.registry import read_stages
+from lidar.signal.weather.read import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
 from lidar.tools.denoise.denoise import denoise
@@ -38,7 +38,7 @@ rate_hz = 5.0
 name = "roof"
 rate_hz = 5.0
 """
-SNOW = number_stages(read_stage(one.table()) for one in read_weather("snow=10"))
+SNOW = read_weather("snow=10")
 WALL = "inject:shape=wall,device=any,points=2000,distance=8,width=60"
 SHIFT = "move:bearing=10,distance=8,long=6,wide=2,high=4"
 BOX = "bearing=10,distance=8,long=6,wide=6,high=4"

@@ -131,7 +131,7 @@ def test_clouds_that_lack_what_a_format_holds_are_refused(folder, tmp_path):
         DatasetError, match=r"clouds in kitti lack what pcd files hold; drive with `formats` pcd"
     ):
         convert(source, tmp_path / "pcd", to="pcd")
-    with pytest.raises(InputError, match=r"`to` pandaset: one of .*nuscenes.*, pcd, "):
+    with pytest.raises(InputError, match=r"`to` 'pandaset' is unknown .*nuscenes.*, pcd, "):
         convert(folder / "plain", tmp_path / "out", to="pandaset")
     with pytest.raises(InputError, match="give a directory outside of"):
         convert(folder / "plain", folder / "plain" / "laz", to="laz")

@@ -345,7 +345,7 @@ def test_traffic_of_another_place_is_refused(scene, graph, street, tmp_path):
     ("words", "said"),
     [
         ("none.xml", "none.xml does not exist"),
-        ("none.xml,speed=2", "speed is none of on, off, sumo, net, begin, parked, radius"),
+        ("none.xml,speed=2", "parameter 'speed' is unknown"),
         ("none.xml,begin=soon", "soon"),
         ("none.xml,parked=2", "parked = 2.0"),
     ],

@@ -80,5 +80,5 @@ def test_without_sumo_the_extra_is_named(scene, path, monkeypatch):
 
 def test_unknown_words_after_sumo_are_named(scene, tmp_path):
     words = ["drive", str(scene.path), "--route", "random", "-o", str(tmp_path / "d"), "-q"]
-    with pytest.raises(CoercionError, match="speed is none of"):
+    with pytest.raises(CoercionError, match="parameter 'speed' is unknown"):
         app([*words, "--traffic", "sumo,speed=3"], exit_on_error=False, result_action="return_value")

@@ -86,5 +86,5 @@ def test_the_option_is_short_for_the_setting_and_in_no_other_way_part_of_the_rec
     assert "relief" not in DriveOptions(**given).recipe(scene)
     with pytest.raises(InputError, match="`settings` relief is given, too"):
         DriveOptions(relief="plain", settings=(("relief", "off"),), **given)
-    with pytest.raises(InputError, match="relief=rough: known are scene, off, plain, full, mesh"):
+    with pytest.raises(InputError, match="relief = 'rough' is none of scene, off, plain, full, mesh"):
         DriveOptions(relief="rough", **given)

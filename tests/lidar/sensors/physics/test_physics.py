@@ -387,7 +387,7 @@ def test_levels_and_settings():
     chosen = settings_of("survey", [("rays", "7"), ("mirrors", "off"), ("spread", "0.1")])[0]
     assert (chosen.rays, chosen.mirrors, chosen.spread, chosen.bias) == (7, False, 0.1, True)
     for level, values, word in [
-        ("best", {}, "one of standard, survey"),
+        ("best", {}, "known are standard, survey"),
         ("standard", {"ray": "7"}, "rays"),
         ("standard", {"rays": "1000"}, "1 to 999"),
         ("standard", {"rays": "x"}, "whole number"),

@@ -17,7 +17,7 @@ from lidar.sensors.physics.echoes import trace
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
-from lidar.signal.registry import stages_of
+from lidar.signal.registry import NamedStage, Stages, number_stages
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, ROAD_USERS, pulses_of
@@ -25,7 +25,8 @@ from lidar.signal.weather.air import through_air
 from lidar.signal.weather.fields import Field, WeatherBeams, _add_spray, amounts, plume_pattern
 from lidar.signal.weather.glass import glare_noise, through_glass
 from lidar.signal.weather.media import medium_of, rain
-from lidar.signal.weather.setting import WeatherSetting, read_weather
+from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.stage import Weather
 
 GEO = Frame.at(7.0, 50.0)
 SENSOR = load_sensor("vlp16")
@@ -52,7 +53,11 @@ SWEEP = sweep_of()
 
 
 def altered(settings, *, sweep=SWEEP, at=SITUATION):
-    return altered_sweep(sweep, stages_of([s.table() for s in settings], seed=3), at=at)
+    return altered_sweep(sweep, Stages(number_stages(settings), 3), at=at)
+
+
+def weather(*args, **values):
+    return NamedStage("weather", Weather(*args, **values))
 
 
 def degrees(*corners):
@@ -61,7 +66,7 @@ def degrees(*corners):
 
 def test_a_bank_of_fog_loses_only_what_is_seen_through_it():
     north = degrees((-500, 20), (500, 20), (500, 500), (-500, 500))
-    found = altered([WeatherSetting(kind="fog", amount=10.0, polygon=north)])
+    found = altered([weather(kind="fog", amount=10.0, polygon=north)])
     y = found.original.xyz[:, 1]
     kept = np.isin(np.arange(len(y)), found.cloud.source)
     assert kept[y < 19].all()
@@ -74,8 +79,8 @@ def test_a_bank_of_fog_loses_only_what_is_seen_through_it():
 
 def test_weather_elsewhere_and_at_other_times_changes_nothing():
     far = dict(zip(("longitude", "latitude"), map(float, GEO.to_geographic(5000, 0)), strict=True))
-    setting = WeatherSetting(kind="rain", amount=100.0, radius=300.0, **far)
-    for some in (setting, WeatherSetting(kind="fog", amount=10.0, start=5.0)):
+    setting = weather(kind="rain", amount=100.0, radius=300.0, **far)
+    for some in (setting, weather(kind="fog", amount=10.0, start=5.0)):
         found = altered([some])
         np.testing.assert_array_equal(found.cloud.intensity, found.original.intensity)
 
@@ -84,7 +89,7 @@ def test_a_place_that_holds_all_is_everywhere():
     here = dict(zip(("longitude", "latitude"), map(float, GEO.to_geographic(0, 0)), strict=True))
     for kind, amount in (("fog", 100.0), ("rain", 80.0)):
         wide, everywhere = (
-            altered([WeatherSetting(kind=kind, amount=amount, **place)])
+            altered([weather(kind=kind, amount=amount, **place)])
             for place in ({"radius": 5000.0, **here}, {})
         )
         np.testing.assert_array_equal(wide.cloud.xyz, everywhere.cloud.xyz)
@@ -127,7 +132,7 @@ def test_the_column_of_a_field_is_its_integral():
 
 
 def test_plumes_of_dust_drift_with_the_wind():
-    setting = WeatherSetting(kind="dust", amount=20.0, wind=4.0, wind_from=270.0)
+    setting = weather(kind="dust", amount=20.0, wind=4.0, wind_from=270.0)
     options = {"seed": 1, "count": 301}
     first = plume_pattern(setting, 0.0, corner=(0.0, 0.0), **options)
     later = plume_pattern(setting, 5.0, corner=(20.0, 0.0), **options)
@@ -139,7 +144,7 @@ def test_plumes_of_dust_drift_with_the_wind():
 def test_dust_in_plumes_gives_returns_within_them_and_hides_less_than_even_dust():
     sweep = replace(SWEEP, sensor=replace(SENSOR, reference_range=150.0))
     plumes, even = (
-        altered([WeatherSetting(kind="dust", amount=10.0, medium=medium)], sweep=sweep)
+        altered([weather(kind="dust", amount=10.0, medium=medium)], sweep=sweep)
         for medium in ("plumes", "even")
     )
     kept = [np.sum(found.cloud.source >= 0) for found in (plumes, even)]
@@ -252,11 +257,11 @@ def test_glare_loses_returns_near_the_sun_and_adds_false_ones():
 
 
 def test_needs_are_checked_before_a_drive_begins():
-    stages = stages_of([s.table() for s in read_weather("spray")])
+    stages = Stages(read_weather("spray"))
     with pytest.raises(InputError, match="weather needs road users"):
         stages.check({"lidar_top": "lidar"}, known=(POSES,))
     stages.check({"lidar_top": "lidar"}, known=(POSES, ROAD_USERS))
-    passing = stages_of([s.table() for s in read_weather("rain=5,model=lisa,end=20")])
+    passing = Stages(read_weather("rain=5,model=lisa,end=20"))
     with pytest.raises(InputError, match="weather_model needs poses and time"):
         passing.check({"velodyne": "lidar"})
-    stages_of([s.table() for s in read_weather("rain=5,fog=100")]).check({"lidar_top": "lidar"})
+    Stages(read_weather("rain=5,fog=100")).check({"lidar_top": "lidar"})

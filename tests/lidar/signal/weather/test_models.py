@@ -11,7 +11,7 @@ from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.scanner import load_sensor
-from lidar.signal.registry import stages_of
+from lidar.signal.registry import Stages
 from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered
 from lidar.signal.situation import Situation
 from lidar.signal.weather import hahner
@@ -35,7 +35,7 @@ from lidar.signal.weather.lisa import (
     particle_count,
 )
 from lidar.signal.weather.media import rain_extinction
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 
 RNG = np.random.default_rng
 
@@ -236,7 +236,7 @@ ROOM = scan(
 
 def modelled(text, *, seed=0):
     original = ROOM
-    stages = stages_of([s.table() for s in read_weather(text)], seed=seed)
+    stages = Stages(read_weather(text), seed)
     cloud = altered_cloud(trace_unaltered(original).cloud, stages, at=Situation("vlp16", 0))
     return original, cloud
 
@@ -279,4 +279,4 @@ def test_models_without_weather_change_nothing(text):
 def test_models_have_no_place_and_no_cover_glass():
     for extra in ("drops=0.1", "longitude=7,latitude=50,radius=50"):
         with pytest.raises(InputError, match="needs model physical"):
-            stages_of([s.table() for s in read_weather(f"rain=5,model=lisa,{extra}")])
+            Stages(read_weather(f"rain=5,model=lisa,{extra}"))

@@ -1,16 +1,18 @@
-from dataclasses import replace
-
 import pytest
 from helpers import ROOT
 
 from lidar.errors import InputError
-from lidar.signal.weather.setting import KINDS, WeatherSetting, read_weather
+from lidar.signal.registry import read_stage
+from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import KINDS, WeatherSetting
 
 
 def test_texts_give_kind_and_amount_in_its_unit():
     def amounts(text):
-        return [(w.kind, w.amount, w.model, w.medium) for w in read_weather(text)]
+        stages = [named.stage for named in read_weather(text)]
+        return [(w.kind, w.amount, w.model, w.medium) for w in stages]
 
+    assert amounts("rain:amount=10mm/h") == amounts("rain=10mm/h")
     assert amounts("rain=10mm/h") == [("rain", 10, "physical", "marshall-palmer")]
     assert amounts("fog=0.2km,medium=radiation") == [("fog", 200, "physical", "radiation")]
     assert amounts("snow=2,model=hahner_snow,fog=500m") == [
@@ -23,8 +25,8 @@ def test_texts_give_kind_and_amount_in_its_unit():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("hail=3", "'hail=3' is no kind of weather; known are rain, fog, snow"),
-        ("", "no kind of weather"),
+        ("hail=3", "kind 'hail' is unknown (known are rain, fog, snow"),
+        ("", "give NAME:KEY=VALUE"),
         ("rain", "rain needs an amount"),
         ("rain=-1", "amount = -1 mm/h of rain is not within 0 to 300"),
         ("rain=nan", "'nan' of rain is not a number"),
@@ -33,7 +35,8 @@ def test_texts_give_kind_and_amount_in_its_unit():
         ("rain=3,model=hahner_fog", "model hahner_fog has no rain; rain has physical, lisa, goodin"),
         ("fog=50m,medium=kym", "medium = 'kym' of fog is none of kim, kruse"),
         ("rain=3,wind=x", "wind = 'x' is not a number"),
-        ("rain=3,gust=5", "no parameter 'gust' (known are kind, amount"),
+        ("rain=3,gust=5", "parameter 'gust' is unknown (known are kind, amount"),
+        ("rain=3,wnd=5", "is wind meant?"),
         ("rain=3,start=9,end=4", "end = 4 is not after start = 9"),
         ("rain=3,amount_to=4", "amount_to needs an end"),
         ("clear=3", "amount = 3 of clear is not 0: it has no amount"),
@@ -74,7 +77,7 @@ def test_files_have_weather_over_time_and_place(tmp_path):
         radius = 300.0
         """
     )
-    rain, fog, dust = read_weather(str(path))
+    rain, fog, dust = (named.stage for named in read_weather(str(path)))
     assert [rain.amount_at(t) for t in (9.9, 10, 15, 20)] == [None, 5, 12.5, None]
     assert fog.corners() == [(7.0, 50.0), (7.1, 50.0), (7.1, 50.1)]
     assert (dust.longitude, dust.latitude, dust.radius) == (7.05, 50.05, 300)
@@ -92,7 +95,7 @@ def test_files_have_weather_over_time_and_place(tmp_path):
         ('kind = "fog"\namount = nan', "amount = nan is not a finite number"),
         (
             'kind = "fog"\namount = 9\nfog = 3',
-            "no parameter 'fog' (known are kind, amount, amount_to, from, to",
+            "parameter 'fog' is unknown (known are kind, amount, amount_to, start, end",
         ),
     ],
 )
@@ -111,17 +114,17 @@ def test_the_extinction_of_changing_fog_is_linear_in_time():
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_setting_is_made_again_from_its_table(kind):
+def test_a_stage_is_made_again_from_its_table(kind):
     amount = KINDS[kind].default if KINDS[kind].default is not None else 8.0
-    setting = WeatherSetting(kind=kind, amount=amount, wind=3.0)
-    table = setting.table()
-    assert table.pop("name") == "weather"
-    assert WeatherSetting(**table) == setting == replace(setting, wind=3)
+    (named,) = read_weather(f"{kind}={amount:g},wind=3")
+    assert named.name == "weather"
+    assert read_stage(named.to_json()) == named
+    assert named.stage.wind == 3
 
 
 def test_the_example_is_a_morning():
     path = ROOT / "examples" / "weather" / "morning.toml"
-    settings = read_weather(str(path))
+    settings = [named.stage for named in read_weather(str(path))]
     assert [s.kind for s in settings] == ["fog", "rain", "rain"]
     now = [[s.kind for s in settings if s.amount_at(t) is not None] for t in (0, 299, 300, 600, 900, 5000)]
     assert now == [["fog"], ["fog"], ["rain"], ["rain"], ["rain"], ["rain"]]

@@ -17,11 +17,11 @@ from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.signal.registry import stages_of
+from lidar.signal.registry import Stages
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.weather.camera import add_weather
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 
 GROUND = box((-90, -90, -1), (90, 90, 0))
 WALL = box((40, -20, 0), (42, 20, 20), feature=8)
@@ -51,7 +51,7 @@ def scan(text, around, *, knows=None):
         return Poses(np.tile([0.0, 0, 1.9], (n, 1)), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3)))
 
     at = Situation("hdl64e_s2", 0, poses=poses, geo=GeoFrame.at(7.0, 50.0), world=knows or around)
-    return altered_sweep(sweep, stages_of([s.table() for s in read_weather(text)], seed=3), at=at)
+    return altered_sweep(sweep, Stages(read_weather(text), 3), at=at)
 
 
 def image(text, around):
@@ -72,7 +72,7 @@ def image(text, around):
     at = Situation(
         "front", 0, 10**9, poses=poses, camera=CAMERA, light=light, world=around, geo=GeoFrame.at(7.0, 50.0)
     )
-    found = add_weather(black, read_weather(text)[0], at=at, rng=np.random.default_rng(1)).rgb
+    found = add_weather(black, read_weather(text)[0].stage, at=at, rng=np.random.default_rng(1)).rgb
     assert found is not None
     return found[75:100, 135:185].astype(int)  # 6.7 by 3.3 m of the wall
 

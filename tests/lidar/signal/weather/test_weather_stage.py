@@ -18,7 +18,7 @@ from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.recorded import altered_recording
-from lidar.signal.registry import stages_of
+from lidar.signal.registry import Stages
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.weather.backscatter import (
@@ -32,7 +32,7 @@ from lidar.signal.weather.backscatter import (
 )
 from lidar.signal.weather.fields import Field
 from lidar.signal.weather.media import fog_extinction, medium_of, rain, snow
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 
 ROOM = world(
     box((-40, -30, -1), (40, 30, 0), feature=7, klass=Class.ROAD, material="asphalt"),
@@ -51,7 +51,7 @@ def sweep_of(detector=LINK, *, sensor="vlp16", **options):
 
 
 def altered(sweep, text, *, seed=3):
-    stages = stages_of([s.table() for s in read_weather(text)], seed=seed)
+    stages = Stages(read_weather(text), seed)
     return altered_sweep(sweep, stages, at=Situation(sweep.sensor.name, sweep.frame))
 
 
@@ -216,7 +216,7 @@ def test_fog_that_is_even_around_the_sensor_sends_back_what_fog_everywhere_does(
     everywhere = altered(SWEEP, "fog=30").cloud
     full = Field((0.0, 0.0), np.ones((1, 1)), 0.0, np.inf, 1.0)
     monkeypatch.setattr("lidar.signal.weather.stage.field_of", lambda *_, **__: full)
-    stages = stages_of([s.table() for s in read_weather("fog=30")], seed=3)
+    stages = Stages(read_weather("fog=30"), 3)
     at = Situation(SWEEP.sensor.name, SWEEP.frame, poses=DRIVE["trajectory"].at)
     here = altered_sweep(SWEEP, stages, at=at).cloud
     np.testing.assert_array_equal(here.origin, everywhere.origin)
@@ -299,7 +299,7 @@ def test_weather_on_recorded_clouds_is_that_of_the_drive(weather):
     """Where the sensor saw sky, too."""
     simulated = altered(SWEEP, weather)
     original = simulated.original
-    stages = stages_of([s.table() for s in read_weather(weather)], seed=3)
+    stages = Stages(read_weather(weather), 3)
     at = Situation(SWEEP.sensor.name, 2)
     found = altered_recording(original, stages, sensor=SWEEP.sensor, at=at, sent=SWEEP.firings).cloud
     cloud = simulated.cloud

@@ -20,7 +20,7 @@ from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.defences.defend import calibrate, defend
 from lidar.tools.defences.physics import Physics
 from lidar.tools.defences.reading import SEEN, read_scans
-from lidar.tools.defences.registry import defence_names, read_defences
+from lidar.tools.defences.registry import DEFENCES, read_defences
 from lidar.tools.defences.run import DETECTOR
 from lidar.tools.detection.registry import read_detector
 from lidar.tools.integrity.watermark import WatermarkKey
@@ -55,7 +55,7 @@ BARE = RIG.partition("[[camera]]")[0]
 
 CALIBRATION = read_calibration()
 ALL = read_defences(["all"])
-UNSIGNED = [name for name in defence_names() if name != "watermark"]
+UNSIGNED = [name for name in DEFENCES if name != "watermark"]
 
 
 def driven(scene, folder, rig, **options):
@@ -80,7 +80,7 @@ def attacked(plain, tmp_path_factory):
 
 def test_every_defence_is_calibrated_by_the_program():
     calibration = read_calibration()
-    for name in defence_names():
+    for name in DEFENCES:
         assert 0 <= calibration.threshold(name, "frames") <= 1
 
 
@@ -300,7 +300,7 @@ def test_a_file_that_is_no_calibration_says_why(tmp_path):
 
 def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
     listed = json.loads(run_program("lidar", "defences", "--json").stdout)
-    assert [row["name"] for row in listed["defences"]] == defence_names()
+    assert [row["name"] for row in listed["defences"]] == list(DEFENCES)
     words = ("lidar", "defend", attacked, "--defence", "occlusion:cell=0.5,physics", "-q")
     found = json.loads(run_program(*words, "--json", "-o", tmp_path / "out").stdout)
     assert found["defences"]["occlusion"]["returns"]["attacked"] > 0

@@ -9,7 +9,7 @@ from scipy.stats import norm
 from lidar.errors import InputError
 from lidar.tools.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
 from lidar.tools.defences.fusion import FUSIONS, fuse_verdicts, fused_threshold, joint_of
-from lidar.tools.defences.registry import defence_names, defence_rows, read_defences
+from lidar.tools.defences.registry import DEFENCES, defence_rows, read_defences
 from lidar.tools.defences.scores import FALSE_ALARMS, SuspicionCounts, score, threshold_at
 from lidar.tools.defences.verdict import Verdict
 
@@ -164,14 +164,15 @@ def test_a_fused_suspicion_grows_with_each(rule):
 
 def test_defences_are_read_from_text():
     every = read_defences(["all"])
-    assert [named.name for named in every] == defence_names()
+    assert [named.name for named in every] == list(DEFENCES)
     assert len(defence_rows()) == len(every)
-    (one,) = read_defences(["occlusion:cell=0.5:core=1"])
+    (one,) = read_defences(["occlusion:cell=0.5,core=1"])
     assert one.to_json() == {"name": "occlusion", "valid": 0.05, "spoofed": 0.15, "cell": 0.5, "core": 1.0}
     for text, message in {
         "occlusio": "is occlusion meant",
-        "shadow:size=3": "no parameter 'size'",
+        "shadow:size=3": "parameter 'size' is unknown",
         "shadow:length": "NAME:KEY=VALUE",
+        "occlusion:cell=0.5:core=1": "as in occlusion:cell=0.5,core=1",
         "shadow:length=far": "length = 'far' is not a number",
         "shadow:length=0": "not within 1 to 100",
     }.items():

@@ -13,7 +13,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.sensors.physics.origin import Origin
-from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.read import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
 from lidar.tools.denoise.denoise import denoise
@@ -111,10 +111,11 @@ def test_scores_of_counts():
     [
         ("drorr", "method 'drorr' is unknown; is dror meant"),
         ("dror:angle=0", "angle = 0 is not within 0.001 to 10"),
-        ("dror:angel=1", "no parameter 'angel'"),
+        ("dror:angel=1", "parameter 'angel' is unknown; is angle meant"),
         ("lior:neighbours=2.5", "not a whole number"),
         ("lior:5", "give NAME:KEY=VALUE"),
-        ("lior:range=5:range=6", "method lior: range is given twice"),
+        ("lior:range=5,range=6", "range is given twice"),
+        ("dror:neighbours=5:angle=0.2", "as in dror:neighbours=5,angle=0.2"),
     ],
 )
 def test_faulty_methods_end_in_one_line(text, match, tmp_path):

@@ -185,7 +185,7 @@ def test_a_gif_that_would_fill_the_memory_is_refused(tmp_path):
         (("--size", "641x360", "-o", "a.gif"), "even"),
         (("--size", "big", "-o", "a.gif"), "WIDTHxHEIGHT"),
         (("--speed", "0", "-o", "a.gif"), "positive"),
-        (("--show", "nothing", "-o", "a.gif"), "one of all"),
+        (("--show", "nothing", "-o", "a.gif"), "known are all"),
         (("--frames", "70:80", "-o", "a.gif"), "frames 0 to 5"),
     ],
 )

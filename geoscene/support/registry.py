@@ -1,0 +1,96 @@
+"""Registries of objects by name, imported when they are used, and one message for unknown names."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection, Iterator, Mapping
+from difflib import get_close_matches
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+_NEAR = 0.6
+"""Least similarity of a name that is offered for a misspelt one, 0 to 1."""
+
+
+def near_name(name: str, known: Collection[str]) -> str:
+    """A question with the known name that is most like a misspelt one; empty if none is like it."""
+    near = get_close_matches(name, known, 1, _NEAR)
+    return f"; is {near[0]} meant?" if near else ""
+
+
+def unknown_name(
+    what: str,
+    name: object,
+    *,
+    known: Collection[str],
+    removed: Mapping[str, str] = MappingProxyType({}),
+    remedy: str = "",
+) -> str:
+    """The message for a name that is not among the known ones.
+
+    what    : what has the name, such as ``stage`` or `` `align` ``
+    removed : for names that were known once, what to write instead
+    remedy  : how to find the known names, where they are too many to list
+    """
+    if name in removed:
+        return f"{what} {name}: {removed[str(name)]}"
+    listed = remedy or f"known are {', '.join(known) or 'none'}"
+    return f"{what} {name!r} is unknown{near_name(str(name), known)} ({listed})"
+
+
+def load(place: str) -> Any:
+    """The object at ``module:name``; its module is imported here, not before."""
+    module, _, name = place.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Objects by the name that users choose them by; those given as ``module:name`` are imported when used.
+
+    what    : what the names are of, for messages
+    removed : for names that were known once, what to write instead
+    """
+
+    def __init__(
+        self,
+        what: str,
+        places: Mapping[str, str | T],
+        *,
+        error: type[Exception],
+        removed: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
+        """Register objects, or the places of objects; ``error`` is raised for unknown names."""
+        self.what, self.removed = what, removed
+        self._places, self._error = dict(places), error
+
+    def __getitem__(self, name: str) -> T:
+        """The object of a name; raises KeyError for an unknown one, see `find`."""
+        found = self._places[name]
+        if isinstance(found, str):
+            found = self._places[name] = load(found)
+        return found
+
+    def __iter__(self) -> Iterator[str]:
+        """The names, in the order of registration."""
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        """Number of names."""
+        return len(self._places)
+
+    def __contains__(self, name: object) -> bool:
+        """Whether a name is registered; imports nothing."""
+        return name in self._places
+
+    def find(self, name: str) -> T:
+        """The object of a name; raises the registry's error, with similar names, for an unknown one."""
+        self.check([name])
+        return self[name]
+
+    def check(self, names: Collection[str]) -> None:
+        """Raise the registry's error for the first unknown one of several names."""
+        for name in names:
+            if name not in self._places:
+                raise self._error(unknown_name(self.what, name, known=self._places, removed=self.removed))

@@ -1,0 +1,182 @@
+"""Parameters of stages, defences, filters and settings: type, unit, bounds and meaning, declared once."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import Field, dataclass, field, fields
+from math import inf, isfinite
+from typing import Any, TypeVar
+
+from geoscene.support.registry import Registry, near_name, unknown_name
+from lidar.errors import InputError
+from lidar.grammar import Item, value_text
+
+P = TypeVar("P")
+T = TypeVar("T", bool, int, float, str)
+
+_SWITCH = {"on": True, "yes": True, "true": True, "1": True}
+_SWITCH |= {"off": False, "no": False, "false": False, "0": False}
+
+
+def parameter(
+    default: T,
+    meaning: str,
+    *,
+    unit: str = "",
+    low: float = -inf,
+    high: float = inf,
+    endless: bool = False,
+    among: tuple[str, ...] = (),
+) -> T:
+    """A field of a dataclass whose value users choose; its type is that of its default.
+
+    meaning   : one line
+    unit      : of a number; empty for counts, shares and factors
+    low, high : bounds of a number, both allowed
+    endless   : infinity is allowed, too
+    among     : allowed words of a text; any if empty
+    """
+    declared = {"meaning": meaning, "unit": unit, "low": low, "high": high}
+    return field(default=default, metadata=declared | {"endless": endless, "among": among})
+
+
+def parameters_of(kind: type[Any]) -> list[Field[Any]]:
+    """The fields of a class that `parameter` made."""
+    return [f for f in fields(kind) if "meaning" in f.metadata]
+
+
+def parameter_rows(kind: type[Any]) -> list[dict[str, Any]]:
+    """Name, default, bounds or words, unit and meaning of each parameter of a class."""
+    return [
+        {
+            "name": f.name,
+            "default": f.default,
+            **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
+            **{key: f.metadata[key] for key in ("among", "unit") if f.metadata[key]},
+            "meaning": f.metadata["meaning"],
+        }
+        for f in parameters_of(kind)
+    ]
+
+
+def describe(row: Mapping[str, Any]) -> str:
+    """The meaning of a parameter in a row of `parameter_rows`, with its words if there are any."""
+    among = row.get("among")
+    return f"{row['meaning']} ({', '.join(among)})" if among else str(row["meaning"])
+
+
+COLUMNS = ("default", "from", "to", "unit", "meaning")
+"""Columns of `parameter_cells` after the name."""
+
+
+def parameter_cells(rows: Iterable[Mapping[str, Any]]) -> list[list[str]]:
+    """Lines of a table of parameters, by rows of `parameter_rows`: name and `COLUMNS`."""
+    return [
+        [
+            row["name"],
+            value_text(row["default"]),
+            *(f"{row[end]:g}" if end in row else "" for end in ("low", "high")),
+            row.get("unit", ""),
+            describe(row),
+        ]
+        for row in rows
+    ]
+
+
+def check_parameters(values: Any, *more: str) -> None:
+    """Raise InputError if a parameter of a dataclass is not of its type or not within its bounds.
+
+    more : further faults; empty ones are none. All faults are in one message
+    """
+    faults = [fault_of(f, getattr(values, f.name)) for f in parameters_of(type(values))]
+    if found := [fault for fault in (*faults, *more) if fault]:
+        raise InputError("; ".join(found))
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Base of dataclasses whose fields are made by `parameter`.
+
+    Raises InputError for a parameter that is not of its default's type or not within its bounds.
+    """
+
+    def __post_init__(self) -> None:
+        """Validate the parameters, all faults in one message."""
+        check_parameters(self)
+
+
+def fault_of(declared: Field[Any], value: Any) -> str:
+    """The fault of the value of a parameter, with what is allowed; empty for a valid one."""
+    name, bounds = declared.name, declared.metadata
+    kind: type = type(declared.default)
+    if kind is bool:
+        return "" if type(value) is bool else f"{name} = {value!r} is not on or off"
+    if kind is str:
+        return _text_fault(name, value, among=bounds["among"])
+    is_number = isinstance(value, int if kind is int else int | float) and not isinstance(value, bool)
+    if not is_number:
+        return f"{name} = {value!r} is not {'a whole number' if kind is int else 'a number'}{_within(bounds)}"
+    if (isfinite(value) and bounds["low"] <= value <= bounds["high"]) or (bounds["endless"] and value == inf):
+        return ""
+    return f"{name} = {value:g} is not{_within(bounds) or ' a finite number'}"
+
+
+def _text_fault(name: str, value: Any, *, among: tuple[str, ...]) -> str:
+    if not isinstance(value, str):
+        return f"{name} = {value!r} is not a text"
+    if not among or value in among:
+        return ""
+    return f"{name} = {value!r} is none of {', '.join(among)}{near_name(value, among)}"
+
+
+def _within(bounds: Mapping[str, Any]) -> str:
+    """The bounds of a number in words, after a space; empty without any."""
+    low, high, unit = bounds["low"], bounds["high"], f" {bounds['unit']}" if bounds["unit"] else ""
+    if isfinite(high):
+        return f" within {low:g} to {high:g}{unit}"
+    if isfinite(low):
+        return f" at least {low:g}{unit}" + (", or inf" if bounds["endless"] else " and finite")
+    return ""
+
+
+def read_values(kind: type[Any], given: Mapping[str, Any], *, also: Collection[str] = ()) -> dict[str, Any]:
+    """Values of parameters of a class from texts, or from values of the parameters' types.
+
+    also : further known names, for messages
+
+    Raises InputError for an unknown name. A text that is no value of the parameter's type is returned as it
+    is; `check_parameters` refuses it.
+    """
+    known = {f.name: type(f.default) for f in parameters_of(kind)}
+    for name in given:
+        if name not in known:
+            raise InputError(unknown_name("parameter", name, known=[*known, *also]))
+    return {
+        name: _value(value, known[name]) if isinstance(value, str) else value for name, value in given.items()
+    }
+
+
+def build(registry: Registry[type[P]], item: Item, *, also: Collection[str] = ()) -> P:
+    """The object of an item's name in a registry of classes, with the item's values.
+
+    also : further names of values, which were taken before; for messages
+
+    Raises InputError for an unknown name or parameter, and for a value that its class refuses.
+    """
+    if item.name not in registry:
+        raise InputError(item.source + unknown_name(registry.what, item.name, known=registry))
+    kind = registry[item.name]
+    try:
+        return kind(**read_values(kind, item.values, also=also))
+    except InputError as error:
+        raise InputError(f"{item.source}{registry.what} {item.name}: {error}") from None
+
+
+def _value(text: str, kind: type) -> Any:
+    """A text as a value of a type; the text itself if it is none."""
+    if kind is bool:
+        return _SWITCH.get(text.lower(), text)
+    try:
+        return kind(text)
+    except ValueError:
+        return text
