@@ -7,7 +7,7 @@ from dataclasses import Field, dataclass, field, fields
 from math import inf, isfinite
 from typing import Any, TypeVar
 
-from geoscene.support.registry import Registry, near_name, unknown_name
+from geoscene.support.registry import Registry, hint, unknown_name
 from lidar.errors import InputError
 from lidar.grammar import Item, value_text
 
@@ -126,7 +126,7 @@ def _text_fault(name: str, value: Any, *, among: tuple[str, ...]) -> str:
         return f"{name} = {value!r} is not a text"
     if not among or value in among:
         return ""
-    return f"{name} = {value!r} is none of {', '.join(among)}{near_name(value, among)}"
+    return f"{name} = {value!r} is none of {', '.join(among)}{hint(value, among)}"
 
 
 def _within(bounds: Mapping[str, Any]) -> str:

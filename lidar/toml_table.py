@@ -10,7 +10,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from geoscene.support.registry import near_name, unknown_name
+from geoscene.support.registry import nearest, unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import RigError
 
@@ -59,7 +59,9 @@ class Table:
         if key in self.data:
             return self.data[key]
         if default is ...:
-            raise self.error(key, f"this key is missing{near_name(key, self.data)}")
+            near = nearest(key, self.data)
+            question = f"; is {near} a misspelling of it?" if near else ""
+            raise self.error(key, f"this key is missing{question}")
         return default
 
     def number(

@@ -14,10 +14,15 @@ _NEAR = 0.6
 """Least similarity of a name that is offered for a misspelt one, 0 to 1."""
 
 
-def near_name(name: str, known: Collection[str]) -> str:
-    """A question with the known name that is most like a misspelt one; empty if none is like it."""
-    near = get_close_matches(name, known, 1, _NEAR)
-    return f"; is {near[0]} meant?" if near else ""
+def nearest(name: str, known: Collection[str]) -> str:
+    """The known name that is most like a misspelt one; empty if none is like it."""
+    return next(iter(get_close_matches(name, known, 1, _NEAR)), "")
+
+
+def hint(name: str, known: Collection[str]) -> str:
+    """A question with the known name that is meant; empty if none is like the name."""
+    near = nearest(name, known)
+    return f"; is {near} meant?" if near else ""
 
 
 def unknown_name(
@@ -37,7 +42,7 @@ def unknown_name(
     if name in removed:
         return f"{what} {name}: {removed[str(name)]}"
     listed = remedy or f"known are {', '.join(known) or 'none'}"
-    return f"{what} {name!r} is unknown{near_name(str(name), known)} ({listed})"
+    return f"{what} {name!r} is unknown{hint(str(name), known)} ({listed})"
 
 
 def load(place: str) -> Any:
