@@ -8,6 +8,7 @@ from pathlib import Path
 
 from geoscene.errors import InputError
 from geoscene.options import KINDS, RELIEFS, BuildOptions
+from geoscene.support.registry import unknown_name
 from geoscene.uses import USES
 
 SETTINGS = ("lod", "relief", "only", "terrain", "for")
@@ -51,7 +52,7 @@ def variants(options: BuildOptions, settings: Sequence[str]) -> list[BuildVarian
     compared.
     """
     if unknown := sorted(set(settings) - set(SETTINGS)):
-        raise InputError(f"`settings` {','.join(unknown)}: unknown; choose from {', '.join(SETTINGS)}")
+        raise InputError(unknown_name("`settings`", unknown[0], known=SETTINGS))
     if "terrain" in settings and not options.dem:
         raise InputError("`settings` terrain: needs `dem`")
     if options.lod != 2 or set(options.only) != set(KINDS) or options.use != "all":

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.support.compiled import njit
+from geoscene.support.registry import unknown_name
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -127,7 +128,7 @@ def limit_rays(
     if not (0.0 <= wide < np.inf and 0.0 <= growth < np.inf):
         raise InputError(f"a footprint of {footprint}: give metres and metres per metre, 0 or more")
     if precision not in PRECISIONS:
-        raise InputError(f"precision {precision!r}: choose one of {', '.join(PRECISIONS)}")
+        raise InputError(unknown_name("precision", precision, known=PRECISIONS))
     if time is not None:
         moments = np.ascontiguousarray(time, np.float32)
         if not (moments.shape == (n,) and ((moments >= 0) & (moments <= 1)).all()):

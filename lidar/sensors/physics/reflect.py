@@ -10,6 +10,7 @@ import numpy as np
 
 from geoscene.classes import materials
 from geoscene.support.compiled import njit
+from geoscene.support.registry import unknown_name
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.raycast.memory import inline
@@ -100,7 +101,7 @@ def apparent(
     Raises InputError if the law is unknown.
     """
     if law not in INCIDENCE_LAWS:
-        raise InputError(f"`law` {law!r} is unknown; there are {', '.join(INCIDENCE_LAWS)}")
+        raise InputError(unknown_name("`law`", law, known=INCIDENCE_LAWS))
     r, c, s = (
         np.ascontiguousarray(v, np.float64) for v in np.broadcast_arrays(reflectance, cosine, specular)
     )

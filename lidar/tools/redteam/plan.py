@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from geoscene.errors import reading
+from geoscene.support.registry import unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
+from lidar.parameters import check_parameters, parameter, read_values
 from lidar.tools.defences.registry import NamedDefence, read_defences
 from lidar.tools.detection import RULES
 from lidar.tools.detection.registry import read_detector
@@ -21,6 +23,7 @@ GOALS = ("forge", "hide", "mislead")
 """What an attack is for: an object that is not there, one that is not found, or a false position."""
 
 _TABLES = ("drive", "grid", "map", "attack", "defences", "measure")
+_KEYS = ("name", "attack", "goal", "published")
 _POOLED = ("seed", "attack")
 """Options of the grid that are no conditions: seeds are repetitions."""
 
@@ -45,34 +48,37 @@ class Attack:
 class Measure:
     """How the matrix is evaluated.
 
-    score        : of a detection from which on it counts
-    false_alarms : share of the genuine frames that may be alarmed
-    false_objects: share of the genuine objects that may be alarmed
-    deviation    : metres of a fix from the genuine one from which on the vehicle is misled; a car that is
-                   1.8 m wide in the middle of a lane of 3.5 m is 0.85 m from its edge
-    block        : seconds of a drive that count as one independent trial
-    detector     : what reports road users, as for `lidar.tools.detection.registry.read_detector`; several are
-                   measured on the same drives and stand side by side
+    detector : what reports road users, as for `lidar.tools.detection.registry.read_detector`; several are
+               measured on the same drives and stand side by side
+
+    Raises InputError for values that are out of bounds.
     """
 
-    score: float = 0.3
-    false_alarms: float = 0.05
-    false_objects: float = 0.01
-    deviation: float = 0.85
-    block: float = 1.0
+    score: float = parameter(0.3, "score of a detection from which on it counts", low=1e-6, high=1 - 1e-6)
+    false_alarms: float = parameter(
+        0.05, "share of the genuine frames that may be alarmed", low=1e-6, high=1 - 1e-6
+    )
+    false_objects: float = parameter(
+        0.01, "share of the genuine objects that may be alarmed", low=1e-6, high=1 - 1e-6
+    )
+    deviation: float = parameter(
+        0.85,
+        "distance of a fix from the genuine one from which on the vehicle is misled; a car that is 1.8 m wide"
+        " in the middle of a lane of 3.5 m is 0.85 m from its edge",
+        unit="m",
+        low=0.01,
+        high=1e6,
+    )
+    block: float = parameter(
+        1.0, "time of a drive that counts as one independent trial", unit="s", low=0.1, high=600
+    )
     detector: tuple[str, ...] = (RULES.name,)
 
     def __post_init__(self) -> None:
         """Validate the values."""
-        for name in ("score", "false_alarms", "false_objects"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(f"measure: {name} = {getattr(self, name):g}: give a share between 0 and 1")
-        if not 0.01 <= self.deviation <= 1e6:
-            raise InputError(f"measure: deviation = {self.deviation:g}: give 0.01 to 1,000,000 m")
-        if not 0.1 <= self.block <= 600:
-            raise InputError(f"measure: block = {self.block:g}: give 0.1 to 600 seconds")
+        check_parameters(self)
         if not self.detector or len(set(self.detector)) < len(self.detector):
-            raise InputError("measure: detector: give one or more that differ")
+            raise InputError("detector: give one or more that differ")
         for name in self.detector:
             read_detector(name)
 
@@ -116,7 +122,7 @@ def read_plan(path: Path) -> RedteamPlan:
     with reading(path, InputError, remedy="give a TOML file with [grid] and [[attack]]", known=InputError):
         document = read_toml(path.read_text("utf-8"))
     if unknown := sorted(set(document) - set(_TABLES)):
-        raise InputError(f"{path}: unknown {unknown[0]}; there are the tables {', '.join(_TABLES)}")
+        raise InputError(f"{path}: {unknown_name('table', unknown[0], known=_TABLES)}")
     attacks = _attacks(path, document.get("attack", []))
     with naming(path, "defences"):
         defences = _defences(document.get("defences", {}))
@@ -150,16 +156,16 @@ def _attacks(path: Path, tables: Any) -> tuple[Attack, ...]:
 
 
 def _attack(table: Mapping[str, Any]) -> Attack:
-    if unknown := sorted(set(table) - {"name", "attack", "goal", "published"}):
-        raise InputError(f"unknown {unknown[0]}; there are name, attack, goal and published")
+    if unknown := sorted(set(table) - set(_KEYS)):
+        raise InputError(unknown_name("key", unknown[0], known=_KEYS))
     for name, kinds in (("name", str), ("attack", (str, dict)), ("goal", str)):
         if not table.get(name) or not isinstance(table[name], kinds):
             raise InputError(f"{name}: give a text")
     if table["goal"] not in GOALS:
-        raise InputError(f"goal = {table['goal']!r}: one of {', '.join(GOALS)}")
+        raise InputError(unknown_name("goal", table["goal"], known=GOALS))
     published = table.get("published", "")
     if published and published not in PUBLISHED:
-        raise InputError(f"published = {published!r}: one of {', '.join(PUBLISHED)}")
+        raise InputError(unknown_name("published", published, known=PUBLISHED))
     return Attack(table["name"], text_of(table["attack"]), table["goal"], published)
 
 
@@ -173,19 +179,15 @@ def _defences(table: Any) -> tuple[NamedDefence, ...]:
 
 
 def _measure(table: Any) -> Measure:
-    known = Measure.__dataclass_fields__
     if not isinstance(table, dict):
         raise InputError("give a table")
-    if unknown := sorted(set(table) - set(known)):
-        raise InputError(f"unknown {unknown[0]}; there are {', '.join(known)}")
     numbers = {name: value for name, value in table.items() if name != "detector"}
-    if wrong := [name for name, value in numbers.items() if type(value) not in (int, float)]:
-        raise InputError(f"{wrong[0]}: give a number")
+    values = read_values(Measure, numbers, also=["detector"])
     detector = table.get("detector", list(Measure().detector))
     detector = [detector] if isinstance(detector, str) else detector
     if not isinstance(detector, list) or not all(isinstance(name, str) for name in detector):
         raise InputError('detector: give a name or a list of names, such as ["rules", "learned"]')
-    return replace(Measure(), **numbers, detector=tuple(detector))
+    return Measure(**values, detector=tuple(detector))
 
 
 def _runs(drives: list[GridDrive], attacks: tuple[Attack, ...]) -> list[Run]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.support.progress import Progress, silent
+from geoscene.support.registry import unknown_name
 from lidar.errors import BackendError, InputError
 from lidar.raycast.library import library
 from lidar.tools.selftest.case import ExtremeCase
@@ -48,7 +49,7 @@ def outcomes(
     Raises InputError for an unknown group.
     """
     if unknown := sorted(set(groups) - set(GROUPS)):
-        raise InputError(f"`only` {','.join(unknown)}: unknown; choose from {', '.join(GROUPS)}")
+        raise InputError(unknown_name("`only`", unknown[0], known=GROUPS))
     chosen = [case for case in CASES if not groups or case.group in groups]
     for k, case in enumerate(chosen):
         yield outcome(case, case.full if full else case.quick)

@@ -10,6 +10,7 @@ import numpy as np
 
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
+from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
 from lidar.options import DriveOptions, TradeoffOptions
@@ -60,7 +61,7 @@ def tradeoff(
     Raises InputError (also as RouteError, RigError) for what cannot be driven or compared.
     """
     if unknown := sorted(set(compared.compare) - set(COMPARED)):
-        raise InputError(f"`compare` {','.join(unknown)}: unknown; there are {', '.join(COMPARED)}")
+        raise InputError(unknown_name("`compare`", unknown[0], known=COMPARED))
     plan = plan_drive(scene, options, progress=progress)
     for other in others:
         if other.frame.to_json() != scene.frame.to_json():

@@ -323,7 +323,7 @@ def test_without_a_second_trace_hits_stay_and_few_rays_leak():
 
 
 def test_an_unknown_precision_is_refused():
-    with pytest.raises(InputError, match="precision 'half': choose one of exact, refined, float32"):
+    with pytest.raises(InputError, match=r"precision 'half' is unknown \(known are exact, refined, float32"):
         Caster(*sheet([0, 0, 1.0], [0, 0, 0])).cast([0, 0, 1], [[0, 0, -1.0]], precision="half")
 
 

@@ -349,5 +349,5 @@ def test_what_lies_under_a_roof_is_neither_wet_nor_under_snow(tmp_path):
         assert ((found.lookup(hits).material & OPEN) > 0).tolist() == is_open
         code = found.faces.packed[hits.face + found.faces.start[hits.instance]] & OPEN
         assert (code > 0).tolist() == is_open
-    with pytest.raises(InputError, match=r"wetness=2: give 0 to 1; snow=-1: give 0 to 1"):
+    with pytest.raises(InputError, match=r"wetness = 2 is not within 0 to 1; snow = -1 is not within"):
         WorldSettings(wetness=2, snow=-1)

@@ -392,7 +392,7 @@ def test_levels_and_settings():
         ("standard", {"rays": "1000"}, "1 to 999"),
         ("standard", {"rays": "x"}, "whole number"),
         ("standard", {"bias": "maybe"}, "on or off"),
-        ("standard", {"spread": "-1"}, "0 or more"),
+        ("standard", {"spread": "-1"}, "at least 0"),
         ("standard", {"law": "cosine"}, "lambert"),
     ]:
         with pytest.raises(InputError, match=word):

@@ -250,7 +250,7 @@ def test_bad_input_is_one_clear_line(scene, scene_utm):
         with pytest.raises(InputError, match=match):
             tradeoff(scene, DRIVE, compared=TradeoffOptions(names, **more))
 
-    refused("leaves", match="`compare` leaves: unknown; there are rays")
+    refused("leaves", match=r"`compare` 'leaves' is unknown \(known are rays")
     refused("rays", "shadows", match="`compare` shadows: a setting of cameras, and none is compared")
     refused("scene", match="`compare` scene: no other scene is given")
     refused("traffic", match="`compare` traffic: the drive has none")
