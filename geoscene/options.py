@@ -8,12 +8,10 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from geoscene.errors import InputError
+from geoscene.relief import MESH, RELIEFS
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.registry import unknown_name
 from geoscene.uses import USES
-
-RELIEFS = ("off", "plain", "full")
-"""Relief of surfaces that a scene can have; each includes the former."""
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """Kinds of features that a scene can have besides its ground."""
@@ -220,5 +218,5 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.relief not in (None, "mesh"):
-            raise InputError(f"`relief` {self.relief}: mesh, or leave it out for plane walls")
+        if self.relief not in (None, MESH):
+            raise InputError(f"`relief` {self.relief}: give {MESH}, or leave it out for plane walls")

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from cyclopts import Group, Parameter, Token
 
 from geoscene.classes import Class
-from geoscene.options import KINDS, RELIEFS, BuildOptions, Degrees
+from geoscene.options import KINDS, BuildOptions, Degrees
+from geoscene.relief import RELIEFS
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.digests import recipe_digest
 from geoscene.support.registry import unknown_name
@@ -614,8 +615,8 @@ class PlaceOptions:
     def build_options(self, name: str, *, relief: str) -> BuildOptions:
         """Options of the build, with a title of the scene; raises InputError for invalid ones.
 
-        relief : setting of the drive, of `lidar.world.settings.RELIEFS`; the default of builds unless it is
-                 one of theirs
+        relief : that the drive uses, of `geoscene.relief.USED_RELIEFS`; the default of builds unless a scene
+                 can be built with it
         """
         return BuildOptions(
             relief=relief if relief in RELIEFS else BuildOptions().relief,

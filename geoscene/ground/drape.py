@@ -19,13 +19,13 @@ from geoscene.ground.layers import Layers
 from geoscene.ground.partition import (
     GroundPlan,
     Partition,
-    follows_relief,
+    follows_terrain,
     partition_tile,
     rows_near,
     tile_lattice,
     values_at,
 )
-from geoscene.ground.triangulate import PlaneTriangles, triangulate, triangulate_relief
+from geoscene.ground.triangulate import PlaneTriangles, triangulate, triangulate_lattice
 from geoscene.sources.data import Way
 from geoscene.typing import Bools, Float, Height
 
@@ -135,8 +135,8 @@ def ground_tile(
     """The ground of tile (i, j) in scene coordinates: partition, triangles and heights in one call."""
     cells = partition_tile(plan, i, j=j)
     still = np.isin(values_at(plan.layers.body, cells.row, base=""), ("sea", "standing")).all()
-    if follows_relief(plan, i, j=j) and not still:
-        triangles = triangulate_relief(cells, tile_lattice(plan, i, j=j))
+    if follows_terrain(plan, i, j=j) and not still:
+        triangles = triangulate_lattice(cells, tile_lattice(plan, i, j=j))
     else:
         triangles = triangulate(cells)
     return drape(plan, cells, triangles=triangles, height=height, levels=levels)

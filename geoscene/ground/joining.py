@@ -15,17 +15,17 @@ _LARGEST = 4096.0
 """Metres of the longest side of a joined tile."""
 
 _MOST_STEPS = 128
-"""Most steps of the relief's lattice along a side of a joined tile, which bounds the number of its faces."""
+"""Most steps of the lattice along a side of a joined tile, which bounds the number of its faces."""
 
 _MOST_LINES = 100
-"""The same for lines of the terrain, where the ground follows no relief."""
+"""The same for lines of the terrain, where the ground follows lines."""
 
 
 def join_tiles(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> GroundPlan:
     """The plan with squares on which nothing lies joined to tiles of 2, 4, 8 ... squares along a side.
 
     Such a square has no outline, none of the ``occupied`` squares' features, no forest (whose trees are
-    placed tile by tile), no river and no ground graded to roads. The ground follows the plan's relief, or
+    placed tile by tile), no river and no ground graded to roads. The ground follows the terrain's heights, or
     else keeps its lines. Tiles that are not joined only change on sides beside joined ones.
     """
     low, high = plan.tiles[0], plan.tiles[-1]
@@ -34,8 +34,8 @@ def join_tiles(plan: GroundPlan, occupied: Collection[tuple[int, int]]) -> Groun
     whole = _bare(plan, occupied).reshape(rows, columns)
     lines = plan.coarse if plan.ruled is not None else plan.lines
     most = min(_LARGEST, _MOST_LINES * lines) if lines else _LARGEST
-    if plan.relief is not None:
-        most = min(_LARGEST, _MOST_STEPS * plan.tile_size / plan.relief.steps(plan.tile_size))
+    if plan.terrain is not None:
+        most = min(_LARGEST, _MOST_STEPS * plan.tile_size / plan.terrain.steps(plan.tile_size))
     n = 2
     while n * plan.tile_size <= most and whole.any():
         # Squares beyond the extent are bare: tiles are cut at its east and north sides.

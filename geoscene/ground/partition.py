@@ -22,8 +22,8 @@ from geoscene.errors import InputError
 from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.faces import GroundFaces, faces
 from geoscene.ground.layers import Layers
-from geoscene.ground.relief import Lattice, Relief, lattice
 from geoscene.ground.snapping import distinct_places, snap_rounded
+from geoscene.ground.terrain_lattice import Lattice, TerrainHeights, lattice
 from geoscene.support.columns import row_blocks
 from geoscene.typing import Bools, Float, Ints
 
@@ -66,7 +66,7 @@ class GroundPlan:
     lines     : spacing of the terrain's lines, metres, 0 for none
     ruled     : tiles that have these lines; None for all
     coarse    : spacing of the lines in the other tiles, 0 for none
-    relief    : heights that joined tiles follow instead of lines, None for none
+    terrain   : heights that joined tiles follow instead of lines, None for none
     layers    : the polygons that compete for the ground
     tree      : STRtree over their polygons
     base      : (class, material code) where no polygon lies
@@ -86,7 +86,7 @@ class GroundPlan:
     lines: float
     ruled: frozenset[tuple[int, int]] | None
     coarse: float
-    relief: Relief | None
+    terrain: TerrainHeights | None
     layers: Layers
     tree: shapely.STRtree
     base: tuple[int, int]
@@ -135,7 +135,7 @@ def plan_ground(
     lines: float = 0.0,
     ruled: Iterable[tuple[int, int]] | None = None,
     coarse: float = 0.0,
-    relief: Relief | None = None,
+    terrain: TerrainHeights | None = None,
     base: tuple[int, str] = (Class.TERRAIN, "soil"),
     kerbs: Kerbs | None = None,
     raised: Raised | None = None,
@@ -147,7 +147,7 @@ def plan_ground(
              that the ground can follow a terrain (still water is not cut); 0 for none
     ruled  : tiles that have such lines; all by default
     coarse : spacing of the lines in other tiles, 0 for none
-    relief : heights that tiles follow, instead of lines, that `geoscene.ground.join_tiles` makes of several
+    terrain : heights that tiles follow, instead of lines, that `geoscene.ground.join_tiles` makes of several
     base   : class and material where no polygon lies
     kerbs  : by which sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
     raised : what stands above; its parts must be layers of their own (`geoscene.roadgraph.camber`)
@@ -177,7 +177,7 @@ def plan_ground(
         lines,
         None if ruled is None else frozenset(ruled),
         coarse,
-        relief,
+        terrain,
         layers,
         shapely.STRtree(layers.polygon),
         (int(klass), materials()[material].code),
@@ -252,18 +252,18 @@ def tile_place(plan: GroundPlan, i: int, *, j: int) -> int | None:
     return (j - south) * (east - west + 1) + i - west if west <= i <= east and south <= j <= north else None
 
 
-def follows_relief(plan: GroundPlan, i: int, *, j: int) -> bool:
-    """Whether the ground of square (i, j) follows the plan's relief, instead of lines."""
-    return plan.relief is not None and tile_span(plan, i, j=j) > 1
+def follows_terrain(plan: GroundPlan, i: int, *, j: int) -> bool:
+    """Whether the ground of square (i, j) follows heights of the terrain, instead of lines."""
+    return plan.terrain is not None and tile_span(plan, i, j=j) > 1
 
 
 def tile_lattice(plan: GroundPlan, i: int, *, j: int) -> Lattice:
-    """The vertices by which tile (i, j) follows the plan's relief; the plan must have one."""
-    if plan.relief is None:
-        raise InputError("the ground's plan has no relief")
+    """The vertices by which tile (i, j) follows the terrain; the plan must have its heights."""
+    if plan.terrain is None:
+        raise InputError("the ground's plan has no heights of the terrain")
     odd = bool((i + j - plan.tiles[0].sum()) % 2)
     span = tile_span(plan, i, j=j)
-    return lattice(plan.relief, (i, j), span=span, odd=odd, tile_size=plan.tile_size, extent=plan.extent)
+    return lattice(plan.terrain, (i, j), span=span, odd=odd, tile_size=plan.tile_size, extent=plan.extent)
 
 
 def rows_near(plan: GroundPlan, xmin: float, *, ymin: float, xmax: float, ymax: float) -> Ints:
@@ -381,7 +381,7 @@ def _by_tile(
 
 def _spacing(plan: GroundPlan, i: int, *, j: int) -> float:
     """Spacing of the terrain's lines in tile (i, j), 0 where it has none."""
-    if follows_relief(plan, i, j=j):
+    if follows_terrain(plan, i, j=j):
         return 0.0
     return plan.lines if plan.ruled is None or (i, j) in plan.ruled else plan.coarse
 
@@ -395,8 +395,8 @@ def _multiples(low: float, high: float, *spacings: float) -> Float:
 def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float, float]) -> list[Float]:
     """The tile's sides, and the terrain's lines across it, as vertices (n, 2).
 
-    A side has a vertex at every line and every vertex of the relief of both tiles that share it, and at every
-    corner of a square, so that tiles of any span agree.
+    A side has a vertex at every line and every vertex of the lattices of both tiles that share it, and at
+    every corner of a square, so that tiles of any span agree.
     """
     xmin, ymin, xmax, ymax = box
     own, n = _spacing(plan, i, j=j), tile_span(plan, i, j=j)
@@ -426,13 +426,13 @@ def _ruling(plan: GroundPlan, i: int, *, j: int, box: tuple[float, float, float,
 
 
 def _kept_on_sides(plan: GroundPlan, i: int, *, j: int) -> list[Float]:
-    """Coordinates of the relief's vertices on a tile's south, north, west and east side.
+    """Coordinates of the lattice's vertices on a tile's south, north, west and east side.
 
-    None where neither the tile nor one beside it follows the relief.
+    None where neither the tile nor one beside it follows the terrain.
     """
     n = tile_span(plan, i, j=j)
     near = [(i + dx, j + dy) for k in range(n) for dx, dy in ((k, -1), (k, n), (-1, k), (n, k))]
-    if not any(follows_relief(plan, column, j=row) for column, row in [(i, j), *near]):
+    if not any(follows_terrain(plan, column, j=row) for column, row in [(i, j), *near]):
         return [np.empty(0)] * 4
     points = tile_lattice(plan, i, j=j)
     x, y, kept = points.x, points.y, points.kept
@@ -452,16 +452,16 @@ def _stops(
 
     first  : index of the first square along the side
     beside : the squares beyond the side, in order
-    kept   : coordinates of the relief's vertices on the side
+    kept   : coordinates of the lattice's vertices on the side
     """
     size, stops = plan.tile_size, [np.empty(0)]
-    own, follows = _spacing(plan, tile[0], j=tile[1]), follows_relief(plan, tile[0], j=tile[1])
+    own, follows = _spacing(plan, tile[0], j=tile[1]), follows_terrain(plan, tile[0], j=tile[1])
     for k, (i, j) in enumerate(beside, start=first):
         start, end = max(k * size, ends[0]), min((k + 1) * size, ends[1])
         if start < end:
             border = follows and tile_place(plan, i, j=j) is None
             lines = _multiples(start, end, own, 0.0 if border else _spacing(plan, i, j=j))
-            if follows or follows_relief(plan, i, j=j):
+            if follows or follows_terrain(plan, i, j=j):
                 lines = np.union1d(lines, kept[(kept > start) & (kept < end)])
             stops += [np.array([start]), lines]
     return np.concatenate(stops)[1:]

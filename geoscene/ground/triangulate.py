@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
 from geoscene.ground.partition import Partition, distinct
-from geoscene.ground.relief import Lattice, relief_corners
+from geoscene.ground.terrain_lattice import Lattice, lattice_corners
 from geoscene.typing import Float, Ints
 
 
@@ -46,12 +46,12 @@ def triangulate(partition: Partition) -> PlaneTriangles:
     return _check(partition, rings.reshape(-1, 4, 2)[:, :3], cell=cell[::4])
 
 
-def triangulate_relief(partition: Partition, vertices: Lattice) -> PlaneTriangles:
-    """The triangles of a tile of bare ground, which is one cell, with the vertices that its relief needs.
+def triangulate_lattice(partition: Partition, vertices: Lattice) -> PlaneTriangles:
+    """The triangles of a tile of bare ground, which is one cell, with the vertices that the terrain needs.
 
     Raises GeosceneError if the triangles do not add up to its area.
     """
-    corners = relief_corners(vertices, partition.polygon[0])
+    corners = lattice_corners(vertices, partition.polygon[0])
     return _check(partition, corners, cell=np.zeros(len(corners), np.int64))
 
 

@@ -32,24 +32,24 @@ class Forests:
 
     feature : (k,) int64, forests with needle-leaved trees, by feature number, ascending
     needles : (k,) float64, their share of needle-leaved trees
-    relief  : trees have habits
+    with_relief : trees have habits
     density : trees per m2; 0.02 (200 to the hectare) is a closed stand of grown trees
     seed    : of places, sizes and forms
     """
 
     feature: Ints
     needles: Float
-    relief: bool = False
+    with_relief: bool = False
     density: float = 0.02
     seed: int = 0
 
     @classmethod
-    def of(cls, layers: Layers, osm: OsmData, *, relief: bool = False) -> Forests:
+    def of(cls, layers: Layers, osm: OsmData, *, with_relief: bool = False) -> Forests:
         """The forests among the layers of a ground."""
         kinds = {area.osm_id: area.tags.get("leaf_type", area.tags.get("wood", "")) for area in osm.areas}
         share = np.array([_SHARES.get(kinds.get(name, ""), 0.0) for name in layers.osm_id.tolist()], float)
         rows = np.flatnonzero((layers.klass == Class.FOREST_FLOOR) & (share > 0))
-        return cls(layers.feature[rows].astype(np.int64), share[rows], relief)
+        return cls(layers.feature[rows].astype(np.int64), share[rows], with_relief)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Forests:
@@ -57,14 +57,14 @@ class Forests:
         shares = document["needleleaved_share"]
         feature = np.array([int(name) for name in shares], np.int64)
         needles = np.array(list(shares.values()), float)
-        relief = bool(document.get("relief", False))
-        return cls(feature, needles, relief, float(document["trees_per_m2"]), int(document["seed"]))
+        with_relief = bool(document.get("relief", False))
+        return cls(feature, needles, with_relief, float(document["trees_per_m2"]), int(document["seed"]))
 
     def to_json(self) -> dict[str, Any]:
         """The document that a scene's manifest contains."""
         shares = dict(zip(map(str, self.feature.tolist()), self.needles.tolist(), strict=True))
         document = {"trees_per_m2": self.density, "seed": self.seed, "needleleaved_share": shares}
-        return document | ({"relief": True} if self.relief else {})
+        return document | ({"relief": True} if self.with_relief else {})
 
 
 def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tuple[Trees, Float]:
@@ -81,7 +81,7 @@ def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tup
     xy, draw, face = _places(floor, forests, box=box)
     feature = floor.feature[face].astype(np.int64)
     share, widest = _needle_shares(forests, feature), 1.2 * _spacing(forests)
-    trees = _sample(xy, draw, feature=feature, share=share, widest=widest, relief=forests.relief)
+    trees = _sample(xy, draw, feature=feature, share=share, widest=widest, with_relief=forests.with_relief)
     return trees, _heights(floor.vertices[floor.faces[face]], xy)
 
 
@@ -155,7 +155,9 @@ def _needle_shares(forests: Forests, feature: Ints) -> Float:
     return np.where(known[place] == feature, share[place], 0.0)
 
 
-def _sample(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float, relief: bool) -> Trees:
+def _sample(
+    xy: Float, draw: Float, *, feature: Ints, share: Float, widest: float, with_relief: bool
+) -> Trees:
     """Trees at places (n, 2) with size and form by random numbers (4, n)."""
     n, needled = len(xy), draw[3] < share
     height = np.where(needled, HEIGHT["needleleaved"], HEIGHT["broadleaved"]) * (0.8 + 0.4 * draw[2])
@@ -166,11 +168,11 @@ def _sample(xy: Float, draw: Float, *, feature: Ints, share: Float, widest: floa
         np.minimum(crown, widest),  # the spacing limits the crown
         height * TRUNK,
         np.where(needled, "needleleaved", "broadleaved"),
-        np.where(needled, "conical", "ovoid") if relief else np.full(n, ""),
+        np.where(needled, "conical", "ovoid") if with_relief else np.full(n, ""),
         np.full(n, "sampled"),
         np.full(n, "height"),
         np.where(share > 0, "leaf_type", "default"),
-        np.full(n, "form" if relief else ""),
+        np.full(n, "form" if with_relief else ""),
         np.full(n, "sampled"),
         np.zeros(n),
         np.full(n, ""),

@@ -118,7 +118,7 @@ def read_furniture(
     With relief, bicycle parkings are rows of stands, and signs have the plates of their codes and faces.
 
     left_hand : traffic keeps left
-    relief    : of `geoscene.options.RELIEFS`; with ``plain`` and ``full`` there are more kinds
+    relief    : of `geoscene.relief.RELIEFS`; with ``plain`` and ``full`` there are more kinds
     """
     chosen, mapped = mapped_furniture(osm, frame, extent=plan.extent, relief=relief)
     roads, sites = _Roads.of(osm, frame), Sites.of(plan)
@@ -238,7 +238,7 @@ def _off_ground(tags: Tags) -> bool:
 
 def usual_height(shape: str) -> float:
     """Height of a shape in metres."""
-    return float(shapes(relief=True)[shape].vertices[:, 2].max())
+    return float(shapes(with_relief=True)[shape].vertices[:, 2].max())
 
 
 def _height(point: TaggedNode, shape: str, *, problems: list[Problem]) -> tuple[float, str]:

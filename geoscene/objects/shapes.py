@@ -37,9 +37,9 @@ _BALL = ((0, 0), (0.65, 0.13), (0.97, 0.38), (0.97, 0.62), (0.65, 0.87), (0, 1))
 _CONE = ((0, 0), (1, 0.05), (0, 1))
 
 
-def leaf_area_density(*, relief: bool = False) -> dict[str, float]:
-    """`LEAF_AREA_DENSITY`, with ``relief`` also of the clusters of leaves in crowns with relief."""
-    if not relief:
+def leaf_area_density(*, with_relief: bool = False) -> dict[str, float]:
+    """`LEAF_AREA_DENSITY`, with relief also of the clusters of leaves in crowns with relief."""
+    if not with_relief:
         return LEAF_AREA_DENSITY
     forms = ("broadleaved", "needleleaved", "palm")
     return LEAF_AREA_DENSITY | leaf_area_densities(
@@ -48,15 +48,15 @@ def leaf_area_density(*, relief: bool = False) -> dict[str, float]:
 
 
 @functools.cache
-def shapes(*, relief: bool = False) -> dict[str, Mesh]:
+def shapes(*, with_relief: bool = False) -> dict[str, Mesh]:
     """All shapes by name, in the order of their numbers in `ShapeInstances.shape`.
 
     Crowns and trunks are of unit size (x and y from -0.5 to 0.5, z from 0 to 1), to be scaled; the rest is in
     metres at its usual size, x in the direction it faces, z up from the ground. All are closed.
 
-    relief : also those of scenes with relief, after the others
+    with_relief : also those of scenes with relief, after the others
     """
-    if relief:
+    if with_relief:
         return shapes() | tree_shapes() | street_shapes() | roof_shapes()
     return {
         "trunk": solid(prism(circle(1.0, 6), 0.0, top=1.0, taper=0.7), klass=Class.TRUNK, material="bark"),
@@ -166,7 +166,7 @@ def place(
     transform = np.concatenate([turn * size[:, None, :], np.reshape(position, (k, 3, 1))], axis=2)
     names = np.broadcast_to(np.asarray(name, np.str_), (k,))
     known, which = np.unique(names, return_inverse=True)
-    library = list(shapes(relief=True))
+    library = list(shapes(with_relief=True))
     number = np.array([library.index(str(n)) for n in known], np.int32)[which.reshape(-1)]
     return ShapeInstances(
         number.astype(np.int32), transform, np.broadcast_to(np.asarray(feature, np.int32), (k,)).copy()

@@ -97,7 +97,7 @@ class Trees(Columns):
 
 
 def read_trees(
-    osm: OsmData, frame: Frame, *, spacing: float = 8.0, relief: bool = False
+    osm: OsmData, frame: Frame, *, spacing: float = 8.0, with_relief: bool = False
 ) -> tuple[Trees, list[Problem]]:
     """The single trees and tree rows on the map, and problems: tags that could not be used.
 
@@ -107,7 +107,7 @@ def read_trees(
     botanical names, and the crowns of some are more slender.
 
     spacing : metres between trees of a row
-    relief  : trees have habits
+    with_relief : trees have habits
     """
     problems: list[Problem] = []
     lonlat: list[tuple[float, float]] = []
@@ -133,7 +133,7 @@ def read_trees(
     mapped = np.isfinite(crown)
     ratio = np.array([CROWN[str(f)] for f in form])
     habit, habit_source = np.full((2, len(ids)), "", object)
-    if relief:
+    if with_relief:
         pairs = [habit_of(_botanical(tag), form=str(f)) for tag, f in zip(tags, form, strict=True)]
         habit[:] = [name for name, _ in pairs]
         habit_source[:] = ["species" if told else "form" for _, told in pairs]

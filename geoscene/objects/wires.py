@@ -162,5 +162,5 @@ def wire_instances(wires: Wires, *, height: Height | None = None) -> ShapeInstan
     above /= np.linalg.norm(above, axis=1)[:, None]
     more = _JOINT * along / np.linalg.norm(along, axis=1)[:, None]
     transform = np.stack([along + 2 * more, width * aside, width * above, a - more], axis=2)
-    number = list(shapes(relief=True)).index("wire")
+    number = list(shapes(with_relief=True)).index("wire")
     return ShapeInstances(np.full(len(a), number, np.int32), transform, np.repeat(wires.feature, _PIECES))

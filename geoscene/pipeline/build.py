@@ -86,7 +86,7 @@ def build(
             ranges=plan.ranges,
             graph=plan.graph,
             kept=plan.kept,
-            shapes=shapes(relief=plan.relief != "off") if plan.use.tiles else {},
+            shapes=shapes(with_relief=plan.relief != "off") if plan.use.tiles else {},
             use=plan.use,
             problems=problems,
             tiles=tiles_document(keys, reports),

@@ -88,29 +88,29 @@ def road_layer(graph: RoadGraph) -> Layer:
     return Layer("roads", edge_lines(graph, heights=True), columns)
 
 
-def tree_layer(trees: Trees, z: NDArray[np.float64], *, relief: bool = False) -> Layer:
+def tree_layer(trees: Trees, z: NDArray[np.float64], *, with_relief: bool = False) -> Layer:
     """Layer ``trees``: mapped trees and those of tree rows, as points at the foot of the trunk.
 
-    relief : with habits
+    with_relief : with habits
     """
     columns = _columns(
         trees,
         "feature osm_id height height_source crown crown_source trunk form form_source"
-        + (" habit habit_source" if relief else "")
+        + (" habit habit_source" if with_relief else "")
         + " place_source moved",
     )
     return Layer("trees", shapely.points(np.column_stack([trees.xy, z])), columns)
 
 
-def furniture_layer(furniture: Furniture, z: NDArray[np.float64], *, relief: bool = False) -> Layer:
+def furniture_layer(furniture: Furniture, z: NDArray[np.float64], *, with_relief: bool = False) -> Layer:
     """Layer ``furniture``: positions of lamps, signals, signs, benches and similar objects.
 
-    relief : with the source of each object and the faces of signs
+    with_relief : with the source of each object and the faces of signs
     """
     columns = _columns(
         furniture,
         "feature osm_id shape height height_source heading heading_source place_source moved"
-        + (" source face" if relief else ""),
+        + (" source face" if with_relief else ""),
     )
     return Layer("furniture", shapely.points(np.column_stack([furniture.xy, z])), columns)
 

@@ -78,7 +78,7 @@ def scene_manifest(
         "counts": _counts(plan, reports, problems=problems),
         **({} if plan.relief == "off" else {"relief": _relief(plan, reports)}),
         "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
-        "leaf_area_density": leaf_area_density(relief=plan.relief != "off"),
+        "leaf_area_density": leaf_area_density(with_relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),
         **({} if osm.cloud is None else {"cloud": osm.cloud}),

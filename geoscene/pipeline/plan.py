@@ -29,9 +29,9 @@ from geoscene.ground import (
 from geoscene.ground.camber import Kerbs, Raised
 from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
-from geoscene.ground.relief import Relief
 from geoscene.ground.standing import standing_height
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
+from geoscene.ground.terrain_lattice import TerrainHeights
 from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
 from geoscene.objects.forests import Forests
@@ -130,7 +130,7 @@ class BuildPlan:
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     use       : what of the scene is written
-    relief    : of surfaces, of `geoscene.options.RELIEFS`
+    relief    : of surfaces, of `geoscene.relief.RELIEFS`
     facades   : what the openings of walls depend on; None without relief
     rooftops  : what stands on roofs; None without full relief
     wires     : overhead wires; none without relief
@@ -258,8 +258,8 @@ def make_plan(
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
         road_layer(roads.graph),
-        tree_layer(trees, _foot(trees.xy, surface), relief=options.relief != "off"),
-        furniture_layer(furniture, _foot(furniture.xy, surface), relief=options.relief != "off"),
+        tree_layer(trees, _foot(trees.xy, surface), with_relief=options.relief != "off"),
+        furniture_layer(furniture, _foot(furniture.xy, surface), with_relief=options.relief != "off"),
         barrier_layer(barriers),
         structure_layer(structures),
     ]
@@ -280,7 +280,7 @@ def make_plan(
         kept=kept,
         levels=local.levels,
         trees=trees,
-        forests=Forests.of(ground.layers, osm, relief=options.relief != "off")
+        forests=Forests.of(ground.layers, osm, with_relief=options.relief != "off")
         if "trees" in options.only
         else None,
         furniture=furniture,
@@ -573,7 +573,9 @@ def _plan_ground(
         lines=_ROAD_LINES if roads.uneven else 0.0,
         ruled=_graded_tiles(roads.graph, size, level=not terrain.grids),
         coarse=terrain.lines,
-        relief=Relief(terrain.height, tolerance, terrain.lines) if terrain.grids and tolerance else None,
+        terrain=TerrainHeights(terrain.height, tolerance, terrain.lines)
+        if terrain.grids and tolerance
+        else None,
         kerbs=kerbs,
         raised=raised,
     )
@@ -634,7 +636,7 @@ def _objects(
     These are a table of the objects before they are sited (of furniture: the guesses or None), boxes (n, 4)
     within which they will stand, and the count of their feature numbers.
     """
-    trees, problems = read_trees(osm, frame, relief=options.relief != "off")
+    trees, problems = read_trees(osm, frame, with_relief=options.relief != "off")
     barriers, more = read_barriers(osm, frame, extent=extent)
     relief = options.relief
     posts = mapped_furniture(osm, frame, extent=extent, relief=relief)[1]

@@ -32,7 +32,7 @@ from geoscene.objects.vegetation import tree_instances
 from geoscene.objects.wires import wire_instances
 from geoscene.pipeline.plan import BuildPlan, take_buildings
 from geoscene.scene import SceneFiles
-from geoscene.scene.tile_files import Extras, Tile, read_tile, write_tile
+from geoscene.scene.tile_files import FullParts, Tile, read_tile, write_tile
 from geoscene.structures import StructureOptions, built_structures
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.digests import file_digest
@@ -215,7 +215,9 @@ def build_tile(
         old, guessed = read_tile(file), report.guessed
         is_building = old.mesh.closed & (old.mesh.feature < plan.buildings.count)
         origin, rest = old.origin, old.mesh.take(~is_building)
-        equipment = np.zeros(len(rest), np.bool_) if old.extras is None else old.extras.faces[~is_building]
+        equipment = (
+            np.zeros(len(rest), np.bool_) if old.full_parts is None else old.full_parts.faces[~is_building]
+        )
         of = old.instances.feature
         copies = old.instances.take((of < 0) | (of >= plan.buildings.count))  # without those on roofs
     else:
@@ -236,12 +238,12 @@ def build_tile(
     if not plan.use.colors:
         mesh = replace(mesh, color=np.full_like(mesh.color, _GREY), surface=np.zeros_like(mesh.surface))
     relief = layout.relief.placed(-origin, faces=len(mesh)) if layout else None
-    extras = None
+    full_parts = None
     if plan.relief == "full":
         guesses = layout.parts.guessed if layout else np.empty(0, np.bool_)
         faces = np.concatenate([np.zeros(len(solids), np.bool_), guesses, equipment])
-        extras = Extras(faces, np.concatenate([added, np.ones(len(on_roofs), np.bool_)]))
-    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief, extras))
+        full_parts = FullParts(faces, np.concatenate([added, np.ones(len(on_roofs), np.bool_)]))
+    digest = write_tile(SceneFiles(folder).tile(*tile), Tile(origin, mesh, copies, relief, full_parts))
     forest_trees = 0
     if plan.forests is not None:
         box = tile_box(plan.ground, tile[0], j=tile[1])

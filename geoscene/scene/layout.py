@@ -264,7 +264,7 @@ class Scene(Previewed):
         if self.modelled and tile.relief is not None:
             from geoscene.buildings.facades.solids import relief_mesh  # noqa: PLC0415  (0.1 s)
 
-            tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None, extras=None)
+            tile = replace(tile, mesh=relief_mesh(tile.mesh, tile.relief), relief=None, full_parts=None)
         if self.forests is None or not forests:
             return tile
         box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
@@ -273,7 +273,7 @@ class Scene(Previewed):
 
     @property
     def relief(self) -> str:
-        """Relief of its surfaces, of `geoscene.options.RELIEFS`."""
+        """Relief of its surfaces, of `geoscene.relief.RELIEFS`."""
         return str(self.manifest.get("options", {}).get("relief", "off"))
 
     def with_relief_mesh(self) -> Scene:

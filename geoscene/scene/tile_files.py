@@ -25,8 +25,8 @@ from geoscene.typing import Bools, Float
 
 
 @dataclass(frozen=True, slots=True)
-class Extras:
-    """What full relief adds to plain, and drives can leave out.
+class FullParts:
+    """Parts that full relief adds to plain, and drives can leave out.
 
     faces     : (m,) bool, of the tile's mesh
     instances : (k,) bool, of the instances of the tile's file
@@ -44,14 +44,14 @@ class Tile:
     mesh      : in tile coordinates
     instances : in tile coordinates; trees of forests are not in files (see `with_forests`)
     relief    : openings of the walls, in tile coordinates; None in scenes without relief
-    extras    : None in scenes without full relief
+    full_parts: None in scenes without full relief
     """
 
     origin: Float
     mesh: Mesh
     instances: ShapeInstances = field(default_factory=ShapeInstances.empty)
     relief: WallRelief | None = None
-    extras: Extras | None = None
+    full_parts: FullParts | None = None
 
 
 def with_forests(tile: Tile, forests: Forests, *, box: Sequence[float]) -> Tile:
@@ -91,8 +91,8 @@ def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
     instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(ShapeInstances)}
     relief = {} if tile.relief is None else _relief_arrays(tile.relief)
-    extras = {} if tile.extras is None else _extra_arrays(tile.extras)
-    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief, **extras})
+    full_parts = {} if tile.full_parts is None else _full_part_arrays(tile.full_parts)
+    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief, **full_parts})
     write_atomically(path, data)
     return digest(data)
 
@@ -108,8 +108,10 @@ def read_tile(path: Path) -> Tile:
         mesh = _mesh(arrays)
         relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
         copies = ShapeInstances(**instances)
-        extras = _extras(arrays, faces=len(mesh), copies=len(copies)) if "extra_faces" in arrays else None
-        return Tile(arrays["origin"], mesh, copies, relief, extras)
+        full_parts = (
+            _full_parts(arrays, faces=len(mesh), copies=len(copies)) if "extra_faces" in arrays else None
+        )
+        return Tile(arrays["origin"], mesh, copies, relief, full_parts)
 
 
 def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
@@ -118,16 +120,16 @@ def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
     return {**facades, **openings, "relief_cells": relief.cells, "relief_wall": relief.wall}
 
 
-def _extra_arrays(extras: Extras) -> dict[str, NDArray[Any]]:
-    return {"extra_faces": extras.faces, "extra_instances": extras.instances}
+def _full_part_arrays(full_parts: FullParts) -> dict[str, NDArray[Any]]:
+    return {"extra_faces": full_parts.faces, "extra_instances": full_parts.instances}
 
 
-def _extras(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) -> Extras:
-    """The extras in a tile's arrays; raises ValueError if they do not fit the mesh and the instances."""
-    extras = Extras(_column(arrays, "extra_faces"), _column(arrays, "extra_instances"))
-    if len(extras.faces) != faces or len(extras.instances) != copies:
-        raise ValueError("extras do not fit the faces or the instances")
-    return extras
+def _full_parts(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) -> FullParts:
+    """The parts of full relief in a tile's arrays; raises ValueError if they do not fit the tile."""
+    full_parts = FullParts(_column(arrays, "extra_faces"), _column(arrays, "extra_instances"))
+    if len(full_parts.faces) != faces or len(full_parts.instances) != copies:
+        raise ValueError("the parts of full relief do not fit the faces or the instances")
+    return full_parts
 
 
 def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:

@@ -53,7 +53,7 @@ class StructureOptions:
 
     @classmethod
     def of_relief(cls, relief: str) -> StructureOptions:
-        """The options of a scene with this relief, one of `geoscene.options.RELIEFS`."""
+        """The options of a scene with this relief, one of `geoscene.relief.RELIEFS`."""
         if relief == "off":
             return cls()
         return cls(walkway=0.75, lining=True, equipment=relief == "full")

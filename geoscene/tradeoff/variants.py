@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from geoscene.errors import InputError
-from geoscene.options import KINDS, RELIEFS, BuildOptions
+from geoscene.options import KINDS, BuildOptions
+from geoscene.relief import RELIEFS
 from geoscene.support.registry import unknown_name
 from geoscene.uses import USES
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.pipeline.limits import Limit
+from geoscene.relief import USED_RELIEFS, sufficient_reliefs
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.parameters import check_parameters, parameter
@@ -22,13 +23,6 @@ _FAR = 10_000.0
 
 ORIGINS = ("near", "scene")
 """Origins of the float32 coordinates of a caster."""
-
-
-RELIEFS = ("scene", "off", "plain", "full", "mesh")
-"""What is used of the relief of a scene."""
-
-_BUILT = {"plain": ("plain", "full"), "mesh": ("plain", "full"), "full": ("full",)}
-"""Reliefs of scenes that hold what a setting asks for; no row for settings that any scene satisfies."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +57,7 @@ class WorldSettings:
         "scene: what the scene holds; plain: without the small parts that full relief adds; off: walls are"
         " planes and the ground is smooth, too; full: only of a scene that has them; mesh: openings of walls"
         " as triangles",
-        among=RELIEFS,
+        among=USED_RELIEFS,
     )
     wetness: float = parameter(
         0.0, "share of surfaces open to the sky that is soaked and under a film of water", low=0, high=1
@@ -85,11 +79,11 @@ PLAIN = WorldSettings()
 
 def check_relief(scene: Scene, settings: WorldSettings) -> None:
     """Raise InputError if the settings ask for relief that a scene does not hold."""
-    built, enough = scene.relief, _BUILT.get(settings.relief)
-    if enough and built not in enough:
+    sufficient = sufficient_reliefs(settings.relief)
+    if scene.relief not in sufficient:
         raise InputError(
-            f"`relief` {settings.relief}: {scene.location} was built with relief {built}; build it again with"
-            f" `relief` {' or '.join(enough)}, or leave the option out"
+            f"`relief` {settings.relief}: {scene.location} was built with relief {scene.relief}; build it"
+            f" again with `relief` {' or '.join(sufficient)}, or leave the option out"
         )
 
 

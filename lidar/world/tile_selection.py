@@ -28,7 +28,7 @@ _CLASSES = {
 }
 
 
-_WITHOUT_EXTRAS = {"bicycle_stand_1": "bicycle_stand", "bicycle_stand_2": "bicycle_stand"}
+_PLAIN_SHAPES = {"bicycle_stand_1": "bicycle_stand", "bicycle_stand_2": "bicycle_stand"}
 """Shapes of mapped objects to which full relief adds something, here bicycles, and those without it."""
 
 
@@ -40,31 +40,31 @@ def selected_tile(scene: Scene, rank: int, *, settings: WorldSettings, shapes: M
     i, j = scene.tile_indices[rank]
     tile = scene.tile(i, j, forests=settings.forests)
     without = [code for name, codes in _CLASSES.items() if not getattr(settings, name) for code in codes]
-    extras = tile.extras if settings.relief in {"off", "plain"} else None
-    if not without and extras is None:
+    full_parts = tile.full_parts if settings.relief in {"off", "plain"} else None
+    if not without and full_parts is None:
         return tile
     mapped = tile.instances
-    if extras is not None:  # the trees of forests follow those of the file
-        mapped = mapped.take(np.arange(len(extras.instances)))
+    if full_parts is not None:  # the trees of forests follow those of the file
+        mapped = mapped.take(np.arange(len(full_parts.instances)))
     elif settings.forests:
         mapped = mapped.take(np.arange(len(scene.tile(i, j, forests=False).instances)))
     forest = tile.instances.take(np.arange(len(mapped), len(tile.instances)))
     classes = np.array([mesh.klass[0] for mesh in shapes.values()], np.uint8)
     keep, kept = ~np.isin(tile.mesh.klass, without), ~np.isin(classes[mapped.shape], without)
-    if extras is not None:
-        keep, kept = keep & ~extras.faces, kept & ~extras.instances
+    if full_parts is not None:
+        keep, kept = keep & ~full_parts.faces, kept & ~full_parts.instances
         mapped = replace(mapped, shape=_plain_shapes(shapes)[mapped.shape])
     relief = tile.relief
     return replace(
         tile,
         mesh=tile.mesh.take(keep),
         relief=None if relief is None else replace(relief, wall=relief.wall[keep]),
-        extras=None,
+        full_parts=None,
         instances=ShapeInstances.concatenate([mapped.take(np.flatnonzero(kept)), forest]),
     )
 
 
 def _plain_shapes(shapes: Mapping[str, Mesh]) -> NDArray[np.int32]:
-    """The shape without extras of each shape."""
+    """The plain shape of each shape."""
     number = {name: k for k, name in enumerate(shapes)}
-    return np.array([number[_WITHOUT_EXTRAS.get(name, name)] for name in shapes], np.int32)
+    return np.array([number[_PLAIN_SHAPES.get(name, name)] for name in shapes], np.int32)

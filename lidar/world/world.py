@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.mesh import Mesh
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
+from geoscene.relief import MESH
 from geoscene.scene import Scene
 from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
@@ -156,7 +157,7 @@ class World:
         check_relief(scene, settings)
         self._named = scene.shapes()
         shapes = list(self._named.values())
-        self.scene = scene.with_relief_mesh() if settings.relief == "mesh" else scene
+        self.scene = scene.with_relief_mesh() if settings.relief == MESH else scene
         self._leaves: Mapping[str, float] = scene.manifest.get("leaf_area_density", LEAF_AREA_DENSITY)
         self.margin = min(margin, settings.reach)
         self.settings = settings

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar
 
-from geoscene.options import RELIEFS
+from geoscene.relief import RELIEFS
 from lidar.grammar import value_text
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera.settings import CameraSettings
@@ -127,7 +127,7 @@ class Basis(Generic[S]):
     used  : the user's settings, without random effects
     exact : the reference's
     world : the user's settings of the world
-    built : relief of the scene, of `geoscene.options.RELIEFS`
+    built : relief of the scene, of `geoscene.relief.RELIEFS`
     """
 
     used: S

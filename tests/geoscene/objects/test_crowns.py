@@ -30,7 +30,7 @@ def trees_of(*tags, relief=True):
     points = [
         TaggedNode(f"node/{k}", {"natural": "tree", **t}, 11.0 + k / 1000, 50.0) for k, t in enumerate(tags)
     ]
-    return read_trees(OsmData((10.9, 49.9, 11.1, 50.1), [], [], points, []), FRAME, relief=relief)[0]
+    return read_trees(OsmData((10.9, 49.9, 11.1, 50.1), [], [], points, []), FRAME, with_relief=relief)[0]
 
 
 @pytest.mark.parametrize("name", tree_shapes())
@@ -61,7 +61,7 @@ def test_a_tree_has_the_leaves_of_its_evenly_filled_envelope(name):
     for nth in range(VARIANTS):
         shape = tree_shapes()[f"crown_{name}_{nth}"]
         held = volume(shape.vertices, shape.faces[shape.klass == Class.TREE_CROWN])
-        density = leaf_area_density(relief=True)[f"crown_{name}_{nth}"]
+        density = leaf_area_density(with_relief=True)[f"crown_{name}_{nth}"]
         assert held * density == pytest.approx(envelope, rel=1e-3)
 
 
@@ -73,12 +73,12 @@ def test_a_default_tree_has_as_many_leaves_with_relief_as_without():
 
 
 def test_every_shape_with_leaves_has_a_leaf_area_density():
-    leafy = {n for n, shape in shapes(relief=True).items() if (shape.klass == Class.TREE_CROWN).any()}
-    assert leafy | {"hedge"} == set(leaf_area_density(relief=True))
+    leafy = {n for n, shape in shapes(with_relief=True).items() if (shape.klass == Class.TREE_CROWN).any()}
+    assert leafy | {"hedge"} == set(leaf_area_density(with_relief=True))
 
 
 def test_numbers_of_shapes_are_the_same_with_and_without_relief():
-    assert list(shapes(relief=True))[: len(shapes())] == list(shapes())
+    assert list(shapes(with_relief=True))[: len(shapes())] == list(shapes())
 
 
 @pytest.mark.parametrize(
@@ -127,15 +127,15 @@ def test_the_variant_depends_on_the_place_alone(shift):
     moved = alone.take(np.zeros(1, np.int64))
     moved.xy[:] += shift
     assert tree_instances(moved).shape[1] in {
-        list(shapes(relief=True)).index(f"crown_round_{k}") for k in range(VARIANTS)
+        list(shapes(with_relief=True)).index(f"crown_round_{k}") for k in range(VARIANTS)
     }
 
 
 def test_forests_with_relief_have_habits_and_survive_the_manifest():
     corners = np.array([[0.0, 0, 0], [200, 0, 0], [200, 200, 0], [0, 200, 0]])
     ground = Mesh.of(corners, np.array([[0, 1, 2], [0, 2, 3]]), klass=Class.FOREST_FLOOR, feature=4)
-    forests = Forests(np.array([4]), np.array([0.5]), relief=True)
-    assert Forests.from_json(json.loads(json.dumps(forests.to_json()))).relief
+    forests = Forests(np.array([4]), np.array([0.5]), with_relief=True)
+    assert Forests.from_json(json.loads(json.dumps(forests.to_json()))).with_relief
     assert "relief" not in Forests(np.array([4]), np.array([0.5])).to_json()
     trees, _ = forest_trees(ground, forests, box=(0, 0, 200, 200))
     assert set(trees.habit[trees.form == "needleleaved"]) == {"conical"}

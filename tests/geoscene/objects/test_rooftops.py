@@ -20,7 +20,7 @@ from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData
 
 BERLIN, NEW_YORK = (13.43, 52.48), (-73.99, 40.72)
-NAMES = list(shapes(relief=True))
+NAMES = list(shapes(with_relief=True))
 HOUSE = {"building": "house", "roof:shape": "gabled", "building:levels": "2", "roof:angle": "45"}
 
 
@@ -161,7 +161,7 @@ def test_dormers_and_the_chimney_of_a_house_keep_clear_of_each_other():
         own = copies.feature == row
         boxes = []
         for k in np.flatnonzero(own):
-            points = shapes(relief=True)[names[k]].vertices @ copies.transform[k, :, :3].T
+            points = shapes(with_relief=True)[names[k]].vertices @ copies.transform[k, :, :3].T
             boxes.append(shapely.MultiPoint((points + copies.transform[k, :, 3])[:, :2]).convex_hull)
         overlap = sum(b.area for b in boxes) - shapely.union_all(boxes).area
         assert overlap == pytest.approx(0.0, abs=1e-6)
@@ -176,7 +176,7 @@ def test_plant_on_a_flat_roof_is_off_its_edges_and_apart():
         boxes = []
         for k in np.flatnonzero(copies.feature == row):
             assert copies.transform[k, 2, 3] == pytest.approx(8.0, abs=0.011)
-            points = shapes(relief=True)[names[k]].vertices @ copies.transform[k, :, :3].T
+            points = shapes(with_relief=True)[names[k]].vertices @ copies.transform[k, :, :3].T
             boxes.append(shapely.MultiPoint((points + copies.transform[k, :, 3])[:, :2] - low).convex_hull)
         assert shapely.box(0.4, 0.4, 49.6, 39.6).contains(shapely.union_all(boxes))
         assert sum(b.area for b in boxes) == pytest.approx(shapely.union_all(boxes).area, abs=1e-6)

@@ -184,7 +184,7 @@ def test_a_bus_shelter_stands_back_from_the_kerb_or_is_a_pole_where_there_is_no_
         kept = with_details(table, Sites.of(plan), full=False)
         assert kept.shape.tolist() == [shape]
         assert kept.xy[0, 1] == pytest.approx(y)
-        assert kept.height[0] == shapes(relief=True)[shape].vertices[:, 2].max()
+        assert kept.height[0] == shapes(with_relief=True)[shape].vertices[:, 2].max()
 
 
 def test_without_relief_none_of_this_is_there():

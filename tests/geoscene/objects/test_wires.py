@@ -16,7 +16,7 @@ from geoscene.support.progress import silent
 
 FRAME = Frame.at(11.0, 50.0)
 EXTENT = (-200.0, -200.0, 200.0, 200.0)
-LIBRARY = list(shapes(relief=True).values())
+LIBRARY = list(shapes(with_relief=True).values())
 
 
 def line_of(tags, *xy, poles=True):

@@ -37,7 +37,7 @@ def relief(osm, tmp_path_factory):
 def test_scenes_without_relief_have_no_facades(osm, tmp_path):
     options = BuildOptions(relief="off", lod=1, tile_size=100, use="lidar")
     scene = build(osm, tmp_path / "scene", options=options)
-    assert all(tile.relief is None and tile.extras is None for tile in scene.tiles())
+    assert all(tile.relief is None and tile.full_parts is None for tile in scene.tiles())
     with pytest.raises(InputError, match="has no relief"):
         scene.with_relief_mesh()
 

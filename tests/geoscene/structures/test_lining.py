@@ -7,7 +7,7 @@ import pytest
 
 from geoscene.classes import Class
 from geoscene.geometry.watertight import validate_mesh
-from geoscene.options import RELIEFS
+from geoscene.relief import RELIEFS
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.structures import (

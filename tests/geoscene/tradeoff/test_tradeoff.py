@@ -77,9 +77,7 @@ def test_variants_change_one_setting_of_the_full_scene():
     labels = [v.label for v in variants(replace(base, dem=("a.tif",)), ("terrain",))]
     assert labels == ["terrain=2 x 2 posts", "terrain=4 x 4 posts", "terrain=8 x 8 posts", "terrain=level"]
     assert [v.label for v in variants(base, ("relief",))] == ["relief=off", "relief=full"]
-    with pytest.raises(
-        InputError, match=r"`settings` 'rays' is unknown .known are lod, relief"
-    ):
+    with pytest.raises(InputError, match=r"`settings` 'rays' is unknown .known are lod, relief"):
         variants(base, ("rays",))
     with pytest.raises(InputError, match="terrain: needs `dem`"):
         variants(base, ("terrain",))

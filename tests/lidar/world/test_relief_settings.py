@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from geoscene.options import RELIEFS, BuildOptions
+from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
+from geoscene.relief import RELIEFS
 from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.options import DriveOptions

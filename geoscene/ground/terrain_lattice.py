@@ -1,4 +1,4 @@
-"""Triangles of ground on which nothing lies: as few as its relief needs.
+"""Triangles of ground on which nothing lies: as few as the terrain needs.
 
 A tile is halved along diagonals again and again, down to a lattice about as fine as the terrain's lines (a
 right-triangulated irregular network, Evans, Kirkpatrick and Townsend 2001). A vertex of the lattice is
@@ -22,7 +22,7 @@ _GRAIN = 2.0**-14
 
 
 @dataclass(frozen=True, slots=True)
-class Relief:
+class TerrainHeights:
     """Heights that bare ground follows.
 
     height    : z of the terrain at x, y
@@ -53,7 +53,7 @@ class Lattice:
 
 
 def lattice(
-    relief: Relief,
+    terrain: TerrainHeights,
     square: tuple[int, int],
     *,
     span: int,
@@ -70,10 +70,10 @@ def lattice(
     odd    : whether i + j, counted from a corner that all tiles have in common, is odd, which tells the
              diagonal that halves the square; used if the span is 1
     """
-    k = relief.steps(tile_size)
+    k = terrain.steps(tile_size)
     around = np.arange(-k, (span + 1) * k + 1) / k
     x, y = (np.clip((v + around) * tile_size, extent[a], extent[a + 2]) for a, v in enumerate(square))
-    z = relief.height(*(axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")))
+    z = terrain.height(*(axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")))
     height = np.round(z.reshape(len(x), len(y)) / _GRAIN) * _GRAIN
     error = np.zeros_like(height)
     for step in _double_until(1, k):
@@ -82,10 +82,10 @@ def lattice(
     error[:: span * k, ::k] = error[::k, :: span * k] = np.inf
     for step in _double_until(k, span * k):
         _add_level(error, height, x=x, y=y, step=step, odd=False)
-    return Lattice(x, y, error > relief.tolerance)
+    return Lattice(x, y, error > terrain.tolerance)
 
 
-def relief_corners(vertices: Lattice, outline: shapely.Polygon) -> Float:
+def lattice_corners(vertices: Lattice, outline: shapely.Polygon) -> Float:
     """Corners (m, 3, 2) of the triangles of a tile of bare ground, counter-clockwise.
 
     outline : the tile's box, with all vertices that its sides have
