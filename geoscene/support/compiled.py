@@ -160,6 +160,14 @@ class _Files(caching.IndexDataCacheFile):
                 if old.name != name:
                     old.unlink(missing_ok=True)
 
+    def _load_index(self) -> dict[Any, str]:
+        """Listed types and files; none if the types are of classes that the sources no longer have."""
+        try:
+            listed: dict[Any, str] = super()._load_index()
+        except (AttributeError, ImportError):
+            return {}
+        return listed
+
 
 class _Own:
     """Of functions of the two packages alone; their code is fresh while no module that it uses changes."""

@@ -140,6 +140,17 @@ def test_new_code_replaces_that_of_older_sources(tmp_path):
     assert len(list(tmp_path.glob("*.nbc"))) == 2
 
 
+def test_code_for_a_class_that_was_renamed_is_stale(tmp_path, monkeypatch):
+    files = compiled._Files(str(tmp_path), "made_up.f-1.py311", "old")
+    with monkeypatch.context() as before:
+        former = type("Former", (), {"__module__": __name__})
+        before.setattr(sys.modules[__name__], "Former", former, raising=False)
+        files.save(former, "old code")
+    assert files.load("ints") is None
+    files.save("ints", "new code")
+    assert files.load("ints") == "new code"
+
+
 def test_functions_are_compiled_for_calls_from_python_only_where_it_calls_them():
     @compiled.njit()
     def twice(x):
