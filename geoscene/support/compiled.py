@@ -152,7 +152,7 @@ class _Files(caching.IndexDataCacheFile):
         name = self._data_name_pattern.replace("{number:d}", hashlib.sha256(code).hexdigest()[:16])
         with self._open_for_write(self._data_path(name)) as file:  # type: ignore[no-untyped-call]
             file.write(code)
-        listed = self._load_index() | {key: name}  # type: ignore[no-untyped-call]
+        listed = self._load_index() | {key: name}
         self._save_index(listed)  # type: ignore[no-untyped-call]
         if len(listed) == 1:
             folder, base = Path(self._cache_path), self._data_name_pattern.split(".{")[0]
@@ -163,7 +163,7 @@ class _Files(caching.IndexDataCacheFile):
     def _load_index(self) -> dict[Any, str]:
         """Listed types and files; none if the types are of classes that the sources no longer have."""
         try:
-            listed: dict[Any, str] = super()._load_index()
+            listed: dict[Any, str] = super()._load_index()  # type: ignore[no-untyped-call]
         except (AttributeError, ImportError):
             return {}
         return listed
