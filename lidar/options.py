@@ -242,7 +242,7 @@ class DriveOptions:
     """Options of a drive. The dataset stores them; its bytes depend on all but ``workers`` and ``scheduler``.
 
     In Python, ``route`` is ``random``, a path or a list of (latitude, longitude) in degrees, ``settings``
-    holds (name, text) pairs and ``traffic`` a `TrafficOptions`, `SumoOptions` or `TrafficFile`.
+    holds (name, text) pairs and ``traffic`` a `TrafficOptions` or `TrafficFile`.
     """
 
     route: Annotated[Spec, Parameter(converter=_route, metavar="ROUTE"), SEVERAL] = ""
@@ -315,8 +315,7 @@ class DriveOptions:
     ] = None
     """Other road users: on, on:vehicles=20,parked=0.5,pedestrians=5,cyclists=2 (vehicles and cyclists per km
     of lane, pedestrians per km of sidewalk, parked as a share of the places; on: may be left out);
-    sumo:vehicles=20,...: the same densities, simulated by SUMO; or a file that sumo --fcd-output wrote,
-    FILE.xml:net=FILE.net.xml,begin=SECONDS,parked=0.6 as needed."""
+    or a file that sumo --fcd-output wrote, FILE.xml:net=FILE.net.xml,begin=SECONDS,parked=0.6 as needed."""
 
     settings: Annotated[
         tuple[tuple[str, str], ...],

@@ -409,9 +409,8 @@ def _signals(
         return None
     from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (not for drives without cameras)
     from lidar.traffic.signal_heads import signal_states  # noqa: PLC0415
-    from lidar.traffic.sumo import SumoOptions  # noqa: PLC0415
 
-    if isinstance(traffic, SumoOptions | TrafficFile):
+    if isinstance(traffic, TrafficFile):
         return None
     road = isinstance(motion, RoadMotion)
     fixed = None if road or (traffic is None and vehicle.kind == "air") else motion
@@ -440,7 +439,6 @@ def _with_traffic(
     from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (0.1 s)
     from lidar.traffic.fcd_replay import replay  # noqa: PLC0415
     from lidar.traffic.populate import populate  # noqa: PLC0415
-    from lidar.traffic.sumo import SumoOptions, drive_in_sumo  # noqa: PLC0415
 
     progress("traffic", 0, total=0)
     traffic = replace(options.traffic, side=options.side_in(scene))
@@ -449,8 +447,7 @@ def _with_traffic(
     if isinstance(traffic, TrafficFile):
         return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
     if isinstance(motion, RoadMotion):
-        simulate = drive_in_sumo if isinstance(traffic, SumoOptions) else drive_in_traffic
-        return simulate(
+        return drive_in_traffic(
             scene,
             graph,
             path=motion.plan.path,
@@ -462,8 +459,6 @@ def _with_traffic(
             at_speed=motion.plan.at_speed,
             road=road,
         )
-    if isinstance(traffic, SumoOptions):
-        raise InputError("`traffic`: SUMO needs a drive along a route on roads")
     return trajectory, populate(
         scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic, road=road
     )

@@ -116,18 +116,6 @@ class Fcd:
     ahead: Float
     speed: Float
 
-    def without(self, name: str) -> Fcd:
-        """All vehicles and persons but one."""
-        kept = np.array([other != name for other in self.name], bool)
-        rows = np.repeat(kept, np.diff(self.first))
-        return Fcd(
-            tuple(np.array(self.name, object)[kept]),
-            np.concatenate([[0], np.cumsum(np.diff(self.first)[kept])]).astype(np.int64),
-            tuple(np.array(self.vclass, object)[kept]),
-            self.length[kept],
-            *(column[rows] for column in (self.time, self.lon, self.lat, self.ahead, self.speed)),
-        )
-
 
 def read_fcd(path: Path, *, net: Path | None = None) -> Fcd:
     """The vehicles and persons of a file, without rail vehicles and ships.

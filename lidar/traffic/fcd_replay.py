@@ -73,29 +73,15 @@ def replay(
     """
     fcd = read_fcd(options.path, net=options.net)
     begin = float(fcd.time.min()) if options.begin is None else options.begin
-    others = TrafficOptions(parked=options.parked, radius=options.radius, side=options.side)
-    return replay_fcd(
-        fcd, scene, graph=graph, ego=ego, vehicle=vehicle, seed=seed, begin=begin, options=others
+    parked_only = TrafficOptions(
+        vehicles=0.0,
+        cyclists=0.0,
+        pedestrians=0.0,
+        parked=options.parked,
+        radius=options.radius,
+        side=options.side,
     )
-
-
-def replay_fcd(
-    fcd: Fcd,
-    scene: Scene,
-    *,
-    graph: RoadGraph,
-    ego: Trajectory,
-    vehicle: Vehicle,
-    seed: int,
-    begin: float,
-    options: TrafficOptions,
-) -> Actors:
-    """As `replay`, for floating car data in memory; ignores the densities of moving road users.
-
-    begin : SUMO's time in seconds at which the drive starts
-    """
-    options = replace(options, vehicles=0.0, cyclists=0.0, pedestrians=0.0)
-    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options)
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=parked_only)
     moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
     parked = parked_vehicles(
         scene,
@@ -122,7 +108,7 @@ def _moving(
 ) -> Actors:
     """The moving road users of a file in the ego's surroundings."""
     scale = setup.scale
-    front, heading = scene_positions(fcd, scene)
+    front, heading = _scene_positions(fcd, scene)
     shapes, stretch, parts = [], [], []
     any_in_scene = False
     for k, name in enumerate(fcd.name):
@@ -176,7 +162,7 @@ def _no_road_users(fcd: Fcd, begin: float, *, any_in_scene: bool) -> str:
     )
 
 
-def scene_positions(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
+def _scene_positions(fcd: Fcd, scene: Scene) -> tuple[Float, Float]:
     """Middles of front bumpers (k, 2) in scene metres, and headings (k,) in radians from the x axis."""
     front = np.column_stack(scene.frame.from_geographic(fcd.lon, fcd.lat))
     d = np.column_stack(scene.frame.from_geographic(*fcd.ahead.T)) - front

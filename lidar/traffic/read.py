@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any
@@ -14,31 +15,35 @@ from lidar.traffic.fcd import TrafficFile
 from lidar.traffic.populate import TrafficOptions
 
 SIMULATIONS: Registry[type[TrafficOptions]] = Registry(
-    "traffic",
-    {"on": "lidar.traffic.populate:TrafficOptions", "sumo": "lidar.traffic.sumo:SumoOptions"},
-    error=InputError,
+    "traffic", {"on": "lidar.traffic.populate:TrafficOptions"}, error=InputError
 )
 """Classes of simulated traffic by name."""
 
 _SUFFIXES = (".xml", ".xml.gz")
-_CHOICES = ("on", "off", *SIMULATIONS, "FILE.xml")
+_CHOICES = ("on", "off", "FILE.xml")
+_RUN_SUMO = (
+    "traffic sumo: run SUMO first and give its file: geoscene export SCENE --to sumo -o roads.net.xml, then"
+    " sumo -n roads.net.xml -r TRIPS.rou.xml --fcd-output fcd.xml, then `traffic` fcd.xml"
+)
 
 
 def read_traffic(text: str) -> TrafficOptions | TrafficFile | None:
-    """Traffic from ``on``, ``off``, ``sumo`` or a file, with parameters as in ``on:vehicles=20,parked=0.5``.
+    """Traffic from ``on``, ``off`` or a file, with parameters as in ``on:vehicles=20,parked=0.5``.
 
     ``on:`` may be left out, and a comma may stand for the colon. Raises InputError for another text.
     """
     if text == "off":
         return None
+    if re.match(r"sumo\b(?!\.)", text):
+        raise InputError(_RUN_SUMO)
     items = split_items(text, SIMULATIONS, default="on")
     if len(items) != 1:
-        raise InputError(f"traffic {text}: give one of {', '.join(dict.fromkeys(_CHOICES))}")
+        raise InputError(f"traffic {text}: give one of {', '.join(_CHOICES)}")
     (item,) = items
     if item.name.lower().endswith(_SUFFIXES):
         return _file(item)
     if item.name not in SIMULATIONS:
-        raise InputError(unknown_name("traffic", item.name, known=dict.fromkeys(_CHOICES)))
+        raise InputError(unknown_name("traffic", item.name, known=_CHOICES))
     return build(SIMULATIONS, item)
 
 

@@ -37,7 +37,6 @@ from lidar.tools.tradeoff.profile_costs import costs
 from lidar.tools.tradeoff.profile_errors import Errors, camera_errors, measuring, scanner_errors
 from lidar.tools.tradeoff.sampling import REFERENCE_RAYS
 from lidar.traffic.fcd import TrafficFile
-from lidar.traffic.sumo import SumoOptions
 
 log = logging.getLogger(__name__)
 
@@ -191,8 +190,8 @@ def _stands_for(options: DriveOptions) -> bool:
     """Whether random drives on the scene's roads stand for a drive."""
     vehicle = load_vehicle(options.vehicle or load_rig(options.rig).vehicle)
     repeated = isinstance(options.route, Path) and options.route.suffix == ".csv"
-    simulated = isinstance(options.traffic, SumoOptions | TrafficFile)
-    return not (options.survey or vehicle.kind == "air" or repeated or simulated)
+    recorded = isinstance(options.traffic, TrafficFile)
+    return not (options.survey or vehicle.kind == "air" or repeated or recorded)
 
 
 def _random_plan(scene: Scene, options: DriveOptions, *, seed: int, progress: Progress) -> DrivePlan:
