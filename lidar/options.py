@@ -24,6 +24,7 @@ from geoscene.support.registry import unknown_name
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
+from lidar.geometry.time_scales import LONGEST_S
 from lidar.grammar import split_pairs
 from lidar.sensors.rig.imu_grades import PRESETS
 
@@ -365,8 +366,11 @@ class DriveOptions:
                     raise InputError(f"`{short}` {value}: `settings` {short} is given, too; give one of both")
                 object.__setattr__(self, "settings", (*self.settings, (short, value)))
                 object.__setattr__(self, short, "")
-        if self.duration is not None and not 0.1 <= self.duration <= 86400:
-            raise InputError(f"`duration` {self.duration}: give 0.1 to 86400 seconds")
+        if self.duration is not None and not 0.1 <= self.duration <= LONGEST_S:
+            raise InputError(
+                f"`duration` {self.duration}: give 0.1 to {LONGEST_S:.0f} seconds (four hours), and record"
+                " several drives for more"
+            )
         if self.side not in ("", "left", "right"):
             raise InputError(unknown_name("`side`", self.side, known=("left", "right")))
         if not 1 <= self.workers <= 256:

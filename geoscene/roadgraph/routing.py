@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -10,8 +11,14 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.errors import InputError
+from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Bools, Float
+
+HEADING_REACH = 5.0
+"""Scene metres over which the heading of a street at a junction is taken."""
+_U_TURN = np.radians(150.0)
+"""Smallest change of direction at a node, in radians, that needs a U-turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +193,30 @@ def turn_states(graph: RoadGraph, *, u_turns: bool = False) -> TurnStates:
         np.concatenate([before, added[:, 0]]),
         np.concatenate([after, added[:, 1]]),
     )
+
+
+def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -> NDArray[np.bool_]:
+    """Whether (k,) the turn from one edge to the next is a U-turn."""
+    ends = np.array([polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry])
+    enter, leave = ends.reshape(-1, 2).T
+    turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
+    back: NDArray[np.bool_] = (graph.twin[before] == after) | (turn > _U_TURN)
+    return back
+
+
+def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
+    """The permitted turns between states, without the turns and edges to avoid."""
+    states = turn_states(graph)
+    if not avoid:
+        return states
+    shut = np.array(sorted(avoid), np.int64).reshape(-1, 2)
+    closed = shut[shut[:, 0] == shut[:, 1], 0]
+    before, after = states.edge[states.before], states.edge[states.after]
+    key = before.astype(np.int64) * len(graph) + after
+    bad = (
+        np.isin(key, shut[:, 0] * len(graph) + shut[:, 1]) | np.isin(before, closed) | np.isin(after, closed)
+    )
+    return replace(states, before=states.before[~bad], after=states.after[~bad])
 
 
 def shortest_path(

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import mmap
-import os
-import tempfile
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
@@ -23,49 +18,6 @@ KNOT_NS = 200_000
 
 At a yaw rate of 1 rad/s the chord deviates from the arc by (2e-4)^2 / 8 = 5e-9 rad.
 """
-
-
-BLOCK_POSES = 1 << 17
-"""Poses of a trajectory that are worked on at once: 22 minutes at 100 Hz."""
-_IN_MEMORY = 1 << 18
-"""Numbers of an array up to which it is in memory: 2 MiB."""
-_RISING = "a trajectory needs two or more poses at increasing times"
-
-
-def blocks_of(count: int, *, overlap: int = 0) -> Iterator[slice]:
-    """Slices that cover ``count`` rows: `BLOCK_POSES` each, and ``overlap`` rows of the next one.
-
-    A last slice of one row, which is no trajectory, is part of the one before.
-    """
-    even = count - 1 if count > 1 and count % BLOCK_POSES == 1 else count
-    for rows in row_blocks(even, BLOCK_POSES, overlap=overlap):
-        yield slice(rows.start, count if rows.stop == even else rows.stop)
-
-
-def room(shape: tuple[int, ...], kind: DTypeLike = float) -> NDArray[Any]:
-    """An array to fill, in memory, or for a long drive in a temporary file: see `release`."""
-    kind = np.dtype(kind)
-    if math.prod(shape) <= _IN_MEMORY:
-        return np.empty(shape, kind)
-    size = math.prod(shape) * kind.itemsize
-    with tempfile.TemporaryFile() as file:
-        if hasattr(os, "posix_fallocate"):  # a full disk is an error here, and a crash when it is written
-            os.posix_fallocate(file.fileno(), 0, size)
-        else:
-            file.truncate(size)
-        return np.frombuffer(mmap.mmap(file.fileno(), size), kind).reshape(shape)
-
-
-def release(*columns: NDArray[Any]) -> None:
-    """Let go of the memory of arrays of `room` in files, which keep their values."""
-    for column in columns:
-        base: Any = column
-        while isinstance(base, np.ndarray):
-            base = base.base
-        if isinstance(base, memoryview):
-            base = base.obj
-        if isinstance(base, mmap.mmap) and hasattr(base, "madvise"):
-            base.madvise(mmap.MADV_DONTNEED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,44 +85,10 @@ class Trajectory(Columns):
 
     def __post_init__(self) -> None:
         """Check that the trajectory can be interpolated."""
-        for rows in blocks_of(len(self.time_ns), overlap=1):
-            if (np.diff(self.time_ns[rows]) <= 0).any():
-                raise InputError(_RISING)
-            if not (np.isfinite(self.position[rows]).all() and np.isfinite(self.quat_xyzw[rows]).all()):
-                raise InputError("a trajectory has poses that are not finite")
-            self.release()
-        if len(self.time_ns) < 2:
-            raise InputError(_RISING)
-
-    @classmethod
-    def gathered(cls, count: int, blocks: Iterable[Trajectory]) -> Trajectory:
-        """The trajectory of ``count`` poses that comes in blocks of rows; a long one is kept in a file."""
-        kinds = {f.name: (np.dtype(np.int64 if f.name == "time_ns" else float)) for f in fields(cls)}
-        shapes = {"position": (count, 3), "quat_xyzw": (count, 4), "velocity": (count, 3)}
-        out = {name: room(shapes.get(name, (count,)), kind) for name, kind in kinds.items()}
-        first = 0
-        for block in blocks:
-            last = first + len(block)
-            for name, column in block.columns().items():
-                out[name][first:last] = column
-            release(*out.values())
-            first = last
-        return cls(**out)
-
-    def release(self) -> None:
-        """Let go of the memory of a trajectory in a file; its rows are read again when needed."""
-        release(*self.columns().values())
-
-    def windows(self, time_ns: NDArray[np.int64], *, margin: int) -> Iterator[tuple[slice, Trajectory]]:
-        """Runs of rising times with the part of the trajectory around each, ``margin`` poses wider."""
-        for rows in blocks_of(len(self.time_ns)):
-            last = len(time_ns)
-            if rows.stop < len(self.time_ns):
-                last = int(np.searchsorted(time_ns, self.time_ns[rows.stop]))
-            begin = int(np.searchsorted(time_ns, self.time_ns[rows.start])) if rows.start else 0
-            if last > begin:
-                yield slice(begin, last), self.take(slice(max(rows.start - margin, 0), rows.stop + margin))
-                self.release()
+        if len(self.time_ns) < 2 or (np.diff(self.time_ns) <= 0).any():
+            raise InputError("a trajectory needs two or more poses at increasing times")
+        if not (np.isfinite(self.position).all() and np.isfinite(self.quat_xyzw).all()):
+            raise InputError("a trajectory has poses that are not finite")
 
     @property
     def duration_ns(self) -> int:

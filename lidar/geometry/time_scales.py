@@ -1,4 +1,4 @@
-"""GPS time and UTC: leap seconds, and the starts that a drive may have."""
+"""GPS time and UTC: leap seconds, and the starts and durations that a drive may have."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.errors import InputError
+from lidar.errors import InputError, RouteError
 
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 """GPS time 0."""
@@ -23,6 +23,9 @@ LEAPS = tuple(datetime.fromisoformat(day).replace(tzinfo=UTC) for day in _SINCE)
 
 KNOWN_UNTIL = datetime(2027, 6, 28, tzinfo=UTC)
 """Until when the IERS has announced leap seconds or their absence; later dates have the last offset."""
+
+LONGEST_S = 4 * 3600.0
+"""Seconds of the longest drive."""
 
 _LAST_YEAR = 2261  # of time stamps that count nanoseconds since 1970 in 64 bits
 
@@ -76,3 +79,12 @@ def iso_times(start: datetime, time_ns: NDArray[np.integer]) -> list[str]:
     base = np.datetime64(whole - timedelta(microseconds=whole.microsecond), "ns")
     stamps = base + np.asarray(time_ns, "timedelta64[ns]") + np.timedelta64(whole.microsecond, "us")
     return [f"{s}Z" for s in np.datetime_as_string(stamps, unit="ns")]
+
+
+def check_duration(seconds: float, *, what: str) -> None:
+    """Raise RouteError for a drive of more than `LONGEST_S` seconds; ``what`` takes that long."""
+    if not seconds <= LONGEST_S:
+        raise RouteError(
+            f"{what} takes {seconds / 3600:.1f} hours, and a drive lasts up to {LONGEST_S / 3600:.0f}; record"
+            f" several drives, each along a part of it, or its beginning (`duration` {LONGEST_S:.0f})"
+        )

@@ -10,18 +10,15 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import BlockedError
-from lidar.geometry.poses import release
-from lidar.motion.blockwise import mean_gap
-from lidar.motion.steering import Pose, SteeredTrack
+from lidar.motion.steering import Pose, SteeredTrack, mean_gap
 from lidar.motion.vehicle import Vehicle
 
 ASIDE = 4.0
 """Maximum lateral shift of a line, in metres, to pass an obstacle."""
 _NEAR = 12.0  # metres from a junction within which a collision blocks its turn, not the edge
-_BODIES = 1 << 15  # outlines of the body that are in memory at once
 _SWEEP = 0.5  # metres between the poses that are checked for collisions
 
 
@@ -82,26 +79,18 @@ def body_outlines(
     return shapes
 
 
-def touching(
-    track: SteeredTrack, line: RouteLine, *, setting: PathParameters
-) -> tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]:
-    """Rows of a track where the body intersects obstacles, its outlines there, and these obstacles."""
+def colliding_rows(track: SteeredTrack, line: RouteLine, *, setting: PathParameters) -> NDArray[np.int64]:
+    """Rows (k,) of a track where the body intersects obstacles."""
     every = max(round(_SWEEP / track.step), 1)
     last = len(track.row) - 1
-    found: list[tuple[NDArray[np.int64], NDArray[np.object_], NDArray[np.object_]]] = []
-    for rows in row_blocks(last + 1, every * _BODIES):
-        part = np.arange(rows.start, rows.stop, every)
-        if rows.stop > last > part[-1]:
-            part = np.append(part, last)
-        part = part[~line.free[track.row[part]]]
-        bodies = body_outlines(
-            track.xy[part], track.heading[part], vehicle=setting.vehicle, margin=setting.margin
-        )
-        body, obstacle = setting.tree.query(bodies, predicate="intersects")
-        found.append((part[body], bodies[body], setting.tree.geometries[obstacle]))
-        release(track.xy, track.heading, track.row, line.free)
-    at, outlines, obstacles = (np.concatenate(column) for column in zip(*found, strict=True))
-    return at, outlines, obstacles
+    rows = np.arange(0, last + 1, every)
+    if rows[-1] < last:
+        rows = np.append(rows, last)
+    rows = rows[~line.free[track.row[rows]]]
+    bodies = body_outlines(
+        track.xy[rows], track.heading[rows], vehicle=setting.vehicle, margin=setting.margin
+    )
+    return np.unique(rows[setting.tree.query(bodies, predicate="intersects")[0]])
 
 
 def pushes(
@@ -111,7 +100,7 @@ def pushes(
 
     NaN where no shift within `ASIDE` frees the body.
     """
-    rows = np.unique(touching(track, line, setting=setting)[0])
+    rows = colliding_rows(track, line, setting=setting)
     if not len(rows):
         return np.empty(0), np.empty(0, np.int64)
     half = setting.vehicle.width / 2 + setting.margin
@@ -185,7 +174,7 @@ def turning_manoeuvre(pose: Pose, line: RouteLine, *, setting: PathParameters) -
             span = math.pi / arcs * radius / (n - 1)
             tracks.append(SteeredTrack(xy, heading, np.full(n, hand / radius), np.full(n, here), gear, span))
             x, y, th = tracks[-1].end
-        if not any(len(touching(t, line, setting=setting)[0]) for t in tracks):
+        if not any(len(colliding_rows(t, line, setting=setting)) for t in tracks):
             return tracks
     edge = int(line.edge[-1])
     raise BlockedError(

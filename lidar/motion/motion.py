@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +13,7 @@ from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_euler
-from lidar.geometry.poses import Trajectory, blocks_of, release, room
-from lidar.motion.blockwise import fill, rowwise, smooth
+from lidar.geometry.poses import Trajectory
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
 
@@ -27,7 +25,6 @@ _SPARE = 0.98  # share of the acceleration limits used, a margin for sampling
 _BRIEF_S = 0.3  # seconds of the second moving average, which smooths the jerk
 _FIT = 40
 _ROWS = 65
-_AROUND = 3  # rows of a path before and after a part of a drive that its poses depend on
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,54 +114,42 @@ def ended_at_rest(motion: Motion) -> Motion:
 
 def speed_limits(path: Path, vehicle: Vehicle) -> Float:
     """Speed (n,) in m/s that speed limits, bends, crests and steering rate allow along a path."""
-    change, crest = _along(path, path.curvature), _along(path, _soften(path, vehicle))
-
-    def allowed(curvature: Float, *changes: Float) -> Float:
-        bend, wheel, crest = (np.abs(column) for column in (curvature, *changes))
-        with np.errstate(divide="ignore", over="ignore"):  # a straight allows any speed
-            by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
-            by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / wheel)
-            by_crest = np.sqrt(_SPARE * vehicle.lateral_acceleration / crest)
-        return np.asarray(np.minimum(by_bend, np.minimum(by_wheel, by_crest)))
-
-    def posted(limit: Float) -> Float:
-        beside = np.minimum(np.append(limit[1:], np.inf), np.append(np.inf, limit[:-1]))
-        return np.asarray(np.minimum(limit, beside))
-
-    return rowwise(
-        lambda limit, other: np.maximum(
-            np.minimum(np.minimum(vehicle.pace * limit, vehicle.max_speed), other), _SLOWEST
-        ),
-        rowwise(posted, path.limit, reach=1),
-        rowwise(allowed, path.curvature, change, crest),
-    )
+    bend = np.abs(path.curvature)
+    wheel, crest = (np.abs(_along(path, column)) for column in (path.curvature, _soften(path, vehicle)))
+    with np.errstate(divide="ignore", over="ignore"):  # a straight allows any speed
+        by_bend = np.sqrt(_SPARE * vehicle.lateral_acceleration / bend)
+        by_wheel = np.cbrt(_SPARE * vehicle.lateral_jerk / wheel)
+        by_crest = np.sqrt(_SPARE * vehicle.lateral_acceleration / crest)
+    beside = np.minimum(np.append(path.limit[1:], np.inf), np.append(np.inf, path.limit[:-1]))
+    posted = np.minimum(vehicle.pace * np.minimum(path.limit, beside), vehicle.max_speed)
+    allowed = np.minimum(posted, np.minimum(by_bend, np.minimum(by_wheel, by_crest)))
+    return np.asarray(np.maximum(allowed, _SLOWEST))
 
 
 def _soften(path: Path, vehicle: Vehicle) -> Float:
     """Slopes (n,) smoothed over the wheelbase: shorter bumps do not raise the body."""
-    out = room((len(path),))
+    from scipy.ndimage import gaussian_filter1d  # noqa: PLC0415  (slow to import)
+
+    out = np.empty(len(path))
     over = vehicle.turning_radius if vehicle.kind == "air" else max(vehicle.wheelbase, 1.0)
     for first, last in legs_of(path):
         gap = (path.s[last - 1] - path.s[first]) / max(last - first - 1, 1)
-        soft = smooth(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
-        fill(out[first:last], soft)
+        out[first:last] = gaussian_filter1d(path.slope[first:last], over / max(gap, 1e-6), mode="nearest")
     return out
 
 
 def _along(path: Path, values: Float) -> Float:
     """Derivative of a column along the path, leg by leg."""
-    out = room((len(path),))
+    out = np.zeros(len(path))
     for first, last in legs_of(path):
-        out[first] = 0.0
         if last - first > 1:
-            fill(out[first:last], rowwise(np.gradient, values[first:last], path.s[first:last], reach=1))
+            out[first:last] = np.gradient(values[first:last], path.s[first:last])
     return out
 
 
 def legs_of(path: Path) -> list[tuple[int, int]]:
     """First and last row (exclusive) of each leg."""
-    begins = rowwise(lambda leg: np.diff(leg, prepend=leg[0]) != 0, path.leg, reach=1)
-    cuts = [0, *np.flatnonzero(begins).tolist(), len(path)]
+    cuts = [0, *(np.flatnonzero(np.diff(path.leg)) + 1).tolist(), len(path)]
     return list(itertools.pairwise(cuts))
 
 
@@ -321,21 +306,6 @@ def _fastest(s: Float, limit: Float, *, up: float, down: float, rest: tuple[bool
 
 def poses_along(path: Path, vehicle: Vehicle, *, motion: Motion) -> Trajectory:
     """The trajectory of a speed profile along a path; cubic between rows, so velocity is continuous."""
-    legs = legs_of(path)
-    # the speed of a walker's gait is a difference over time, of all rows at once
-    blocks = [slice(0, len(motion))] if any(vehicle.bob) else blocks_of(len(motion))
-
-    def parts() -> Iterator[Trajectory]:
-        for rows in blocks:
-            yield _poses(path, vehicle, legs=legs, motion=motion.take(rows))
-            path.release()
-            release(*motion.columns().values())
-
-    return Trajectory.gathered(len(motion), parts())
-
-
-def _poses(path: Path, vehicle: Vehicle, *, legs: Sequence[tuple[int, int]], motion: Motion) -> Trajectory:
-    """The poses of a part of a speed profile."""
     from scipy.interpolate import CubicHermiteSpline  # noqa: PLC0415  (slow to import)
 
     n = len(motion.s)
@@ -343,15 +313,11 @@ def _poses(path: Path, vehicle: Vehicle, *, legs: Sequence[tuple[int, int]], mot
     columns = {name: np.empty(n) for name in ("slope", "pitch", "bank", "scale", "curvature")}
     gear = path.gear[motion.row].astype(float)
     leg = path.leg[motion.row]
-    for first, last in legs:
+    for first, last in legs_of(path):
         here = leg == path.leg[first]
         if not here.any():
             continue
-        s = motion.s[here]
-        ends = np.searchsorted(path.s[first:last], [s.min(), s.max()])
-        p = path.take(
-            slice(first + max(int(ends[0]) - _AROUND, 0), min(first + int(ends[1]) + _AROUND, last))
-        )
+        s, p = motion.s[here], path.take(slice(first, last))
         run = np.cos(p.slope) * p.scale * p.gear
         tangent = np.column_stack(
             [run * np.cos(p.heading), run * np.sin(p.heading), np.sin(p.slope) * p.gear]

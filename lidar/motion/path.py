@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
-from lidar.geometry.poses import blocks_of, release, room
-from lidar.motion.blockwise import extend, fill, headings, join, rowwise, smooth, sums
 from lidar.motion.clearance import ASIDE, PathParameters, RouteLine, pushes, turning_manoeuvre, turns_at
 from lidar.motion.route import Route
 from lidar.motion.steering import Pose, SteeredTrack, follow, relax
@@ -55,7 +53,7 @@ _WHEEL = 0.95  # share of the maximum curvature of a line, a margin for feedback
 
 @dataclass(frozen=True, slots=True)
 class Path(Columns):
-    """The path of the rear axle, with a row every few decimetres; a long one is kept in files.
+    """The path of the rear axle, with a row every few decimetres.
 
     s         : (n,) true metres driven from the start, along the slope
     position  : (n, 3) scene metres, the rear axle's centre on the ground
@@ -90,10 +88,6 @@ class Path(Columns):
     def length(self) -> float:
         """True metres driven."""
         return float(self.s[-1])
-
-    def release(self) -> None:
-        """Let go of the memory of a path in files; its rows are read again when needed."""
-        release(*self.columns().values())
 
 
 def plan_path(
@@ -141,7 +135,7 @@ def plan_path(
 
 def _resample(route: Route, spacing: float) -> RouteLine:
     """The route's line with points about ``spacing`` apart; its turning points stay points."""
-    stretches = []
+    stretches: list[RouteLine] = []
     ends = [0, *(np.asarray(route.turns, int) + 1).tolist(), len(route.line)]
     for first, last in itertools.pairwise(ends):
         xyz = route.line[first:last]
@@ -151,21 +145,15 @@ def _resample(route: Route, spacing: float) -> RouteLine:
         if len(s) < 2 or s[-1] < 2 * spacing:
             raise RouteError(f"the route has a stretch of {s[-1]:.2f} m; too short to drive")
         count = max(math.ceil(s[-1] / spacing), 4) + 1
-        stretches.append((xyz, s, np.arange(first, last)[keep], count))
-
-    def parts() -> Iterator[RouteLine]:
-        for xyz, s, point, count in stretches:
-            for rows in blocks_of(count):
-                at = np.arange(rows.start, rows.stop) * (s[-1] / (count - 1))
-                turn = np.zeros(len(at), bool)
-                if rows.stop == count:
-                    at[-1] = s[-1]
-                    turn[-1] = point[-1] < len(route.line) - 1
-                index = point[np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
-                new = polylines.points_at(xyz, at, along=s)
-                yield RouteLine(new, route.edge[index], route.limit[index], route.free[index], turn)
-
-    return join(sum(count for *_, count in stretches), parts())
+        at = np.arange(count) * (s[-1] / (count - 1))
+        at[-1] = s[-1]
+        turn = np.zeros(count, bool)
+        turn[-1] = last < len(route.line)
+        point = np.arange(first, last)[keep]
+        index = point[np.clip(np.searchsorted(s, at, side="right") - 1, 0, len(s) - 1)]
+        new = polylines.points_at(xyz, at, along=s)
+        stretches.append(RouteLine(new, route.edge[index], route.limit[index], route.free[index], turn))
+    return RouteLine.concatenate(stretches)
 
 
 def _shorten(line: RouteLine, vehicle: Vehicle) -> RouteLine:
@@ -179,7 +167,7 @@ def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None)
 
     Raises BlockedError if the line cannot be pushed clear, or bends too tightly.
     """
-    from scipy.ndimage import maximum_filter1d  # noqa: PLC0415
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d  # noqa: PLC0415
 
     vehicle = setting.vehicle
     cap = _WHEEL / vehicle.turning_radius
@@ -187,12 +175,12 @@ def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None)
     middle = line.xyz[len(line.xyz) // 2]
     scale = float(setting.frame.scale_at(middle[0], middle[1]))
     base, gap = line.xyz[:, :2], line.gap
-    heading = smooth(headings(base), 2.0 / gap, mode="nearest")
-    left = rowwise(lambda part: np.stack([-np.sin(part), np.cos(part)], axis=1), heading)
-    shift = rowwise(np.zeros_like, heading)
+    heading = gaussian_filter1d(polylines.headings(base), 2.0 / gap, mode="nearest")
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    shift = np.zeros(len(base))
     wide = 2 * math.ceil(_PUSH / gap) + 1
     for _ in range(_REPAIRS):
-        pushed = rowwise(lambda xy, by, to: xy + by[:, None] * to, base, shift, left)
+        pushed = base + shift[:, None] * left
         xy = relax(pushed, cap / scale, reach=reach)
         track = follow(xy, vehicle, scale=scale, pose=pose, step=setting.step)
         departure = _departure(track, line, xy=pushed, vehicle=vehicle)
@@ -212,10 +200,9 @@ def _clear_track(line: RouteLine, setting: PathParameters, *, pose: Pose | None)
         for sign in (1.0, -1.0):
             bump = np.zeros(len(base))
             np.maximum.at(bump, at, np.maximum(sign * push, 0.0))
-            bumps = rowwise(lambda part: maximum_filter1d(part, wide), bump, reach=wide)
-            bumps = smooth(bumps, 0.5 * _PUSH / gap, mode="nearest")
-            shift = rowwise(lambda old, part, sign=sign: old + sign * part, shift, bumps)
-        shift = rowwise(lambda part: np.clip(part, -ASIDE, ASIDE), shift)
+            bump = gaussian_filter1d(maximum_filter1d(bump, wide), 0.5 * _PUSH / gap, mode="nearest")
+            shift = shift + sign * bump
+        shift = np.clip(shift, -ASIDE, ASIDE)
     stuck = np.isnan(push)
     at = at[stuck] if stuck.any() else at
     worst = at[0]
@@ -231,15 +218,8 @@ def _departure(track: SteeredTrack, line: RouteLine, *, xy: Float, vehicle: Vehi
     """The row of the line, pushed to ``xy`` (n, 2), where the track leaves it; none if it does not."""
     if track.row[-1] < len(line.edge) - 1:
         return track.row[-1:]
-    off = rowwise(
-        lambda at, row: np.hypot(*(at - xy[row]).T) / vehicle.turning_radius,
-        track.xy,
-        track.row,
-        looked_up=(xy,),
-    )
-    astray = rowwise(
-        lambda off, row: (line.edge[row] >= 0) & (off > _ASTRAY), off, track.row, looked_up=(line.edge,)
-    )
+    off = np.hypot(*(track.xy - xy[track.row]).T) / vehicle.turning_radius
+    astray = (line.edge[track.row] >= 0) & (off > _ASTRAY)
     if astray.any():
         worst = int(np.argmax(off))
         return track.row[worst : worst + 1]
@@ -250,10 +230,11 @@ def _join(
     legs: list[SteeredTrack], lines: list[RouteLine], *, setting: PathParameters, ground: Surface | None
 ) -> Path:
     """One path of all legs, with heights."""
-    whole = join(sum(len(leg.row) for leg in legs), _leg_paths(legs, lines, setting=setting, ground=ground))
+    whole = Path.concatenate([*_leg_paths(legs, lines, setting=setting, ground=ground)])
     # headings of consecutive legs may differ by whole turns
-    turns = sums(rowwise(_whole_turns, whole.heading, reach=1))
-    return replace(whole, heading=rowwise(np.subtract, whole.heading, turns))
+    change = np.diff(whole.heading, prepend=whole.heading[0])
+    turns = np.cumsum(np.round(change / (2 * np.pi)) * 2 * np.pi)
+    return replace(whole, heading=whole.heading - turns)
 
 
 def _leg_paths(
@@ -263,18 +244,14 @@ def _leg_paths(
     start = 0.0
     heights = _heights(legs, lines, setting=setting, ground=ground)
     for number, (leg, line, (z, slope, pitch, bank)) in enumerate(zip(legs, lines, heights, strict=True)):
-        steps = rowwise(lambda z, leg=leg: np.hypot(leg.step, np.diff(z, prepend=z[0])), z, reach=1)
+        steps = np.hypot(leg.step, np.diff(z, prepend=z[0]))
         steps[0] = 0.0
-        s = rowwise(lambda along, start=start: start + along, sums(steps))
+        s = start + np.cumsum(steps)
         start = float(s[-1])
-        scale = rowwise(lambda xy: setting.frame.scale_at(xy[:, 0], xy[:, 1]).astype(float), leg.xy)
-        limit, edge = (
-            rowwise(lambda row, column=column: column[row], leg.row, looked_up=(column,))
-            for column in (line.limit, line.edge)
-        )
+        scale = setting.frame.scale_at(*leg.xy.T).astype(float)
         yield Path(
             s=s,
-            position=rowwise(lambda xy, z: np.column_stack([xy, z]), leg.xy, z),
+            position=np.column_stack([leg.xy, z]),
             heading=leg.heading,
             curvature=leg.curvature,
             slope=slope,
@@ -283,28 +260,18 @@ def _leg_paths(
             scale=scale,
             gear=np.full(len(s), leg.gear, np.int8),
             leg=np.full(len(s), number, np.int32),
-            limit=limit,
-            edge=edge,
-            offset=rowwise(lambda off, k: off[:, 1] / k, _from_line(leg, line), scale),
+            limit=line.limit[leg.row],
+            edge=line.edge[leg.row],
+            offset=_from_line(leg, line)[:, 1] / scale,
         )
-
-
-def _whole_turns(heading: Float) -> Float:
-    """Radians (n,) of the whole turns that each heading (n,) differs by from the one before."""
-    turns: Float = np.round(np.diff(heading, prepend=heading[0]) / (2 * np.pi)) * 2 * np.pi
-    return turns
 
 
 def _from_line(leg: SteeredTrack, line: RouteLine) -> Float:
     """Scene metres (n, 2) by which a track's rows are ahead of their rows of the line, and to its left."""
-    heading = headings(line.xyz)
-
-    def apart(xy: Float, row: NDArray[np.int64]) -> Float:
-        d = xy - line.xyz[row, :2]
-        c, s = np.cos(heading[row]), np.sin(heading[row])
-        return np.column_stack([d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s])
-
-    return rowwise(apart, leg.xy, leg.row, looked_up=(line.xyz, heading))
+    heading = polylines.headings(line.xyz)[leg.row]
+    d = leg.xy - line.xyz[leg.row, :2]
+    c, s = np.cos(heading), np.sin(heading)
+    return np.column_stack([d[:, 0] * c + d[:, 1] * s, d[:, 1] * c - d[:, 0] * s])
 
 
 def _heights(
@@ -314,49 +281,37 @@ def _heights(
 
     Wheels keep to the ground; without one, the route's profile is smoothed over the wheelbase.
     """
-    from scipy.ndimage import maximum_filter1d, median_filter  # noqa: PLC0415
+    from scipy.ndimage import gaussian_filter1d, maximum_filter1d, median_filter  # noqa: PLC0415
 
+    raw = [_raw_heights(*pair, setting=setting, ground=ground) for pair in zip(legs, lines, strict=True)]
     # positions are doubled between legs: smooth without the duplicates
-    sizes = np.array([len(leg.row) for leg in legs])
-    starts = np.cumsum(sizes - 1) - (sizes - 1)
-    z, tilt, bank = columns = [room((int(starts[-1] + sizes[-1]),)) for _ in range(3)]
-    for leg, line, start in zip(legs, lines, starts.tolist(), strict=True):
-        once = slice(1 if start else 0, None)
-        raw = _raw_heights(leg, line, setting=setting, ground=ground)
-        for column, values in zip(columns, raw, strict=True):
-            fill(column[start : start + len(leg.row)][once], values[once])
+    z, tilt, bank = (
+        np.concatenate([column[min(k, 1) :] for k, column in enumerate(columns)])
+        for columns in zip(*raw, strict=True)
+    )
     body = setting.vehicle
     over = body.turning_radius if body.kind == "air" else max(body.wheelbase, 1.0)
     width = (over if ground is None else _SPRING) / legs[0].step
     # extrapolate the road at both ends with its gradient
     spare, wide = math.ceil(4 * over / legs[0].step) + 1, over / legs[0].step
-    far = extend(z, spare)
-    near, soft = (smooth(far, w)[spare : spare + len(z)] for w in (width, wide))
+    far = np.pad(z, spare, mode="reflect", reflect_type="odd")
+    near, soft = (gaussian_filter1d(far, w)[spare : spare + len(z)] for w in (width, wide))
     if ground is not None:  # a step, as at the joint of a bridge, becomes a ramp
         reach = 2 * math.ceil(wide) + 1
-
-        def step(rise: Float) -> Float:
-            usual = median_filter(rise, reach, mode="nearest")
-            return np.asarray(np.abs(rise - usual) > _JOINT / 2, float)
-
-        steps = rowwise(step, rowwise(np.gradient, z, reach=1), reach=reach)
-        share = smooth(rowwise(lambda part: maximum_filter1d(part, reach), steps, reach=reach), wide / 2)
-        near, tilt = (
-            rowwise(lambda part, other, share: part + share * (other - part), column, softer, share)
-            for column, softer in ((near, soft), (tilt, smooth(tilt, wide, mode="mirror")))
-        )
-    tilt, bank = (smooth(column, width, mode="mirror") for column in (tilt, bank))
+        rise = np.gradient(z)
+        steps = np.abs(rise - median_filter(rise, reach, mode="nearest")) > _JOINT / 2
+        share = gaussian_filter1d(maximum_filter1d(steps.astype(float), reach), wide / 2)
+        near = near + share * (soft - near)
+        tilt = tilt + share * (gaussian_filter1d(tilt, wide, mode="mirror") - tilt)
+    tilt, bank = (gaussian_filter1d(column, width, mode="mirror") for column in (tilt, bank))
     stands = ground is not None and body.wheelbase >= _AXLES
-    for leg, start in zip(legs, starts.tolist(), strict=True):
+    start = 0
+    for leg in legs:
         height, ahead, across = (c[start : start + len(leg.row)] for c in (near, tilt, bank))
-        slope = rowwise(lambda z, leg=leg: np.arctan(leg.gear * np.gradient(z, leg.step)), height, reach=1)
-        pitch = rowwise(np.arctan, ahead) if stands else slope
-        yield (
-            height,
-            slope,
-            pitch,
-            rowwise(lambda across, pitch: np.arctan(across * np.cos(pitch)), across, pitch),
-        )
+        slope = np.arctan(leg.gear * np.gradient(height, leg.step))
+        pitch = np.arctan(ahead) if stands else slope
+        yield height, slope, pitch, np.arctan(across * np.cos(pitch))
+        start += len(leg.row) - 1
 
 
 def _raw_heights(
@@ -366,43 +321,27 @@ def _raw_heights(
 
     As the ground has them, or, without one, the line.
     """
-    gap, end = line.gap, len(line.edge)
     # the last row may lie a little beyond the end of the line
-    beyond = 2 * line.xyz[-1, 2] - line.xyz[-2, 2]
-
-    def height(row: NDArray[np.int64], off: Float) -> Float:
-        place = row + off[:, 0] / gap
-        first, last = max(int(place.min()), 0), max(int(place.max()), 0) + 2
-        known = line.xyz[first:last, 2]
-        profile = known if last <= end else np.append(known, beyond)
-        return np.interp(place, np.arange(first, first + len(profile)), profile)
-
-    z = rowwise(height, leg.row, _from_line(leg, line), looked_up=(line.xyz,))
-    rise = rowwise(lambda z: leg.gear * np.gradient(z, leg.step), z, reach=1)
-    if ground is None or not len(z):
-        return z, rise, rowwise(np.zeros_like, z)
-    columns = [room((len(z),)) for _ in range(3)]
-    for rows in _runs(leg.xy):
-        values = _on_wheels(
+    profile = np.append(line.xyz[:, 2], 2 * line.xyz[-1, 2] - line.xyz[-2, 2])
+    place = leg.row + _from_line(leg, line)[:, 0] / line.gap
+    z = np.interp(place, np.arange(len(profile)), profile)
+    rise = leg.gear * np.gradient(z, leg.step)
+    if ground is None:
+        return z, rise, np.zeros(len(z))
+    runs = [
+        _on_wheels(
             leg.xy[rows], leg.heading[rows], z=z[rows], rise=rise[rows], setting=setting, ground=ground
         )
-        for column, part in zip(columns, values, strict=True):
-            column[rows] = part
-        release(leg.xy, z, rise, *columns)
-    rear, ahead, across = columns
+        for rows in _runs(leg.xy)
+    ]
+    rear, ahead, across = (np.concatenate(column) for column in zip(*runs, strict=True))
     return rear, ahead, across
 
 
 def _runs(xy: Float) -> Iterator[slice]:
     """Runs of rows of a track (n, 2) within a square of `_REGION`: the ground is loaded run by run."""
     starts = np.arange(0, len(xy), _RUN_STEP)
-    lows, highs = [], []
-    for rows in row_blocks(len(xy), _RUN_STEP * _RUN):
-        begins = np.arange(0, rows.stop - rows.start, _RUN_STEP)
-        lows.append(np.minimum.reduceat(xy[rows], begins, axis=0))
-        highs.append(np.maximum.reduceat(xy[rows], begins, axis=0))
-        release(xy)
-    low, high = np.concatenate(lows), np.concatenate(highs)
+    low, high = (reduce.reduceat(xy, starts, axis=0) for reduce in (np.minimum, np.maximum))
     first = 0
     for k in range(1, len(starts)):
         size = high[first : k + 1].max(axis=0) - low[first : k + 1].min(axis=0)

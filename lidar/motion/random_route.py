@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.routing import TurnStates
+from geoscene.roadgraph.routing import TurnStates, permitted_turns, turns_back
 from geoscene.typing import Bools, Float, Ints
 from lidar.geometry.random_streams import generator
-from lidar.motion.route import permitted_turns, turns_back
 
 _LAST_START = 0.9
 """Share of a street within which a route starts."""

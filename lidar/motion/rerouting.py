@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from lidar.errors import BlockedError, RouteError
+from lidar.geometry.time_scales import check_duration
 from lidar.motion.path import MARGIN, Path, Surface, plan_path
 from lidar.motion.route import Route, RouteOptions, Spec, plan_route
 from lidar.motion.vehicle import Vehicle
@@ -39,7 +40,8 @@ def plan_route_and_path(
     Where the body does not pass, the route is planned again without that street or turn; ``tried`` is called
     with each route.
 
-    Raises RouteError as `plan_route` does, and BlockedError if every route is blocked.
+    Raises RouteError as `plan_route` does and for a given route that takes longer than a drive lasts, and
+    BlockedError if every route is blocked.
     """
     options = replace(options or RouteOptions(), body_width=vehicle.width)
     if not isinstance(obstacles, shapely.STRtree):
@@ -53,6 +55,8 @@ def plan_route_and_path(
             if avoid:
                 break
             raise
+        if spec != "random" and options.duration is None:
+            check_duration(route.least_seconds(vehicle.max_speed), what="the route")
         tried(route)
         try:
             return route, plan_path(

@@ -12,11 +12,9 @@ from geoscene.classes import Class
 from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
-from geoscene.support.columns import row_blocks
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.errors import RouteError
-from lidar.motion.blockwise import rowwise
 from lidar.motion.path import Path, Surface
 from lidar.motion.rerouting import plan_route_and_path
 from lidar.motion.route import Route, RouteOptions, Side, Spec
@@ -28,7 +26,6 @@ ROUTE_MARGIN_S = 15.0
 """Seconds at the speed limits by which the route of a drive that starts and ends at speed exceeds its record.
 
 It covers the braking distance at any speed that streets allow."""
-_RAYS = 1 << 17  # rays that are cast at once
 _HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
@@ -111,15 +108,11 @@ def road_surface(scene: Scene) -> Surface:
 
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
         world.follow((float(x.min()) - 1, float(y.min()) - 1, float(x.max()) + 1, float(y.max()) + 1))
-        out = np.array(z, float)
-        for rows in row_blocks(len(x), _RAYS):
-            origins = np.column_stack([x[rows], y[rows], z[rows] + _SEARCH_M])
-            down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
-            hits = world.caster.cast(origins, down, far=2 * _SEARCH_M)
-            on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
-            low = z[rows] + _SEARCH_M - np.where(on_road, hits.range, 0.0)
-            out[rows] = np.where(on_road, low, z[rows])
-        return out
+        origins = np.column_stack([x, y, z + _SEARCH_M])
+        down = np.broadcast_to([0.0, 0.0, -1.0], origins.shape)
+        hits = world.caster.cast(origins, down, far=2 * _SEARCH_M)
+        on_road = np.isfinite(hits.range) & np.isin(world.lookup(hits).klass, _DRIVEN)
+        return np.where(on_road, z + _SEARCH_M - np.where(on_road, hits.range, 0.0), z)
 
     return surface
 
@@ -165,7 +158,7 @@ def plan_road_drive(
             raise
         raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
     number = np.append(np.flatnonzero(kept), -1).astype(np.int32)
-    path = replace(path, edge=rowwise(lambda edge: number[edge], path.edge))
+    path = replace(path, edge=number[path.edge])
     return RoadPlan(whole, route, path, seconds, at_speed)
 
 

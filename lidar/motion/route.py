@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import shapely
@@ -15,21 +15,17 @@ from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import graph_lanes
-from geoscene.roadgraph.routing import TurnStates, edge_lines, turn_states
+from geoscene.roadgraph.routing import turns_back
 from geoscene.typing import Float
 from lidar.errors import RouteError
+from lidar.motion.random_route import random_edges
+from lidar.motion.waypoints import match_track, read_track, route_through
 
 Side = Literal["right", "left"]
 Spec = str | Path | Sequence[tuple[float, float]]
 
 TOLERANCE = 50.0
 """Maximum distance in metres of a waypoint from a drivable street."""
-HEADING_REACH = 5.0
-"""Scene metres over which the heading of a street at a junction is taken."""
-U_TURN_S = 30.0
-"""Cost in seconds of a U-turn at a dead end in the search for the fastest route."""
-U_TURN = np.radians(150.0)
-"""Smallest change of direction at a node, in radians, that needs a U-turn."""
 _STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
 _STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
@@ -60,6 +56,11 @@ class Route:
     def length(self) -> float:
         """Scene metres of the line in plan."""
         return polylines.length(self.line)
+
+    def least_seconds(self, max_speed: float) -> float:
+        """Seconds that the route takes at its speed limits, and at most at ``max_speed`` in m/s."""
+        steps = np.hypot(*np.diff(self.line[:, :2], axis=0).T)
+        return float((steps / np.minimum(self.limit[:-1], max_speed)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +109,8 @@ def plan_route(
         seconds = np.inf if options.duration is None else options.duration
         if options.length is None and options.duration is None:
             seconds = 600.0
-        from lidar.motion.random_route import random_edges  # noqa: PLC0415  (it imports this module)
-
         edges, ends = random_edges(graph, seed=options.seed, seconds=seconds, metres=metres, avoid=avoid)
         return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
-
-    from lidar.motion.waypoints import match_track, read_track, route_through  # noqa: PLC0415  (they import this module)
 
     if isinstance(spec, str | Path):
         track = read_track(Path(spec), frame)
@@ -134,30 +131,6 @@ def plan_route(
 def _need_streets(graph: RoadGraph) -> None:
     if not len(graph):
         raise RouteError("the scene has no drivable streets; build one of a place with roads")
-
-
-def turns_back(graph: RoadGraph, before: NDArray[Any], *, after: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether (k,) the turn from one edge to the next is a U-turn: `U_TURN` or more."""
-    ends = np.array([polylines.end_headings(line, reach=HEADING_REACH) for line in graph.geometry])
-    enter, leave = ends.reshape(-1, 2).T
-    turn = np.abs((enter[after] - leave[before] + np.pi) % (2 * np.pi) - np.pi)
-    back: NDArray[np.bool_] = (graph.twin[before] == after) | (turn > U_TURN)
-    return back
-
-
-def permitted_turns(graph: RoadGraph, avoid: Collection[tuple[int, int]]) -> TurnStates:
-    """The permitted turns between states, without the turns and edges to avoid."""
-    states = turn_states(graph)
-    if not avoid:
-        return states
-    shut = np.array(sorted(avoid), np.int64).reshape(-1, 2)
-    closed = shut[shut[:, 0] == shut[:, 1], 0]
-    before, after = states.edge[states.before], states.edge[states.after]
-    key = before.astype(np.int64) * len(graph) + after
-    bad = (
-        np.isin(key, shut[:, 0] * len(graph) + shut[:, 1]) | np.isin(before, closed) | np.isin(after, closed)
-    )
-    return replace(states, before=states.before[~bad], after=states.after[~bad])
 
 
 # ------------------------------------------------------------------------------------------------ lanes
@@ -262,8 +235,3 @@ def free_route(xyz: ArrayLike, *, limit: float = np.inf, side: Side = "right") -
         np.empty(0, np.int32),
         side,
     )
-
-
-def street_tree(graph: RoadGraph) -> shapely.STRtree:
-    """Search tree over the edges' centre lines."""
-    return shapely.STRtree(edge_lines(graph))

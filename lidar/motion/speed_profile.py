@@ -15,11 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.support.columns import row_blocks
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.geometry.poses import BLOCK_POSES, release, room
-from lidar.motion.blockwise import even, fill, interpolate, lowest_ahead, rowwise
 from lidar.motion.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
@@ -79,8 +76,8 @@ def motion_within(
         origin, end = float(path.s[first]), float(path.s[last - 1])
         allowed = np.clip(max_distance, origin, end) - origin
         there = np.flatnonzero(allowed >= end - origin - 1e-6)
-        s = rowwise(lambda along, origin=origin: along - origin, path.s[first:last])
-        needed = _TAIL_S + 1.5 * float(rowwise(_seconds, s, limit[first:last], reach=1)[:-1].sum())
+        s = path.s[first:last] - origin
+        needed = _TAIL_S + 1.5 * float((np.diff(s) / limit[first : last - 1]).sum())
         until = max(float(time_s[there[0]]) - begin, 0.0) + needed if len(there) else math.inf
         t = STEP_S * np.arange(max(math.floor(min(total - begin, until) / STEP_S), 2) + 1)
         rolls = at_speed and not parts
@@ -114,81 +111,57 @@ class _Part:
 
 def _join(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
     """The profile of all legs."""
-    n, kinds = sum(len(part.s) for part in parts), (np.int64, float, float, float, np.int64)
-    time_ns, s, v, acceleration, row = columns = [room((n,), kind) for kind in kinds]
-    start = 0
-    for part in parts:
-        for rows in row_blocks(len(part.s), BLOCK_POSES):
-            to = slice(start + rows.start, start + rows.stop)
-            s[to], v[to] = part.origin + part.s[rows], part.v[rows]
-            near = np.searchsorted(path.s, s[to], side="right") - 1
-            row[to] = np.clip(near, part.first, part.last)
-            release(*columns, part.s, part.v, path.s)
-        start += len(part.s)
-    for rows in row_blocks(n, BLOCK_POSES):
-        time_ns[rows] = np.round(np.arange(rows.start, rows.stop) * (1e9 / rate_hz))
-        around = slice(max(rows.start - 1, 0), rows.stop + 1)
-        change = np.gradient(v[around], 1.0 / rate_hz)
-        acceleration[rows] = change[rows.start - around.start :][: rows.stop - rows.start]
-        release(*columns)
-    return Motion(time_ns, s, v, acceleration, row)
+    s = np.concatenate([part.origin + part.s for part in parts])
+    v = np.concatenate([part.v for part in parts])
+    sizes = [len(part.s) for part in parts]
+    first, last = (np.repeat([getattr(part, end) for part in parts], sizes) for end in ("first", "last"))
+    row = np.clip(np.searchsorted(path.s, s, side="right") - 1, first, last)
+    time_ns = np.round(np.arange(len(s)) * (1e9 / rate_hz)).astype(np.int64)
+    return Motion(time_ns, s, v, np.gradient(v, 1.0 / rate_hz), row)
 
 
 def desired_speed(path: Path, vehicle: Vehicle) -> Float:
     """Desired speed (n,) in m/s along a path: comfortable braking, rest at the end of each leg."""
     limit = speed_limits(path, vehicle)
-    out = room((len(limit),))
+    out = np.empty(len(limit))
     for first, last in legs_of(path):
         limit[last - 1] = 0.0
-        fill(out[first:last], _limit_braking(path.s[first:last], limit[first:last], vehicle=vehicle))
+        out[first:last] = _limit_braking(path.s[first:last], limit[first:last], vehicle=vehicle)
     return out
-
-
-def _seconds(s: Float, limit: Float) -> Float:
-    """Seconds (n,) from each row to the next at the speed limits."""
-    time: Float = np.diff(s, append=s[-1]) / limit
-    return time
 
 
 def _limit_braking(s: Float, limit: Float, *, vehicle: Vehicle) -> Float:
     """Speed limits (n,) at distances (n,), lowered for comfortable braking before lower ones."""
     by = 2 * _COMFORT * vehicle.deceleration
-    lowest = lowest_ahead(rowwise(lambda s, limit: limit**2 + by * s, s, limit))
-    return rowwise(lambda s, lowest: np.sqrt(np.maximum(lowest - by * s, 0.0)), s, lowest)
+    lowest = np.minimum.accumulate((limit**2 + by * s)[::-1])[::-1]
+    speed: Float = np.sqrt(np.maximum(lowest - by * s, 0.0))
+    return speed
 
 
 @dataclass(frozen=True, slots=True)
 class _Limits:
     """Speed limits in m/s every `_GAP` metres of a leg: as they are, and with comfortable braking before."""
 
+    place: Float
     strict: Float
     cautious: Float
 
     def at(self, s: Float) -> Float:
         """Cautious limits (n,) at distances (n,)."""
-        return _looked_up(self.cautious, s)
+        return np.interp(s, self.place, self.cautious)
 
     def excess(self, s: Float, *, v: Float) -> float:
         """Largest ratio of speeds (n,) to the limits at distances (n,)."""
-        return float((v / _looked_up(self.strict, s)).max())
-
-
-def _looked_up(limit: Float, s: Float) -> Float:
-    """Values (n,) at distances (n,) of a column with a row every `_GAP` metres."""
-    last = len(limit) - 1
-    low, high = (min(max(int(end / _GAP), 0), last) for end in (s.min(), s.max()))
-    rows = np.arange(low, min(high + 1, last) + 1)
-    return np.interp(s, _GAP * rows, limit[rows])
+        return float((v / np.interp(s, self.place, self.strict)).max())
 
 
 def _limits(s: Float, limit: Float, *, vehicle: Vehicle) -> _Limits:
     from scipy.ndimage import minimum_filter1d  # noqa: PLC0415
 
-    place = even(math.ceil((s[-1] + _GAP) / _GAP), _GAP)
-    strict = interpolate(place, s, column=limit)
-    around = 2 * round(_AROUND / _GAP) + 1
-    least = rowwise(lambda part: minimum_filter1d(part, around), strict, reach=around)
-    return _Limits(strict, _limit_braking(place, least, vehicle=vehicle))
+    place = _GAP * np.arange(math.ceil((s[-1] + _GAP) / _GAP))
+    strict = np.interp(place, s, limit)
+    least = minimum_filter1d(strict, 2 * round(_AROUND / _GAP) + 1)
+    return _Limits(place, strict, _limit_braking(place, least, vehicle=vehicle))
 
 
 def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tuple[bool, bool]) -> _Knots:
@@ -212,7 +185,6 @@ def _best(s: Float, limit: Float, *, vehicle: Vehicle, allowed: Float, rest: tup
             ends=ends,
             rests=ends and rest[1],
         )
-        release(limits.strict, limits.cautious)
         kept = part if ends else part[:, : _KEPT + 1]
         knots[:, first : first + kept.shape[1]] = kept
         excess, first = max(excess, over), first + kept.shape[1] - 1
@@ -324,17 +296,10 @@ def _sample(knots: _Knots, end: float, *, dt: float) -> tuple[Float, Float]:
     resting = np.flatnonzero((knots.s > end - _NEAR) & (knots.v < _AT_REST))
     if len(resting):
         last = int(resting[0])
-    count = math.ceil((last * knots.dt + 1e-9) / dt)
-    s, v = room((count,)), room((count,))
-    furthest = 0.0
-    for rows in row_blocks(count, BLOCK_POSES):
-        t = dt * np.arange(rows.start, rows.stop)
-        i = np.minimum((t / knots.dt).astype(int), len(knots.s) - 2)
-        u = t - i * knots.dt
-        jerk = (knots.a[i + 1] - knots.a[i]) / knots.dt
-        v[rows] = np.maximum(knots.v[i] + knots.a[i] * u + jerk * u**2 / 2, 0.0)
-        far = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
-        s[rows] = np.maximum(np.maximum.accumulate(np.clip(far, 0.0, end)), furthest)
-        furthest = float(s[rows.stop - 1])
-        release(s, v)
-    return s, v
+    t = dt * np.arange(math.ceil((last * knots.dt + 1e-9) / dt))
+    i = np.minimum((t / knots.dt).astype(int), len(knots.s) - 2)
+    u = t - i * knots.dt
+    jerk = (knots.a[i + 1] - knots.a[i]) / knots.dt
+    v = np.maximum(knots.v[i] + knots.a[i] * u + jerk * u**2 / 2, 0.0)
+    far = knots.s[i] + knots.v[i] * u + knots.a[i] * u**2 / 2 + jerk * u**3 / 6
+    return np.maximum.accumulate(np.clip(far, 0.0, end)), v

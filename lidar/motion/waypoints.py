@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.routing import nearest_edge
+from geoscene.roadgraph.routing import edge_lines, nearest_edge, permitted_turns, turns_back
 from geoscene.sources.tracks import read_track as read_points
 from geoscene.typing import Float
 from lidar.errors import RouteError
-from lidar.motion.route import U_TURN_S, permitted_turns, street_tree, turns_back
 
 Place = tuple[int, float]
 """An edge and the true metres from its tail."""
@@ -33,6 +32,8 @@ SIGMA_M = 6.0
 BETA_M = 15.0
 """Metres by which driven and straight distance between two points of a track typically differ."""
 _CANDIDATES = 6
+_U_TURN_S = 30.0
+"""Cost in seconds of a U-turn at a dead end in the search for the fastest route."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +107,7 @@ def route_through(
         rest = [f"and so are {len(far) - _NAMED} more"] if len(far) > _NAMED else []
         raise RouteError("; ".join(named + rest))
     candidates = [_both_sides(graph, int(e), offset=float(o)) for e, o in zip(edge, offset, strict=True)]
-    chain = _Search(graph, graph.travel_time, avoid=avoid, u_turn=U_TURN_S)
+    chain = _Search(graph, graph.travel_time, avoid=avoid, u_turn=_U_TURN_S)
 
     def score(_: int, cost: Float) -> Float:
         return cost
@@ -140,7 +141,7 @@ def match_track(
     that have no street within ``tolerance``, or where the streets do not connect.
     """
     xy = _thin(track.xyz[:, :2], 2.5 * SIGMA_M)
-    tree = street_tree(graph)
+    tree = shapely.STRtree(edge_lines(graph))
     candidates: list[list[Place]] = []
     costs: list[Float] = []
     lost: list[int] = []

@@ -19,6 +19,7 @@ from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float
 from lidar.errors import InputError, RouteError
 from lidar.geometry.poses import Trajectory
+from lidar.geometry.time_scales import LONGEST_S, check_duration
 from lidar.motion.flight import (
     Flight,
     dense_line,
@@ -47,7 +48,6 @@ _LAYERS = 16  # surfaces above the ground that a vertical ray passes at most
 _BORDER = 1e-3  # metres inside the scene's border, on which rays may miss the ground
 _CLEAR = 2.0  # metres, minimum clearance above the scene
 _STEEPEST = 0.2  # sine of the smallest depression angle of a beam that counts for the swath
-_LONGEST_S = 6 * 3600.0  # seconds: few aircraft stay up longer, and plans of longer flights fill the memory
 _FURTHEST = 20_000.0  # metres from the scene to a waypoint; sensors do not range further
 _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
 
@@ -100,6 +100,8 @@ def plan_flight(
         )
     else:
         route = _along(scene, spec, vehicle=vehicle, options=options, above=above, below=below)
+        if duration is None:
+            check_duration(route.least_seconds(vehicle.max_speed), what="the route")
     at_speed = spec == "random" and not survey and not options.from_rest
     trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, at_speed=at_speed)
     if duration is not None:
@@ -273,11 +275,11 @@ def _strips(
     strips = 1 + float(np.hypot(*sides.T).min()) / spacing
     turn = 2 * math.pi * vehicle.turning_radius * scale
     seconds = (area.area / spacing + strips * turn) / (vehicle.max_speed * scale)
-    if not seconds <= _LONGEST_S:
+    if not seconds <= LONGEST_S:
         raise RouteError(
             f"the survey has {strips:.0f} strips {spacing / scale:.3g} m apart and takes over"
-            f" {_LONGEST_S / 3600:.0f} hours; lower the `overlap`, fly higher (`altitude`) or take a smaller"
-            " area"
+            f" {LONGEST_S / 3600:.0f} hours; fly several surveys of parts of the area, lower the `overlap`"
+            " or fly higher (`altitude`)"
         )
     stop = 0.0 if vehicle.cruise else vehicle.max_speed**2 / (2 * vehicle.acceleration)
     heading_deg = math.degrees(math.atan2(dx, dy))

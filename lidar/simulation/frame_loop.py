@@ -29,9 +29,6 @@ T = TypeVar("T")
 CHUNK = 200.0
 """Scene metres along each axis that the vehicle may cover before other tiles are loaded."""
 
-_FORGET_NS = 60 * 10**9
-"""Nanoseconds of a drive after which the memory of long motion is let go."""
-
 
 def run_jobs(
     task: Callable[[SensorFrame, Worlds], T],
@@ -46,23 +43,18 @@ def run_jobs(
 
     At most twice as many frames as workers are begun and not yet taken. Leaving the loop ends the threads.
     """
-    released_ns = 0
     max_range = max((job.sensor.max_range for job in jobs), default=0.0)
     worlds = Worlds(scene, max_range, actors=recording.actors, settings=recording.settings.world)
     workers = min(workers, os.cpu_count() or 1)  # more than cores would only wait for one another
     with _pool(workers) as pool:
         for chunk, region in recording_chunks(jobs, recording):
             with recording.watch.stage("load"):
-                recording.release()
                 worlds.follow(region)
             running: deque[Future[T]] = deque()
             for job in chunk:
                 running.append(pool.submit(task, job, worlds))
                 if len(running) >= 2 * workers:
                     yield from _finish(running, in_order=in_order)
-                if job.start_ns - released_ns > _FORGET_NS:
-                    recording.release()
-                    released_ns = job.start_ns
             while running:
                 yield running.popleft().result()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
-from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_json
 from lidar.dataset.kitti_sequence import write_sequence
 from lidar.dataset.layout import Paths
@@ -32,9 +32,9 @@ from lidar.simulation.situations import situation_of_unit
 
 
 def pose_columns(
-    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer], first: int = 0
+    trajectory: Trajectory, frame: Frame, *, start: datetime, time_ns: NDArray[np.integer]
 ) -> dict[str, Any]:
-    """Columns of ``poses.csv``: the vehicle at given times, of frames from number ``first`` on.
+    """Columns of ``poses.csv``: the vehicle at the starts of frames.
 
     x, y, z in scene metres; alpha, beta, gamma in radians with R = Rz(gamma) Ry(beta) Rx(alpha), scene axes
     from vehicle axes; lon, lat in degrees (WGS 84) and h in metres as the scene's heights.
@@ -45,7 +45,7 @@ def pose_columns(
     lon, lat = frame.to_geographic(x, y)
     return {
         "timestamp": iso_times(start, time_ns),
-        "frame": np.arange(first, first + len(time_ns)),
+        "frame": np.arange(len(time_ns)),
         "x": x,
         "y": y,
         "z": z,
@@ -140,23 +140,14 @@ def write_metadata(
     write_json(paths.calibration, calibration(rig, sensors))
     for k, sensor in enumerate(sensors):
         times = np.fromiter(map(sensor.frame_start_ns, range(frames[sensor.name])), np.int64)
-        number = np.arange(len(times))
-        write_blocks(
-            paths.timestamps(sensor.name),
-            (
-                {"frame": number[rows], "time_ns": times[rows], "timestamp": iso_times(start, times[rows])}
-                for rows in table_blocks(len(times))
-            ),
-        )
+        stamps: dict[str, Any] = {
+            "frame": np.arange(len(times)),
+            "time_ns": times,
+            "timestamp": iso_times(start, times),
+        }
+        write_columns(paths.timestamps(sensor.name), stamps)
         if k == 0:
-            windows = trajectory.windows(times, margin=2) if len(times) else [(slice(0), trajectory)]
-            write_blocks(
-                paths.poses,
-                (
-                    pose_columns(part, scene.frame, start=start, time_ns=times[rows], first=rows.start)
-                    for rows, part in windows
-                ),
-            )
+            write_columns(paths.poses, pose_columns(trajectory, scene.frame, start=start, time_ns=times))
         if settings.kitti and isinstance(sensor, Scanner):
             folder, mount = paths.sensor(sensor.name), sensor.spec.mount
             write_sequence(folder, rig, mount=mount, trajectory=trajectory, time_ns=times)

@@ -22,8 +22,8 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.provenance import scene_provenance, versions
 from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.geometry.poses import Trajectory, blocks_of
-from lidar.geometry.time_scales import check_start
+from lidar.geometry.poses import Trajectory
+from lidar.geometry.time_scales import check_duration, check_start
 from lidar.motion.flight import Flight
 from lidar.motion.road_conditions import vehicle_on
 from lidar.motion.road_drive import RoadPlan, plan_road_drive
@@ -128,13 +128,9 @@ class DrivePlan:
     @property
     def length(self) -> float:
         """True metres that the ego vehicle covers."""
-        metres = 0.0
-        for rows in blocks_of(len(self.trajectory), overlap=1):
-            steps = np.diff(self.trajectory.position[rows], axis=0)
-            steps[:, :2] /= self.trajectory.scale[rows][1:, None]
-            metres += float(np.linalg.norm(steps, axis=1).sum())
-            self.trajectory.release()
-        return metres
+        steps = np.diff(self.trajectory.position, axis=0)
+        steps[:, :2] /= self.trajectory.scale[1:, None]
+        return float(np.linalg.norm(steps, axis=1).sum())
 
     @property
     def frames(self) -> dict[str, int]:
@@ -148,8 +144,7 @@ class DrivePlan:
 
         And surfaces that are missing, where sensors see farther than a scene along a route was built.
         """
-        position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)].copy()
-        self.trajectory.release()
+        position = self.trajectory.position[:: max(len(self.trajectory) // 1000, 1)]
         settings = self.options.recording_settings.world
         sight = min(self.max_range, settings.reach)
         return [
@@ -221,8 +216,11 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     road = options.road_conditions()
     vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
-    _refuse_elsewhere(scene, motion if isinstance(motion, Trajectory) else motion.trajectory, sensors=sensors)
+    alone = motion if isinstance(motion, Trajectory) else motion.trajectory
+    check_duration(alone.duration_ns / 1e9, what="the route")
+    _refuse_elsewhere(scene, alone, sensors=sensors)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
+    check_duration(trajectory.duration_ns / 1e9, what="the route in traffic")
     stages = options.recording_settings.stages
     actors = with_objects(actors, stages, scene=scene, trajectory=trajectory)
     check_start(start, trajectory.duration_ns)
@@ -251,11 +249,8 @@ def _refuse_elsewhere(scene: Scene, trajectory: Trajectory, *, sensors: Sequence
     """Raise RouteError for a motion from which no sensor ever reaches the scene."""
     sight = max((sensor.max_range for sensor in sensors), default=0.0)
     xmin, ymin, xmax, ymax = scene.bounds
-    nearest = np.inf
-    for rows in blocks_of(len(trajectory.time_ns)):
-        xy = trajectory.position[rows, :2]
-        off = np.hypot(*(xy - np.clip(xy, [xmin, ymin], [xmax, ymax])).T)
-        nearest = min(nearest, float(off.min()))
+    xy = trajectory.position[:, :2]
+    nearest = float(np.hypot(*(xy - np.clip(xy, [xmin, ymin], [xmax, ymax])).T).min())
     if nearest > sight:
         raise RouteError(
             f"the route comes no closer than {nearest:,.0f} m to {scene.path}, and the sensors see up to"

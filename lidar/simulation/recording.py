@@ -95,12 +95,6 @@ class Recording:
         """Header fields that all LAS and LAZ files of the dataset share."""
         return LasInfo(self.geo.crs, self.geo.offset, self.start)
 
-    def release(self) -> None:
-        """Let go of the memory of motion in files, see `lidar.geometry.poses.release`."""
-        self.trajectory.release()
-        if self.actors is not None:
-            self.actors.release()
-
     def paths(self, sensor: Scanner | Camera, frame: int) -> dict[str, Path]:
         """Files of one frame.
 

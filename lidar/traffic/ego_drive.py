@@ -15,7 +15,7 @@ from lidar.motion.path import Path
 from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.speed_profile import motion_within
 from lidar.motion.vehicle import Vehicle
-from lidar.traffic.ego_trip import ego_trip
+from lidar.traffic.ego import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
 from lidar.traffic.simulation import has_traffic_control, simulate_ego
@@ -134,7 +134,6 @@ def drive_in_traffic(
                 obeys_signals=True,
             )
             return ego, others
-        del setup  # it grows with the drive, and the next one does not need it
 
 
 def _driven(

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
-from geoscene.roadgraph.routing import turn_states
+from geoscene.roadgraph.routing import HEADING_REACH, turn_states
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.motion.route import HEADING_REACH
 from lidar.motion.steering import relax
 
 STEP = 0.5

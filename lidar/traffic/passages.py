@@ -9,34 +9,27 @@ import numpy as np
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.typing import Float
-from lidar.geometry.poses import release
-from lidar.motion.blockwise import rowwise
-from lidar.traffic.ego_trip import EgoTrip
+from lidar.traffic.ego import EgoTrip
 from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
-from lidar.traffic.trips import Trip, TripCourse
+from lidar.traffic.trips import Trip
 
 _LINE_REACH = 20.0  # metres before a junction within which lines to stop at are heeded
 _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
 
 
 def passages(
-    trip: Trip | EgoTrip,
-    course: TripCourse,
-    *,
-    graph: RoadGraph,
-    plan: JunctionPlan,
-    routes: dict[tuple[int, ...], int],
+    trip: Trip | EgoTrip, graph: RoadGraph, *, plan: JunctionPlan, routes: dict[tuple[int, ...], int]
 ) -> Float:
     """Passages through junctions (b, 8): from, to, stop, zone, group, route, rank, sign; see `BLOCK`.
 
     routes : numbers of the routes through junctions so far; new ones are added
     """
-    path = course.path
-    zone = rowwise(lambda xyz: zone_at(plan.zones, xyz[:, :2]), path.xyz)
+    path = trip.course.path
+    zone = zone_at(plan.zones, path.xyz[:, :2])
     half = int(np.ceil((trip.length / 2 + 0.5) / STEP))
     rows: list[list[float]] = []
-    for first, last, number in course.crossing:
+    for first, last, number in trip.course.crossing:
         if last >= trip.begin:
             z = int(zone[(first + last) // 2])
             group = signal_group(plan, z, heading=float(path.heading[(first + last) // 2])) if z >= 0 else -1
@@ -44,9 +37,8 @@ def passages(
             rows.append([first, last, first - 1, z, group, key, 99.0, 0.0])
     if trip.on_foot:
         return np.array(rows, float).reshape(-1, 8)
-    begins = rowwise(lambda part: np.diff(part, prepend=-2) != 0, zone, reach=1)
-    for a, b in itertools.pairwise([*np.flatnonzero(begins).tolist(), len(zone)]):
-        release(*path.columns().values())
+    begins = np.flatnonzero(np.diff(zone, prepend=-2))
+    for a, b in itertools.pairwise([*begins.tolist(), len(zone)]):
         z = int(zone[a])
         if z < 0 or b - 1 + half < trip.begin:
             continue

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import shapely
@@ -16,7 +15,7 @@ from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, round_corners
 from lidar.traffic.surroundings import TrafficArea
-from lidar.traffic.trips import Drawings, Driver, Trip, TripCourse, random_shape, random_stretch
+from lidar.traffic.trips import Driver, Trip, TripCourse, random_shape, random_stretch
 
 _KINDS = {"adult": 0.5, "small_adult": 0.38, "child": 0.12}
 _FREE = {"adult": 1.36, "small_adult": 1.30, "child": 1.15}
@@ -102,7 +101,7 @@ def pedestrian_trips(
     metres = np.array([polylines.length(line) for line in walks.line])
     crossings = _crossings(lanes, walks)
     names, chance = list(_KINDS), np.array(list(_KINDS.values()))
-    trips, drawings = [], Drawings()
+    trips = []
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", "walker", number)
         walk = int(rng.choice(len(metres), p=metres / metres.sum()))
@@ -121,8 +120,8 @@ def pedestrian_trips(
                 side=lanes.side,
                 rng=rng,
             )
-            draw = partial(drawings.of, partial(_course, line, over, pace=pace, scale=area.scale))
-            trips.append(Trip(shape, grow, draw, _WALK, 0, start, leaves=False, on_foot=True))
+            course = _course(line, over, pace=pace, scale=area.scale)
+            trips.append(Trip(shape, grow, course, _WALK, 0, start, leaves=False, on_foot=True))
     return trips
 
 

@@ -16,7 +16,6 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
-from geoscene.support.columns import row_blocks
 from lidar.geometry.poses import Trajectory
 from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.vehicle import Vehicle
@@ -34,7 +33,6 @@ from lidar.world.actors import Actors, first_feature, join_actors
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
-_BOXES = 1 << 14  # boxes of the ego vehicle that are made at once
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
 
@@ -219,8 +217,8 @@ def parked_vehicles(
             shapely.buffer(setup.plan.zones.polygon, 3.0),
             crossings,
             np.empty(0, object) if structures is None else shapely.buffer(structures.geometry, 0.5),
+            _ego_boxes(ego, vehicle, scale=setup.scale),
         ],
-        _ego_boxes(ego, vehicle, scale=setup.scale),
         swept,
     )
     spots = ParkingSpaces.concatenate(
@@ -247,7 +245,7 @@ def _passable(
 def _swept(trips: list[Trip]) -> Iterator[NDArray[np.object_]]:
     """Bounding boxes (k,) of each moving road user along its path, with a margin."""
     for trip in trips:
-        xy, heading = trip.body(trip.draw().path)
+        xy, heading = trip.body()
         every = slice(0, None, 2 if trip.on_foot else 4)
         yield rectangles(
             xy[every], heading[every], length=max(trip.length, 1.0) + 0.5, width=trip.width + 0.3
@@ -269,17 +267,15 @@ def _strips(lanes: Lanes, area: TrafficArea) -> NDArray[np.object_]:
     return strips
 
 
-def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> Iterator[NDArray[np.object_]]:
+def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np.object_]:
     """Bounding boxes (k,) of the ego vehicle every metre of its trajectory, with a margin."""
     moved = polylines.stations(ego.position)
     every = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
-    for rows in row_blocks(len(every), _BOXES):
-        poses = ego.at(ego.time_ns[every[rows]])
-        forward = poses.rotation[:, :2, 0]
-        middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
-        heading = np.arctan2(forward[:, 1], forward[:, 0])
-        yield rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
-    ego.release()
+    poses = ego.at(ego.time_ns[every])
+    forward = poses.rotation[:, :2, 0]
+    middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    return rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
 
 
 def _layer(scene: Scene, name: str) -> Layer | None:

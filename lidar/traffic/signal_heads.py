@@ -16,6 +16,7 @@ from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
 from lidar.motion.vehicle import Vehicle
+from lidar.traffic.ego import ego_motion, green_windows
 from lidar.traffic.junctions import (
     JunctionPlan,
     Signals,
@@ -25,7 +26,6 @@ from lidar.traffic.junctions import (
     zone_at,
 )
 from lidar.traffic.lanes import lanes_of
-from lidar.traffic.simulation import ego_motion, green_windows
 
 RED, AMBER, GREEN = 0, 1, 2
 """States: rows of lamps from the top."""

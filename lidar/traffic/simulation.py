@@ -1,45 +1,69 @@
-"""Simulation of trips around a fixed or a simulated ego vehicle."""
+"""Simulation of trips around a fixed or a simulated ego vehicle.
+
+Time passes in windows: the tables of the time loop hold the road users that are present in one window.
+"""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import shapely
+from numpy.typing import NDArray
 
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.routing import edge_lines
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.geometry.poses import Trajectory, release, room
-from lidar.traffic.ego_trip import EgoTrip
-from lidar.traffic.junctions import JunctionPlan, signal_group, zone_at
+from lidar.geometry.poses import Trajectory
+from lidar.traffic.ego import EgoBox, EgoTrip, ego_motion, green_windows
+from lidar.traffic.junctions import JunctionPlan, Signals
+from lidar.traffic.lanes import STEP
 from lidar.traffic.passages import passages
-from lidar.traffic.simulation_kernel import MOTION, STEP_S
-from lidar.traffic.simulation_windows import EgoBox, Log, TrafficSimulation, records
+from lidar.traffic.simulation_kernel import (
+    BLOCK,
+    CELL,
+    LOOK_AHEAD,
+    MOTION,
+    NOBODY,
+    STATE,
+    STATION,
+    STEP_S,
+    USER,
+    EgoMotion,
+    Movers,
+    make_unreserved,
+    records,
+    simulate_steps,
+)
+from lidar.traffic.surroundings import LEFT
+from lidar.traffic.sweep import SweptCells, sweep
 from lidar.traffic.trips import Trip
 
-_KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
 _ROUNDS = 30
-_POINTS = 1 << 14  # points whose edges are looked for at once
-_NEAR = 6.0  # metres in plan from an edge's middle within which the ego may be on it
+_HORIZON = 60  # steps that the ego's path is known ahead: 6 s
+_STEPS = 200
+"""Steps of a window: 20 s."""
+_FASTER = 1.2  # maximum factor by which a road user exceeds its desired speed
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedTrips(Columns):
-    """Motion of the trips that appeared, sorted by trip and time; that of a long drive is in files.
+    """Motion of the trips that appeared, sorted by trip and time.
 
-    trip, step : (k,) int64
+    trip, step : (k,) int32
     travelled, speed : (k,) metres of the body's centre along the path, m/s
     """
 
-    trip: Ints
-    step: Ints
+    trip: NDArray[np.int32]
+    step: NDArray[np.int32]
     travelled: Float
     speed: Float
+
+    @classmethod
+    def of_rows(cls, rows: Float) -> SimulatedTrips:
+        """The motion in rows (k, 4) of trip, step, metres along the path and speed."""
+        trip, step = rows[:, :2].T.astype(np.int32)
+        return cls(trip, step, rows[:, 2].copy(), rows[:, 3].copy())
 
 
 def simulate_trips(
@@ -59,43 +83,24 @@ def simulate_trips(
 
     Trips that the ego would hit are left out.
     """
+    moved = [SimulatedTrips.of_rows(np.empty((0, 4)))]
     if not trips:
-        none = np.empty(0, np.int64)
-        return SimulatedTrips(none, none, np.empty(0), np.empty(0))
+        return moved[0]
     known = ego_motion(ego, ego_box, graph=graph)
     signals = plan.signals if obeys_signals else plan.signals._replace(window=green_windows(plan, known))
     simulation = TrafficSimulation(trips, graph, plan=plan, ego=known, signals=signals, radius=radius)
     excluded = np.zeros(len(trips), bool)
-    with closing(Log()) as log:
-        for _ in range(_ROUNDS):
-            log.clear()
-            hit_ego = np.zeros(len(trips), bool)
-            for rows, hit in simulation.windows(excluded):
-                log.add(rows)
-                hit_ego[hit] = True
-            if not hit_ego.any():
-                break
-            excluded |= hit_ego
-        return _by_trip(log, len(trips))
-
-
-def _by_trip(log: Log, count: int) -> SimulatedTrips:
-    """The rows of a log, sorted by trip and time."""
-    knots = sum((np.bincount(rows[:, 0].astype(int), minlength=count) for rows in log), np.zeros(count, int))
-    n = int(knots.sum())
-    columns = [room((n,), kind) for kind in (np.int64, np.int64, float, float)]
-    to = np.cumsum(knots) - knots
-    for rows in log:
-        trip = rows[:, 0].astype(int)
-        order = np.argsort(trip, kind="stable")
-        number = np.bincount(trip, minlength=count)
-        rank = np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)
-        place = to[trip[order]] + rank
-        for column, values in zip(columns, rows[order].T, strict=True):
-            column[place] = values
-        release(*columns)
-        to += number
-    return SimulatedTrips(*columns)
+    for _ in range(_ROUNDS):
+        del moved[1:]
+        hit_ego = np.zeros(len(trips), bool)
+        for rows, hit in simulation.windows(excluded):
+            moved.append(SimulatedTrips.of_rows(rows))
+            hit_ego[hit] = True
+        if not hit_ego.any():
+            break
+        excluded |= hit_ego
+    in_time = SimulatedTrips.concatenate(moved)
+    return in_time.take(np.argsort(in_time.trip, kind="stable"))
 
 
 def simulate_ego(
@@ -112,8 +117,7 @@ def simulate_ego(
     It follows, gives way and obeys signals and signs like the other road users, and they react to it.
     """
     steps = int(np.ceil(seconds / STEP_S)) + 1
-    motion = EgoBox(room((steps,), MOTION), np.full(2, -np.inf))
-    motion.motion[:] = 0
+    motion = EgoBox(np.zeros(steps, MOTION), np.full(2, -np.inf))
     simulation = TrafficSimulation(
         [ego, *trips], graph, plan=plan, ego=motion, signals=plan.signals, radius=radius, ego_row=0
     )
@@ -126,70 +130,200 @@ def simulate_ego(
 
 def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -> bool:
     """Whether there are signals or stop signs along the ego's path."""
-    blocks = passages(ego, ego.course, graph=graph, plan=plan, routes={})
+    blocks = passages(ego, graph, plan=plan, routes={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 
 
-def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> EgoBox:
-    """The ego's motion and the area that others keep free of; ``box`` as in `simulate_trips`."""
-    length, width, ahead = box
-    steps = int(ego.duration_ns * 1e-9 / STEP_S) + 2
-    time = np.round(np.arange(steps) * STEP_S * 1e9).astype(np.int64)
-    level_of = _Levels(graph)
-    motion, level = np.empty(steps, MOTION), np.empty(steps, np.int64)
-    for rows, part in ego.windows(time, margin=2):
-        poses = part.at(time[rows])
-        forward = poses.rotation[:, :, 0]
-        middle = poses.position + poses.scale * forward * ahead
-        heading = np.arctan2(forward[:, 1], forward[:, 0])
-        speed = np.interp(time[rows], part.time_ns, np.hypot(*part.velocity[:, :2].T))
-        motion[rows] = records(MOTION, x=middle[:, 0], y=middle[:, 1], heading=heading, speed=speed)
-        level[rows] = level_of(middle)
-    grown = np.column_stack(
-        [length / 2 + _KEEP[0] + motion["speed"] * STEP_S / 2, np.full(steps, width / 2 + _KEEP[1])]
-    )
-    return EgoBox(motion, np.array([length / 2 + 0.2, width / 2 + 0.1]), grown, level)
+@dataclass(frozen=True, slots=True)
+class _Tables:
+    """Rows of one road user in the tables of the simulation.
+
+    station : `STATION`, of its whole path
+    level   : (n,) 1 at stations on bridges and in tunnels, 0 at others
+    scale   : scene metres per true metre
+    block   : columns of `BLOCK`, of its whole path
+    sweep   : the cells that it can come to or leave in a window
+    """
+
+    station: NDArray[np.void]
+    level: Ints
+    scale: float
+    block: Float
+    sweep: SweptCells
 
 
-class _Levels:
-    """Whether points are on bridges or in tunnels: by the edge of a graph nearest in height."""
+class TrafficSimulation:
+    """A simulation of trips around the ego vehicle.
 
-    def __init__(self, graph: RoadGraph) -> None:
+    trips   : in the order in which they move within a step; a simulated ego is one of them
+    ego     : the ego's motion, filled in step by step if it is simulated
+    signals : of the junctions
+    radius  : true metres from the ego beyond which road users disappear
+    ego_row : number of the ego's trip, -1 if its motion is fixed
+    """
+
+    def __init__(
+        self,
+        trips: Sequence[Trip | EgoTrip],
+        graph: RoadGraph,
+        *,
+        plan: JunctionPlan,
+        ego: EgoBox,
+        signals: Signals,
+        radius: float,
+        ego_row: int = -1,
+    ) -> None:
+        self._trips, self._graph, self._plan = trips, graph, plan
+        self._ego, self._signals, self._radius, self._ego_row = ego, signals, radius, ego_row
         self._covered = graph.bridge | graph.tunnel
-        if self._covered.any():
-            self._lines = edge_lines(graph)
-            self._tree = shapely.STRtree(self._lines)
-            self._solid = np.array([shapely.linestrings(line) for line in graph.geometry], object)
+        self._alone = len(trips) == 1 and ego_row >= 0  # nobody takes its ground
+        self._routes: dict[tuple[int, ...], int] = {}
+        self._appear = np.array([int(trip.appear_s / STEP_S) for trip in trips], np.int64)
 
-    def __call__(self, xyz: Float) -> Ints:
-        """1 for points (n, 3) on bridges and in tunnels, 0 for others."""
-        out = np.zeros(len(xyz), np.int64)
-        if not self._covered.any():
-            return out
-        for rows in row_blocks(len(xyz), _POINTS):
-            points = shapely.points(xyz[rows, :2])
-            row, edge = self._tree.query(points, predicate="dwithin", distance=_NEAR)
-            share = shapely.line_locate_point(self._lines[edge], points[row], normalized=True)
-            z = shapely.get_z(shapely.line_interpolate_point(self._solid[edge], share, normalized=True))
-            order = np.argsort(-np.abs(z - xyz[rows][row, 2]), kind="stable")
-            out[rows.start + row[order]] = self._covered[edge[order]]
-        return out
+    def windows(self, excluded: NDArray[np.bool_]) -> Iterator[tuple[Float, Ints]]:
+        """Rows (k, 4) of trip, step, metres along the path and speed, and trips that hit the ego, in time.
 
-
-def green_windows(plan: JunctionPlan, ego: EgoBox) -> Float:
-    """Windows (w, 4) in which signals are green for the ego: from 8 s before it reaches a junction."""
-    zone = zone_at(plan.zones, np.column_stack([ego.motion["x"], ego.motion["y"]]))
-    rows = []
-    cuts = np.flatnonzero(np.diff(np.concatenate([[-2], zone, [-2]])))
-    for a, b in itertools.pairwise(cuts.tolist()):
-        z = int(zone[a])
-        if z >= 0 and plan.signalised[z]:
-            rows.append(
-                (
-                    z,
-                    signal_group(plan, z, heading=float(ego.motion["heading"][a])),
-                    a * STEP_S - 8.0,
-                    b * STEP_S,
-                )
+        excluded : (n,) trips to leave out
+        """
+        coming = np.argsort(self._appear, kind="stable")
+        coming = coming[~excluded[coming]]
+        begins = np.searchsorted(self._appear[coming], np.arange(0, len(self._ego.motion), _STEPS))
+        begins = np.append(begins, np.searchsorted(self._appear[coming], len(self._ego.motion)))
+        here, state = np.empty(0, np.int64), np.zeros(0, STATE)
+        tables: dict[int, _Tables] = {}
+        carried = np.empty(0, np.int64), make_unreserved(0)
+        for window, first in enumerate(range(0, len(self._ego.motion), _STEPS)):
+            last = min(first + _STEPS, len(self._ego.motion))
+            rows = np.sort(np.append(here, coming[begins[window] : begins[window + 1]]))
+            known = self._ego.known(first, last + _HORIZON)
+            old, state = state, np.zeros(len(rows), STATE)
+            state["station"] = -1
+            state[np.searchsorted(rows, here)] = old
+            tables = {
+                row: self._around(row, tables.get(row) or self._tables(row), state=state[k : k + 1])
+                for k, row in enumerate(rows.tolist())
+            }
+            movers, known, used = self._numbered(rows, list(tables.values()), known=known)
+            reservations = _renumber(carried, rows, used=used)
+            start = movers.user[:-1]
+            _shift(state, start, sign=1)
+            log, hit = simulate_steps(
+                movers,
+                known,
+                signals=self._signals,
+                reservations=reservations,
+                state=state,
+                steps=(first, last),
+                dt=STEP_S,
+                horizon=_HORIZON,
+                radius=self._radius + LEFT,
+                ego_row=self._ego_row,
             )
-    return np.array(rows, float).reshape(-1, 4)
+            _shift(state, start, sign=-1)
+            log[:, 0] = rows[log[:, 0].astype(np.int64)]
+            yield log, rows[hit]
+            carried = _reserve(reservations, rows, used=used, after_s=last * STEP_S)
+            stay = ~state["departed"] | (rows == self._ego_row)
+            here, state = rows[stay], state[stay]
+
+    def _tables(self, row: int) -> _Tables:
+        """The tables of a trip."""
+        trip = self._trips[row]
+        path, desired_speed = trip.course.path, trip.course.desired_speed
+        xy, heading = trip.body()
+        station = records(STATION, desired_speed=desired_speed, x=xy[:, 0], y=xy[:, 1], heading=heading)
+        block = passages(trip, self._graph, plan=self._plan, routes=self._routes)
+        level = np.where(path.edge >= 0, self._covered[path.edge], False).astype(np.int64)
+        return _Tables(station, level, path.scale, block, SweptCells.empty())
+
+    def _around(self, row: int, tables: _Tables, *, state: NDArray[np.void]) -> _Tables:
+        """The tables of a trip with its cells in the next window; its ``state`` (1,) is made to fit them."""
+        if self._alone:
+            return tables
+        trip, own = self._trips[row], state[0]
+        at = int(own["s"] / STEP) if own["active"] else trip.begin
+        speed = _FASTER * float(tables.station["desired_speed"].max())
+        brake = min(trip.driver.deceleration, trip.driver.hard)
+        ahead = (max(LOOK_AHEAD[0] + LOOK_AHEAD[1] * speed, speed**2 / brake + 2 * speed) + 20.0) / STEP
+        to = max(at + speed * _STEPS * STEP_S / STEP, float(own["station"])) + ahead
+        first, last, stop = tables.block[:, :3].T
+        to = max(to, float(last[(stop <= to) & (last >= at)].max(initial=0)) + ahead)
+        passing = float(first[own["block"]]) if own["granted"] else at
+        begin = max(int(min(at, passing) - 2 * (trip.length + trip.width) / STEP) - 4, 0)
+        part = slice(begin, int(min(to, len(tables.station))))
+        xy = np.column_stack([tables.station[c][part] for c in "xy"])
+        heading = tables.station["heading"][part].copy()  # the type that is compiled
+        swept = sweep(
+            xy,
+            heading,
+            length=trip.length,
+            width=trip.width,
+            level=tables.level[part],
+            scale=tables.scale,
+        )
+        first_station = np.int32(begin)
+        swept = replace(swept, first=swept.first + first_station, last=swept.last + first_station)
+        state["ahead"] = np.searchsorted(swept.first, at, side="right")
+        state["reserved"] = np.searchsorted(swept.first, own["station"], side="right")
+        state["released"] = np.searchsorted(swept.last[swept.leave], at)
+        return replace(tables, sweep=swept)
+
+    def _numbered(
+        self, rows: Ints, tables: Sequence[_Tables], *, known: EgoMotion
+    ) -> tuple[Movers, EgoMotion, Ints]:
+        """The tables of road users with cells numbered from 0, and the numbered cells."""
+        trips = [self._trips[row] for row in rows.tolist()]
+        columns = SweptCells.concatenate([SweptCells.empty(), *(part.sweep for part in tables)])
+        used, number = np.unique(np.concatenate([columns.cell, known.event_cell]), return_inverse=True)
+        mine, its = np.split(number.astype(np.int32), [len(columns)])
+        counted = {"station_start": "station", "cell_start": "sweep", "block_start": "block"}
+        starts = {
+            name: np.cumsum([0, *(len(getattr(part, column)) for part in tables)])
+            for name, column in counted.items()
+        }
+        drivers = ("headway", "acceleration", "deceleration", "hard", "gap")
+        user = {name: [getattr(t.driver, name) for t in trips] for name in drivers}
+        user |= {name: [getattr(t, name) for t in trips] for name in ("length", "width", "begin", "leaves")}
+        user["appear"] = self._appear[rows].tolist()
+        user["whole_block"] = [t.on_foot for t in trips]
+        end = {name: [*values, 0] for name, values in user.items()}
+        block = np.concatenate([np.empty((0, 8)), *(part.block for part in tables)])
+        station = [part.station for part in tables] or [np.empty(0, STATION)]
+        movers = Movers(
+            records(USER, **starts, **end),
+            station[0] if len(station) == 1 else np.concatenate(station),
+            records(CELL, number=mine, first=columns.first, last=columns.last, leave=columns.leave),
+            records(BLOCK, **dict(zip(BLOCK.names or (), block.T, strict=True))),
+        )
+        return movers, known._replace(event_cell=its), used
+
+
+def _shift(state: NDArray[np.void], start: NDArray[np.void], *, sign: int) -> None:
+    """Make rows in states count from the starts of all tables (1), or of each road user's (-1)."""
+    for name in ("ahead", "reserved", "released"):
+        state[name] += sign * start["cell_start"]
+    state["block"] += sign * start["block_start"]
+
+
+def _reserve(
+    reservations: NDArray[np.void], rows: Ints, *, used: Ints, after_s: float
+) -> tuple[Ints, NDArray[np.void]]:
+    """Cells that are reserved after a time, and their reservations, with the numbers of trips as owners."""
+    taken = (reservations["owner"] != NOBODY) | (reservations["holds"] > 0)
+    kept = np.flatnonzero(taken | (reservations["until"] > after_s - 1.0))
+    out = reservations[kept]
+    owned = out["owner"] != NOBODY
+    out["owner"][owned] = rows[out["owner"][owned]]
+    return used[kept], out
+
+
+def _renumber(carried: tuple[Ints, NDArray[np.void]], rows: Ints, *, used: Ints) -> NDArray[np.void]:
+    """Reservations of the cells of a window: those carried over from the last one, and none of others."""
+    cells, kept = carried
+    out = make_unreserved(len(used))
+    place = np.searchsorted(used, cells)
+    found = used[np.minimum(place, len(used) - 1)] == cells if len(used) else np.zeros(len(cells), bool)
+    owned = kept["owner"] != NOBODY
+    kept["owner"][owned] = np.searchsorted(rows, kept["owner"][owned])
+    out[place[found]] = kept[found]
+    return out

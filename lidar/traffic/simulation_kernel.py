@@ -18,7 +18,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float, Ints
@@ -124,6 +124,14 @@ block, granted     : next passage through a junction, and whether it may be ente
 rested             : steps at rest at the stop sign of the next passage
 still, waits_for   : steps at rest, and the road user that is in its way, `NOBODY` for none
 """
+
+
+def records(dtype: np.dtype[np.void], **columns: ArrayLike) -> NDArray[np.void]:
+    """A table of records from its columns."""
+    table = np.empty(np.size(next(iter(columns.values()))), dtype)
+    for name, values in columns.items():
+        table[name] = values
+    return table
 
 
 class Movers(NamedTuple):

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.scene import Scene
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.traffic.lanes import STEP
 from lidar.traffic.simulation import SimulatedTrips
 from lidar.traffic.simulation_kernel import STEP_S
@@ -82,13 +81,11 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
     Streets may lead beyond the bounds of a map, where there is no ground. A road user that comes back is
     another actor.
     """
-    n = len(flow.trip)
-    counts = sum(
-        (np.bincount(flow.trip[rows], minlength=len(trips)) for rows in row_blocks(n, BLOCK_POSES)),
-        np.zeros(len(trips), np.int64),
-    )
+    n, counts = len(flow), np.bincount(flow.trip, minlength=len(trips))
     present, first = np.flatnonzero(counts), np.cumsum(counts) - counts
-    knots, inside = _room_for(n), np.empty(n, bool)
+    position, angles, velocity = np.empty((3, n, 3))
+    knots = Knots(np.empty(n, np.int64), position, angles, velocity, np.empty(n))
+    inside = np.empty(n, bool)
     for some in _together(present, trips, counts=counts):  # in order of time: they are near each other
         rows = np.concatenate([np.arange(first[row], first[row] + counts[row]) for row in some])
         tracks = _tracks([trips[row] for row in some], flow.take(rows), counts=counts[some])
@@ -99,7 +96,6 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
             [np.hypot(trips[row].length, trips[row].width) / 2 * scale for row in some], counts[some]
         )
         inside[rows] = _inside(scene, part.position, half=half)
-        release(*knots.columns().values(), *flow.columns().values())
     trip, counts = present, counts[present]
     if not inside.all():
         knots, trip, counts = _parts_inside(knots, inside, trip=present, counts=counts)
@@ -111,11 +107,6 @@ def moving_actors(trips: Sequence[Trip], flow: SimulatedTrips, *, scene: Scene, 
         parked=False,
         scale=scale,
     )
-
-
-def _room_for(n: int) -> Knots:
-    """Room for ``n`` knots."""
-    return Knots(room((n,), np.int64), room((n, 3)), room((n, 3)), room((n, 3)), room((n,)))
 
 
 def _inside(scene: Scene, position: Float, *, half: Float) -> NDArray[np.bool_]:
@@ -133,13 +124,7 @@ def _parts_inside(
     starts = np.flatnonzero(np.diff(of, prepend=-2))
     sizes = np.diff(starts, append=len(of))
     part = (of[starts] >= 0) & (sizes > 1)
-    kept = np.flatnonzero(np.repeat(part, sizes))
-    out = _room_for(len(kept))
-    for rows in row_blocks(len(kept), BLOCK_POSES):
-        for name, column in out.columns().items():
-            column[rows] = getattr(knots, name)[kept[rows]]
-        release(*out.columns().values(), *knots.columns().values())
-    return out, of[starts[part]], sizes[part]
+    return knots.take(np.repeat(part, sizes)), of[starts[part]], sizes[part]
 
 
 def _together(rows: Ints, trips: Sequence[Trip], *, counts: Ints) -> Iterator[list[int]]:
@@ -157,9 +142,9 @@ def _tracks(trips: Sequence[Trip], flow: SimulatedTrips, *, counts: Ints) -> Roa
     n = len(flow.trip)
     middle, yaw, hint = np.empty((n, 2)), np.empty(n), np.empty(n)
     for k, trip in enumerate(trips):
-        part, path = slice(ends[k], ends[k + 1]), trip.draw().path
+        part, path = slice(ends[k], ends[k + 1]), trip.course.path
         at = flow.travelled[part] / STEP
-        xy, heading = trip.body(path)
+        xy, heading = trip.body()
         stations = np.arange(len(xy))
         middle[part] = np.stack([np.interp(at, stations, xy[:, c]) for c in (0, 1)], axis=1)
         yaw[part] = np.interp(at, stations, heading)
@@ -204,7 +189,7 @@ class RoadUserTracks:
     shapes: Sequence[ActorShape]
     stretch: Sequence[tuple[float, float, float]]
     knots: NDArray[np.int64]
-    step: NDArray[np.int64]
+    step: NDArray[np.integer]
     middle: Float
     yaw: Float
     hint: Float

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,8 +17,6 @@ from lidar.traffic.surroundings import TrafficArea, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, ActorShape, catalogue
 
-_STATIONS = 1 << 19
-"""Stations of courses that are kept in memory: 40 MB."""
 _TRIES = 5  # paths tried for a vehicle until one stays on the carriageway
 _MIN_STATIONS = 40  # of a path
 _MAX_LENGTH = 3000.0  # metres of a path
@@ -107,31 +105,13 @@ class TripCourse:
     crossing: Sequence[tuple[int, int, int]] = ()
 
 
-class Drawings:
-    """Courses and the functions that draw them; those drawn last are kept, up to `_STATIONS` in total."""
-
-    def __init__(self) -> None:
-        self._kept: dict[Callable[[], TripCourse], TripCourse] = {}
-        self._stations = 0
-
-    def of(self, draw: Callable[[], TripCourse]) -> TripCourse:
-        """The course that a function draws, the same at each call."""
-        course = self._kept.get(draw)
-        if course is None:
-            course = self._kept[draw] = draw()
-            self._stations += len(course.path)
-            while self._stations > _STATIONS and len(self._kept) > 1:
-                self._stations -= len(self._kept.pop(next(iter(self._kept))).path)
-        return course
-
-
 @dataclass(frozen=True, slots=True)
 class Trip:
-    """One simulated road user. Its course is drawn when it is needed: those of a long drive fill memory.
+    """One simulated road user.
 
     shape    : body
     stretch  : scale factors of the body along x, y and z
-    draw     : returns its course, the same at each call
+    course   : its path and desired speed
     driver   : driver model
     begin    : station of the start
     appear_s : seconds after the drive's start at which it appears
@@ -141,7 +121,7 @@ class Trip:
 
     shape: ActorShape
     stretch: tuple[float, float, float]
-    draw: Callable[[], TripCourse]
+    course: TripCourse
     driver: Driver
     begin: int
     appear_s: float
@@ -163,9 +143,9 @@ class Trip:
         """Wheelbase in metres: both axles stay on the path."""
         return self.shape.base * self.stretch[0]
 
-    def body(self, path: ActorPath) -> tuple[Float, Float]:
+    def body(self) -> tuple[Float, Float]:
         """Centre (n, 2) in scene metres and heading (n,) in radians of the body at each station."""
-        return body_poses(path, self.axle)
+        return body_poses(self.course.path, self.axle)
 
 
 def vehicle_trips(
@@ -191,7 +171,7 @@ def vehicle_trips(
     used = np.flatnonzero(metres)
     metres, name = metres[used], "+".join(shares)
     trips: list[Trip | None] = []
-    make = partial(_trip, lanes, area, drawings=Drawings(), shares=shares, ground=ground, road=road)
+    make = partial(_trip, lanes, area, shares=shares, ground=ground, road=road)
     for number in range(round(density * float(metres.sum()) / 1000)):
         rng = generator(seed, "traffic", name, number)
         edge, at = int(rng.choice(used, p=metres / metres.sum())), rng.random()
@@ -217,7 +197,6 @@ def _trip(
     lanes: Lanes,
     area: TrafficArea,
     *,
-    drawings: Drawings,
     rng: np.random.Generator,
     shares: dict[str, float],
     place: tuple[int, float],
@@ -247,17 +226,15 @@ def _trip(
         edges, picked = random_lanes(
             lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width
         )
-        drawn = partial(
-            path_along_lanes,
+        whole = path_along_lanes(
             lanes,
-            np.array(edges, np.int32),  # many trips are kept: a list takes nine times the memory
+            np.array(edges, np.int32),
             picked=np.array(picked, np.int8),
             width=width,
             radius=driver.min_radius,
             scale=area.scale,
             keeps_kerb=driver.keeps_kerb,
         )
-        whole = drawn()
         begin = int(at * float(lanes.graph.length[edge]) / STEP)
         first, last = _stations_on_carriageway(whole, shape, grow=grow, ground=ground, begin=begin)
         complete = len(whole) - last <= shape.length / STEP + 4
@@ -265,16 +242,10 @@ def _trip(
             continue
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        course = partial(_course, drawn, slice(first, last), driver=driver, pace=pace)
-        draw = partial(drawings.of, course)
-        return Trip(shape, grow, draw, driver, begin - first, span[0], leaves)
+        path = whole.take(np.arange(first, last))
+        course = TripCourse(path, speed_profile(path, driver, pace=pace))
+        return Trip(shape, grow, course, driver, begin - first, span[0], leaves)
     return None
-
-
-def _course(whole: Callable[[], ActorPath], stations: slice, *, driver: Driver, pace: float) -> TripCourse:
-    """The course along some stations of a path."""
-    path = whole().take(stations)
-    return TripCourse(path, speed_profile(path, driver, pace=pace))
 
 
 def random_shape(kind: str, rng: np.random.Generator) -> ActorShape:

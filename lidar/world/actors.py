@@ -11,10 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
-from geoscene.support.columns import Columns, row_blocks
+from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.geometry.poses import BLOCK_POSES, release, room
 from lidar.world.actor_shapes import ActorShape
 
 Region = tuple[float, float, float, float]
@@ -37,7 +36,7 @@ class Actors(Columns):
     begin_ns, end_ns : (n,) int64, times of its first and last knot; a parked one is always there
     first   : (n + 1,) int64 rows of the knots below
 
-    Knots of each actor, times ascending, for a long drive in files (see `lidar.geometry.poses.room`):
+    Knots of each actor, times ascending:
 
     time_ns  : (k,) int64, nanoseconds since the drive's start
     position : (k, 3) scene metres, centre of the bounding box, on the ground
@@ -66,10 +65,6 @@ class Actors(Columns):
     velocity: Float
     travelled: Float
     scale: float
-
-    def release(self) -> None:
-        """Let go of the memory of knots in files; they are read again when needed."""
-        release(*(getattr(self, name) for name in KNOTS))
 
 
 KNOTS = ("time_ns", "position", "angles", "velocity", "travelled")
@@ -223,34 +218,19 @@ def join_actors(groups: Sequence[Actors], *, first_feature: int) -> Actors:
         ]
     )
     knots = np.concatenate([np.diff(g.first) for g in groups])
-    each = {
+    columns = {
         name: np.concatenate([getattr(g, name) for g in groups])
         for name in groups[0].columns()
-        if name not in (*KNOTS, "shape", "feature", "first")
+        if name not in ("shape", "feature", "first")
     }
-    every = {name: _end_to_end([getattr(g, name) for g in groups]) for name in KNOTS}
     return Actors(
         shapes=tuple(shapes.values()),
         shape=shape,
         feature=(first_feature + np.arange(len(shape))).astype(np.int32),
         first=np.concatenate([[0], np.cumsum(knots)]).astype(np.int64),
         scale=groups[0].scale,
-        **each,
-        **every,
+        **columns,
     )
-
-
-def _end_to_end(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Arrays end to end, block by block where they are in files."""
-    count = sum(map(len, parts))
-    out = room((count, *parts[0].shape[1:]), parts[0].dtype)
-    to = 0
-    for part in parts:
-        for rows in row_blocks(len(part), BLOCK_POSES):
-            out[to + rows.start : to + rows.stop] = part[rows]
-            release(out, part)
-        to += len(part)
-    return out
 
 
 def first_feature(scene: Scene) -> int:

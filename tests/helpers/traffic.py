@@ -24,7 +24,7 @@ def tracks(trips, flow):
     out = np.full((int(flow.step.max()) + 1, len(trips), 3), np.nan)
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        xy, heading = trips[k].body(trips[k].draw().path)
+        xy, heading = trips[k].body()
         at = flow.travelled[rows] / STEP
         for c, column in enumerate((*xy.T, heading)):
             out[flow.step[rows], k, c] = np.interp(at, np.arange(len(xy)), column)
@@ -40,5 +40,5 @@ def boxes_at(trips, poses):
 
 def with_speed(trip, desired_speed):
     """A trip with another desired speed (n,) at its stations."""
-    course = replace(trip.draw(), desired_speed=desired_speed)
-    return replace(trip, draw=lambda: course)
+    course = replace(trip.course, desired_speed=desired_speed)
+    return replace(trip, course=course)

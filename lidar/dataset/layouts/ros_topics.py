@@ -19,7 +19,6 @@ from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds, labelled_formats, mount_of
 from lidar.geometry.attitude import body_rates, matrix_from_quat, quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, OPTICAL_QUAT
-from lidar.geometry.poses import Trajectory
 from lidar.sensors.navigation.measurements import Fixes, fix_variances
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.patterns.scanner2d import Scan2d
@@ -66,39 +65,31 @@ def _mounts(drive: RosDrive) -> Any:
     return ros.transforms(rows, drive.stamp(0))
 
 
-def _windows(drive: RosDrive) -> Iterator[tuple[Trajectory, range]]:
-    """Parts of the trajectory, with the rows that are not of the part before or after."""
-    trajectory = drive.trajectory
-    for window, part in trajectory.windows(trajectory.time_ns, margin=1):
-        first = int(np.searchsorted(part.time_ns, trajectory.time_ns[window.start]))
-        yield part, range(first, first + window.stop - window.start)
-
-
 def _poses(drive: RosDrive) -> Iterator[Message]:
-    for part, rows in _windows(drive):
-        place, quat, times = part.position / drive.scale, part.quat_xyzw, part.time_ns.tolist()
-        for k in rows:
-            row = (MAP, BASE, place[k], quat[k])
-            yield times[k], functools.partial(ros.transforms, [row], drive.stamp(times[k]))
+    trajectory = drive.trajectory
+    place, quat = trajectory.position / drive.scale, trajectory.quat_xyzw
+    for k, time_ns in enumerate(trajectory.time_ns.tolist()):
+        row = (MAP, BASE, place[k], quat[k])
+        yield time_ns, functools.partial(ros.transforms, [row], drive.stamp(time_ns))
 
 
 def _odometry(drive: RosDrive) -> Iterator[Message]:
-    for part, rows in _windows(drive):
-        place, quat, times = part.position / drive.scale, part.quat_xyzw, part.time_ns.tolist()
-        velocity = np.einsum("nji,nj->ni", matrix_from_quat(quat), part.velocity)
-        rates = body_rates(part.time_ns * 1e-9, quat)
-        for k in rows:
-            make = functools.partial(
-                ros.odometry,
-                place[k],
-                quat[k],
-                stamp_ns=drive.stamp(times[k]),
-                frame_id=MAP,
-                child=BASE,
-                velocity=velocity[k],
-                rates=rates[k],
-            )
-            yield times[k], make
+    trajectory = drive.trajectory
+    place, quat = trajectory.position / drive.scale, trajectory.quat_xyzw
+    velocity = np.einsum("nji,nj->ni", matrix_from_quat(quat), trajectory.velocity)
+    rates = body_rates(trajectory.time_ns * 1e-9, quat)
+    for k, time_ns in enumerate(trajectory.time_ns.tolist()):
+        make = functools.partial(
+            ros.odometry,
+            place[k],
+            quat[k],
+            stamp_ns=drive.stamp(time_ns),
+            frame_id=MAP,
+            child=BASE,
+            velocity=velocity[k],
+            rates=rates[k],
+        )
+        yield time_ns, make
 
 
 def _imu(drive: RosDrive, name: str) -> list[Topic]:

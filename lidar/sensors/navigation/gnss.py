@@ -30,7 +30,6 @@ from lidar.sensors.rig.specs import GnssSpec
 
 MULTIPATH_TAU_S = 60.0
 """Correlation time of the multipath error m, seconds."""
-_AROUND = 4  # poses around a time that its differences depend on
 SETTLE_S = 3.0
 """Seconds for which a better state must be possible before the receiver reports it."""
 _LADDER = {  # by mode, best first: state, minimum satellites (of one system), maximum PDOP
@@ -53,16 +52,6 @@ def antenna_motion(
     trajectory: Trajectory, frame: Frame, *, spec: GnssSpec, time_ns: NDArray[np.int64]
 ) -> tuple[Float, Float]:
     """Position (n, 3) in scene metres and velocity (n, 3) in m/s true east, north, up of the antenna."""
-    position, velocity = np.empty((len(time_ns), 3)), np.empty((len(time_ns), 3))
-    for rows, part in trajectory.windows(time_ns, margin=_AROUND):
-        position[rows], velocity[rows] = _antenna_motion(part, frame, spec=spec, time_ns=time_ns[rows])
-    return position, velocity
-
-
-def _antenna_motion(
-    trajectory: Trajectory, frame: Frame, *, spec: GnssSpec, time_ns: NDArray[np.int64]
-) -> tuple[Float, Float]:
-    """Columns of `antenna_motion` from the part of the trajectory around some times."""
     poses = trajectory.at(time_ns)
     arm = np.asarray(spec.mount.translation, float)
     position = poses.mounted(arm, np.eye(3)).position

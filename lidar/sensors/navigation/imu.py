@@ -20,7 +20,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.support.csv_tables import table_blocks
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
-from lidar.geometry.poses import Trajectory, release, room
+from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.navigation.measurements import Inertial
 from lidar.sensors.navigation.satellite_visibility import E2, A
@@ -28,8 +28,6 @@ from lidar.sensors.rig.specs import ImuSpec
 
 _FLICKER_TIMES = 0.1 * np.exp(np.arange(12))
 """Correlation times in seconds of the processes that add up to flicker noise: 0.1 s to 100 minutes."""
-
-_AROUND = 4  # poses around a time that its differences depend on
 
 EARTH_RATE = 7.292115e-5
 """Angular rate of the Earth, rad/s (WGS 84)."""
@@ -50,9 +48,8 @@ def true_inertial(
 
     Central differences of the trajectory's attitudes and of the unit's velocity, interpolated linearly.
     """
-    rate, force = np.empty((len(time_ns), 3)), np.empty((len(time_ns), 3))
-    for rows, *signals in _true_blocks(trajectory, frame, spec=spec, time_ns=time_ns):
-        rate[rows], force[rows] = signals
+    blocks = [*_true_blocks(trajectory, frame, spec=spec, time_ns=time_ns)]
+    rate, force = (np.concatenate([np.empty((0, 3)), *(block[k] for block in blocks)]) for k in (1, 2))
     return rate, force
 
 
@@ -61,16 +58,14 @@ def _true_blocks(
 ) -> Iterator[tuple[slice, Float, Float]]:
     """Rows of times, and `true_inertial` of these, in order: blocks for tables."""
     own = spec.mount.rotation
-    for window, part in trajectory.windows(time_ns, margin=_AROUND):
-        seconds = part.time_ns * 1e-9
-        signals = _at_poses(part, frame, spec=spec)
-        for block in table_blocks(window.stop - window.start):
-            rows = slice(window.start + block.start, window.start + block.stop)
-            at = time_ns[rows] * 1e-9
-            rate, force = (
-                np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in signals
-            )
-            yield rows, rate, force
+    seconds = trajectory.time_ns * 1e-9
+    signals = _at_poses(trajectory, frame, spec=spec)
+    for rows in table_blocks(len(time_ns)):
+        at = time_ns[rows] * 1e-9
+        rate, force = (
+            np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in signals
+        )
+        yield rows, rate, force
 
 
 def _at_poses(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec) -> tuple[Float, Float]:
@@ -114,24 +109,16 @@ def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: in
     """
     time_ns = _times(trajectory, spec)
     noise = _Noise(spec, seed)
-    if not len(time_ns):
-        yield Inertial(time_ns, *(np.empty((0, 3)) for _ in range(4)))
     for rows, rate, force in _true_blocks(trajectory, frame, spec=spec, time_ns=time_ns):
         errors = noise.following(len(rate))
-        yield Inertial(time_ns[rows].copy(), rate + errors[:, :3], force + errors[:, 3:], rate, force)
-        release(time_ns)
+        yield Inertial(time_ns[rows], rate + errors[:, :3], force + errors[:, 3:], rate, force)
 
 
 def _times(trajectory: Trajectory, spec: ImuSpec) -> NDArray[np.int64]:
     """Times (n,) of a unit's measurements along a drive."""
     step = 1e9 / spec.rate_hz
     count = int(np.floor((trajectory.duration_ns - spec.time_offset_ns) / step + 1e-9)) + 1
-    out = room((max(count, 0),), np.int64)
-    for rows in table_blocks(len(out)):
-        out[rows] = np.round(np.arange(rows.start, rows.stop) * step)
-        out[rows] += spec.time_offset_ns
-        release(out)
-    return out
+    return np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
 
 
 def inertial_noise(spec: ImuSpec, count: int, *, seed: int) -> Float:

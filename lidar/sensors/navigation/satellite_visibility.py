@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.typing import Bools, Float
-from lidar.geometry.poses import release, room
 from lidar.sensors.navigation.constellations import satellite_names, satellites
 from lidar.sensors.rig.specs import SYSTEMS
 
@@ -137,7 +136,7 @@ def open_sky(
     """
     lon, lat = frame.to_geographic(antenna[:, 0], antenna[:, 1])
     names = satellite_names(systems)
-    azimuth, elevation = (room((len(antenna), len(names))) for _ in range(2))
+    azimuth, elevation = (np.empty((len(antenna), len(names))) for _ in range(2))
     above = np.empty(azimuth.shape, bool)
     for first in range(0, len(antenna), _EPOCHS):
         rows = slice(first, first + _EPOCHS)
@@ -145,7 +144,6 @@ def open_sky(
             lon[rows], lat[rows], h=antenna[rows, 2], start=start, time_ns=time_ns[rows], systems=systems
         )
         above[rows] = elevation[rows] > np.radians(mask_deg)
-        release(azimuth, elevation)
     return Sky(azimuth, elevation, above, above, np.zeros(len(antenna)), names)
 
 
@@ -187,7 +185,6 @@ def sky_view(
         dome = grid_directions(spoke[None, :], rise[None, :], convergence=convergence[rows, None])
         hit = caster.occluded(np.repeat(antenna[rows], len(ring), axis=0), dome.reshape(-1, 3))
         blocked[rows] = hit.reshape(len(rows), -1).mean(axis=1)
-        release(sky.azimuth, sky.elevation)
     return Sky(sky.azimuth, sky.elevation, visible, sky.above, blocked, sky.names)
 
 
@@ -208,7 +205,6 @@ def dilution(azimuth: Float, elevation: Float, *, used: Bools, names: NDArray[np
     for first in range(0, len(azimuth), _EPOCHS):
         rows = slice(first, first + _EPOCHS)
         out[rows] = _dilution(azimuth[rows], elevation[rows], used=used[rows], names=names)
-        release(azimuth, elevation)
     return out
 
 

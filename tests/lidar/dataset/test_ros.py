@@ -421,12 +421,6 @@ def test_altitudes_are_above_the_ellipsoid(recorded, monkeypatch, caplog):
     assert "no altitudes" in caplog.text
 
 
-def test_motion_is_the_same_in_blocks_of_a_long_drive(recorded, bags, tmp_path, monkeypatch):
-    monkeypatch.setattr("lidar.geometry.poses.BLOCK_POSES", 16)
-    EXPORTERS["mcap"].export(recorded, tmp_path / "mcap")
-    same_files(tmp_path / "mcap", bags["mcap"])
-
-
 def test_damaged_files_are_named_and_nothing_is_left(recorded, tmp_path):
     copy = tmp_path / "drive"
     shutil.copytree(recorded.path, copy)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
+from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import (
     body_rates,
     euler_from_quat,
@@ -18,6 +19,7 @@ from lidar.geometry.attitude import (
     quat_from_euler_intrinsic,
 )
 from lidar.geometry.poses import Trajectory
+from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
 from lidar.simulation.metadata import pose_columns
 
 angles = st.one_of(st.floats(-np.pi, np.pi), st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1e-9]))
@@ -112,3 +114,26 @@ def test_the_pose_table_agrees_with_the_trajectory():
     for row in range(3):
         R = rz(table["gamma"][row]) @ ry(table["beta"][row]) @ rx(table["alpha"][row])
         np.testing.assert_allclose(matrix_from_quat(quat[row]), R, atol=1e-12)
+
+
+def test_trajectories_are_read_as_they_were_written(tmp_path):
+    rng = np.random.default_rng(1)
+    quat = rng.normal(size=(9, 4))
+    quat /= np.linalg.norm(quat, axis=1)[:, None]
+    columns = rng.normal(size=(9, 3)), quat, rng.normal(size=(9, 3)), np.full(9, 0.9997)
+    whole, path = Trajectory(np.arange(9) * 10, *columns), tmp_path / "trajectory.csv"
+    write_trajectory(path, whole)
+    again = read_trajectory(path)
+    for name, column in whole.columns().items():
+        assert column.tobytes() == again.columns()[name].tobytes()
+    path.write_text(path.read_text()[:-30])
+    with pytest.raises(DatasetError):
+        read_trajectory(path)
+
+
+def test_trajectories_need_poses_at_increasing_times():
+    still, turn = np.zeros((4, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
+    for time in ([0, 2, 2, 3], [0]):
+        n = len(time)
+        with pytest.raises(InputError, match="two or more poses at increasing times"):
+            Trajectory(np.array(time), still[:n], turn[:n], still[:n], np.ones(n))

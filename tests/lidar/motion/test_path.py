@@ -333,3 +333,22 @@ def test_every_row_of_the_path_has_its_street():
     inner = np.abs(path.position[:, 0] % 80.0 - 40.0) < 39.0
     np.testing.assert_array_equal(path.edge[inner], expected[inner])
     np.testing.assert_array_equal(path.limit[inner], graph.speed[expected[inner]])
+
+
+def test_the_ground_is_loaded_in_regions_around_the_vehicle(monkeypatch):
+    graph = grid(gap=80.0)
+    route = plan_route(graph, FRAME, spec="random", options=RouteOptions(seed=3, length=600.0))
+    boxes = []
+
+    def ground(x, y, z):
+        boxes.append((np.ptp(x), np.ptp(y)))
+        return z + 0.1 * np.sin(x / 9) * np.cos(y / 7)
+
+    whole = plan_path(route, load_vehicle("car"), frame=FRAME, ground=ground)
+    boxes.clear()
+    monkeypatch.setattr("lidar.motion.path._REGION", 150.0)
+    parts = plan_path(route, load_vehicle("car"), frame=FRAME, ground=ground)
+    assert len(boxes) > 9
+    assert np.max(boxes) < 150.0 + 2 * 4.0  # and the axles beside and ahead
+    for name, column in whole.columns().items():
+        assert column.tobytes() == parts.columns()[name].tobytes()

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
-from geoscene.roadgraph.routing import turn_table
+from geoscene.roadgraph.routing import turn_table, turns_back
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
 from lidar.motion.random_route import random_edges
-from lidar.motion.route import RouteOptions, lane_route, plan_route, turns_back
+from lidar.motion.route import RouteOptions, lane_route, plan_route
 
 FRAME = Frame.at(-76.3, 36.88)
 

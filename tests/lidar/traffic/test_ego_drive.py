@@ -12,8 +12,8 @@ from lidar.motion.motion import drive_path, poses_along
 from lidar.motion.path import plan_path
 from lidar.motion.route import RouteOptions, plan_route
 from lidar.motion.speed_profile import motion_within
+from lidar.traffic.ego import ego_trip
 from lidar.traffic.ego_drive import drive_with_signals
-from lidar.traffic.ego_trip import ego_trip
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lanes_of
 from lidar.traffic.simulation import simulate_ego, simulate_trips
@@ -129,11 +129,11 @@ def test_the_ego_keeps_its_distance_from_a_slow_leader(seed):
         lanes, surroundings_of(lanes, free, radius=400.0, scale=1.0), seed=seed, density=10.0
     )
     leader, *others = [
-        with_speed(t, np.minimum(t.draw().desired_speed, 4.0)) for t in trips if t.appear_s == 0.0
+        with_speed(t, np.minimum(t.course.desired_speed, 4.0)) for t in trips if t.appear_s == 0.0
     ]
     ahead = middle_of(free, np.zeros(1))[0][0, 0] + 60.0
-    leader = replace(leader, begin=round((ahead - leader.draw().path.xyz[0, 0]) / STEP))
-    slow = [leader, *(t for t in others if t.draw().path.xyz[0, 0] + t.begin * STEP > ahead + 30.0)]
+    leader = replace(leader, begin=round((ahead - leader.course.path.xyz[0, 0]) / STEP))
+    slow = [leader, *(t for t in others if t.course.path.xyz[0, 0] + t.begin * STEP > ahead + 30.0)]
     plan = junction_plan(graph, lanes, seed=1)
     travelled = simulate_ego(ego_trip(path, CAR), slow, graph=graph, plan=plan, seconds=60.0, radius=600.0)
     motion = motion_within(
@@ -144,12 +144,12 @@ def test_the_ego_keeps_its_distance_from_a_slow_leader(seed):
     # Trips without room at the first step never appear; those that do stay to the end of the drive or street.
     for trip in np.unique(flow.trip):
         rows = flow.trip == trip
-        start, end = slow[trip].draw().path.xyz[[0, -1], 0]
+        start, end = slow[trip].course.path.xyz[[0, -1], 0]
         at_end = start + flow.travelled[rows].max() > end - 5.0
         assert at_end or flow.step[rows].max() == flow.step.max()
     check_gentle(ego)
     rows = flow.trip == 0
-    tail = leader.draw().path.xyz[0, 0] + flow.travelled[rows] - leader.length / 2
+    tail = leader.course.path.xyz[0, 0] + flow.travelled[rows] - leader.length / 2
     middle, _ = middle_of(ego, flow.step[rows] * STEP_S)
     gap = tail - middle[:, 0] - CAR.length / 2
     assert gap.min() > 1.5

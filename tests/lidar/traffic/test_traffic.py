@@ -11,18 +11,16 @@ from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar.geometry import poses
 from lidar.geometry.poses import Trajectory
 from lidar.motion.motion import drive_path
 from lidar.motion.path import plan_path
 from lidar.motion.road_conditions import DRY, ROADS
 from lidar.motion.route import RouteOptions, plan_route
-from lidar.traffic import simulation_windows
-from lidar.traffic import trips as trips_module
-from lidar.traffic.ego_trip import ego_trip
+from lidar.traffic import simulation
+from lidar.traffic.ego import ego_motion, ego_trip, green_windows
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, lane_shift, lanes_of, random_lanes
-from lidar.traffic.simulation import ego_motion, green_windows, simulate_ego, simulate_trips
+from lidar.traffic.simulation import simulate_ego, simulate_trips
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import surroundings_of
 from lidar.traffic.sweep import rectangles
@@ -102,7 +100,7 @@ def test_reckless_drivers_do_not_collide():
     trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
     wild = [
         replace(
-            with_speed(t, 0 * t.draw().desired_speed + 16.0),
+            with_speed(t, 0 * t.course.desired_speed + 16.0),
             driver=replace(t.driver, headway=0.0, gap=0.0, deceleration=50.0, acceleration=4.0),
         )
         for t in trips
@@ -122,17 +120,16 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
     ego = driving(graph, seed, 90.0)
     route = plan_route(graph, Plane(), spec="random", options=RouteOptions(seed=seed, duration=90.0))
     own = ego_trip(plan_path(route, CAR, frame=Plane()), CAR)
-    numbered = simulation_windows.TrafficSimulation._numbered
+    numbered = simulation.TrafficSimulation._numbered
 
     def counted(self, rows, tables, *, known):
         most.append(len(rows))
         return numbered(self, rows, tables, known=known)
 
-    monkeypatch.setattr(simulation_windows.TrafficSimulation, "_numbered", counted)
+    monkeypatch.setattr(simulation.TrafficSimulation, "_numbered", counted)
     found = []
     for window in (10_000, steps):
-        monkeypatch.setattr(simulation_windows, "_STEPS", window)
-        monkeypatch.setattr(poses, "_IN_MEMORY", 10_000 if window == steps else 10**9)  # in files
+        monkeypatch.setattr(simulation, "_STEPS", window)
         most.clear()
         trips, flow, plan = flow_on(graph, ego, seed=seed, radius=60.0)
         far = simulate_ego(own, trips, graph=graph, plan=plan, seconds=90.0, radius=60.0)
@@ -143,18 +140,6 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     np.testing.assert_array_equal(alone, windowed)
     assert some < 0.7 * everyone
-
-
-def test_courses_are_drawn_again_when_more_were_drawn_since(monkeypatch):
-    monkeypatch.setattr(trips_module, "_STATIONS", 1000)
-    trips, _, _ = flow_on(city(signalised=False), standing((400.0, 400.0), 20.0), seed=3, radius=600.0)
-    first = [trip.draw() for trip in trips]
-    assert sum(len(course.path) for course in first) > 5000
-    assert trips[-1].draw() is first[-1]
-    again = trips[0].draw()
-    assert again is not first[0]
-    np.testing.assert_array_equal(again.path.xyz, first[0].path.xyz)
-    np.testing.assert_array_equal(again.desired_speed, first[0].desired_speed)
 
 
 def test_traffic_on_snow_is_slower_and_brakes_no_harder_than_the_grip_allows():
@@ -272,13 +257,13 @@ def test_no_road_user_enters_a_junction_on_red():
     entered = 0
     for k in np.unique(flow.trip):
         rows = flow.trip == k
-        zone = zone_at(plan.zones, trips[k].draw().path.xyz[:, :2])
+        zone = zone_at(plan.zones, trips[k].course.path.xyz[:, :2])
         station = (flow.travelled[rows] + trips[k].length / 2) / STEP
         front = np.minimum(station, len(zone) - 1).astype(int)
         here = zone[front]
         for i in np.flatnonzero((np.diff(here) != 0) & (here[1:] >= 0)):
             z = int(here[i + 1])
-            group = signal_group(plan, z, heading=float(trips[k].draw().path.heading[front[i]]))
+            group = signal_group(plan, z, heading=float(trips[k].course.path.heading[front[i]]))
             t = float(flow.step[rows][i + 1]) * STEP_S
             # green now, or it entered on green and is within amber and clearing
             lately = [is_green(z, group, t - ago, plan.signals) for ago in np.arange(0.0, AMBER, 0.5)]
@@ -308,11 +293,11 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
-            xy, heading = trip.body(trip.draw().path)
+            xy, heading = trip.body()
             assert shapely.covers(road, rectangles(xy, heading, length=trip.length, width=trip.width)).all()
-            line = shapely.LineString(graph.geometry[trip.draw().path.edge[trip.begin]][:, :2])
-            ring = shapely.LinearRing([*line.coords, trip.draw().path.xyz[trip.begin, :2]])
-            if abs(trip.draw().path.curvature[trip.begin]) < 1e-3:
+            line = shapely.LineString(graph.geometry[trip.course.path.edge[trip.begin]][:, :2])
+            ring = shapely.LinearRing([*line.coords, trip.course.path.xyz[trip.begin, :2]])
+            if abs(trip.course.path.curvature[trip.begin]) < 1e-3:
                 assert ring.is_ccw == (sign < 0)
 
 

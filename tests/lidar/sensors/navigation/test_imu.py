@@ -6,7 +6,6 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
 from geoscene.support import csv_tables
-from lidar.geometry import poses
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
@@ -183,8 +182,6 @@ def test_measurements_do_not_depend_on_the_blocks_in_which_they_are_drawn(offset
     np.testing.assert_array_equal(whole.gyro, whole.true_gyro + noise[:, :3])
     np.testing.assert_array_equal(whole.accel, whole.true_accel + noise[:, 3:])
     monkeypatch.setattr(csv_tables, "BLOCK_ROWS", 100)
-    monkeypatch.setattr(poses, "BLOCK_POSES", 257)
-    monkeypatch.setattr(poses, "_IN_MEMORY", 300)
     blocks = list(observe_imu(circling(), FRAME, spec=spec, seed=4))
     assert max(len(block) for block in blocks) <= 100
     parts = Inertial.concatenate(blocks)
