@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,10 @@ SIMULATIONS: Registry[type[TrafficOptions]] = Registry(
 
 _SUFFIXES = (".xml", ".xml.gz")
 _CHOICES = ("on", "off", "FILE.xml")
-_RUN_SUMO = (
-    "traffic sumo: run SUMO first and give its file: geoscene export SCENE --to sumo -o roads.net.xml, then"
+_REMOVED = {
+    "sumo": "run SUMO first and give its file: geoscene export SCENE --to sumo -o roads.net.xml, then"
     " sumo -n roads.net.xml -r TRIPS.rou.xml --fcd-output fcd.xml, then `traffic` fcd.xml"
-)
+}
 
 
 def read_traffic(text: str) -> TrafficOptions | TrafficFile | None:
@@ -34,8 +33,6 @@ def read_traffic(text: str) -> TrafficOptions | TrafficFile | None:
     """
     if text == "off":
         return None
-    if re.match(r"sumo\b(?!\.)", text):
-        raise InputError(_RUN_SUMO)
     items = split_items(text, SIMULATIONS, default="on")
     if len(items) != 1:
         raise InputError(f"traffic {text}: give one of {', '.join(_CHOICES)}")
@@ -43,7 +40,7 @@ def read_traffic(text: str) -> TrafficOptions | TrafficFile | None:
     if item.name.lower().endswith(_SUFFIXES):
         return _file(item)
     if item.name not in SIMULATIONS:
-        raise InputError(unknown_name("traffic", item.name, known=_CHOICES))
+        raise InputError(unknown_name("traffic", item.name, known=_CHOICES, removed=_REMOVED))
     return build(SIMULATIONS, item)
 
 
