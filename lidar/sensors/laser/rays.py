@@ -36,9 +36,14 @@ class Beam:
     turn: Float
 
     @property
+    def rays(self) -> int:
+        """Number of rays per pulse."""
+        return len(self.place)
+
+    @property
     def gap(self) -> Gap:
         """Widest gap between neighbouring rays, in the wider direction of the beam."""
-        share = widest_gap(len(self.place))
+        share = widest_gap(self.rays)
         return Gap(share * float(self.size.max()), share * float(self.spread.max()))
 
     @property
@@ -47,7 +52,7 @@ class Beam:
 
         A Gaussian profile spreads as far as a uniform one of 0.87 of its width at 1/e^2.
         """
-        share = 2.0 * float(_UNIFORM / np.sqrt(len(self.place)))
+        share = 2.0 * float(_UNIFORM / np.sqrt(self.rays))
         return share * float(self.size[1]), share * float(self.spread[1])
 
 
@@ -137,7 +142,7 @@ class MovingSensor:
         part = slice(batch * self._batch, (batch + 1) * self._batch)
         fired, beam = self._firings, self._beam
         work = self._order[part]
-        n = len(work) * len(beam.place)
+        n = len(work) * beam.rays
         out = PulseRays(self.poses, *_scratch.columns(n))
         _fill(
             fired.time_ns[part],

@@ -13,8 +13,8 @@ from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.geometry.random_streams import normal_of
 from lidar.raycast import Hits
+from lidar.sensors.laser.rays import Beam
 from lidar.sensors.physics.echoes import Echoes, depth_of, gather, insert
-from lidar.sensors.physics.footprint import Gap
 from lidar.sensors.physics.fresnel import film, glint, under_film
 from lidar.sensors.physics.reflect import (
     INCIDENCE_LAWS,
@@ -118,14 +118,13 @@ def _with_open(plain: Float, covered: Float) -> Float:
 class EchoCollector:
     """Collects the echoes of consecutive pulses, batch after batch.
 
-    rays       : rays of equal power per pulse
+    beam       : of the pulses; its rays have equal power
     separation : metres; surfaces closer than this give one echo
-    gap        : between neighbouring rays
     pulses     : number of pulses in all
     """
 
-    def __init__(self, optics: SurfaceOptics, rays: int, *, separation: float, gap: Gap, pulses: int) -> None:
-        self._optics, self._rays, self._separation, self._gap = optics, rays, separation, gap
+    def __init__(self, optics: SurfaceOptics, beam: Beam, *, separation: float, pulses: int) -> None:
+        self._optics, self._beam, self._separation, self._gap = optics, beam, separation, beam.gap
         self._columns, self._glossy, self._count = _columns(pulses), np.empty(pulses, np.bool_), 0
 
     def take(self, hits: Hits, first: int) -> NDArray[np.int32]:
@@ -140,7 +139,7 @@ class EchoCollector:
         count, found = _receive(
             (hits.range, hits.face, hits.instance, hits.cosine),
             first,
-            self._rays,
+            self._beam.rays,
             self._optics.faces,
             self._optics.tables,
             self._separation,
@@ -156,7 +155,7 @@ class EchoCollector:
                 self._optics.faces.packed[_face_row(self._optics.faces, hits, ray=ray)] & 255
                 == glossy_codes()[1]
             )
-            echoes.apparent[row[wet]] = glint(echoes.cosine[row[wet]]) / self._rays
+            echoes.apparent[row[wet]] = glint(echoes.cosine[row[wet]]) / self._beam.rays
         rays: NDArray[np.int32] = ray
         return rays
 

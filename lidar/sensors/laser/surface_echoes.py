@@ -54,8 +54,7 @@ def surface_echoes(
     batch = max(_BATCH // rays, 1)
     optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
     moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
-    gap = beam.gap
-    collector = EchoCollector(optics, rays, separation=separation, gap=gap, pulses=len(pulses))
+    collector = EchoCollector(optics, beam, separation=separation, pulses=len(pulses))
     foliage = None
     if settings.foliage:
         leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
@@ -98,7 +97,7 @@ def surface_echoes(
     echoes, surfaces = collector.echoes()
     if not len(surfaces):
         return echoes
-    return by_pulse(echoes, merge(join(surfaces, *beyond), separation, gap=gap))
+    return by_pulse(echoes, merge(join(surfaces, *beyond), separation, gap=beam.gap))
 
 
 def _beyond(

@@ -8,9 +8,9 @@ from helpers.sensor_worlds import MeshWorld, box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
+from lidar.sensors.laser.rays import beam_of
 from lidar.sensors.laser.reflection import EchoCollector, SurfaceOptics
 from lidar.sensors.laser.scan import cast, scan
-from lidar.sensors.physics.footprint import AXIS_ONLY
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.sensors.rig.specs import load_rig
@@ -276,6 +276,7 @@ def test_collected_echoes_of_wet_ground_are_those_of_single_surfaces():
     down = np.array([[0.3, 0.1, -1.0], [1.0, 0.0, -0.2], [0.9, 0.1, 0.0]])
     hits = wet.caster.cast(np.array([0.0, 0.0, 2.0]), down / np.linalg.norm(down, axis=1, keepdims=True))
     single, _ = optics.at(hits)
-    collector = EchoCollector(optics, 1, separation=0.5, gap=AXIS_ONLY, pulses=3)
+    beam = beam_of(1, divergence=(0.0, 0.0), aperture=(0.0, 0.0), turn=np.empty(0))
+    collector = EchoCollector(optics, beam, separation=0.5, pulses=3)
     collector.take(hits, 0)
     np.testing.assert_allclose(collector.echoes()[0].apparent, single.apparent, rtol=1e-12)

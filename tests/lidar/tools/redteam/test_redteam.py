@@ -71,15 +71,15 @@ def test_each_drive_has_one_without_attack(written: Callable[..., Path]) -> None
     [
         ("", "no attacks"),
         (PHANTOM + PHANTOM, "two attacks are named phantom"),
-        (PHANTOM.replace("forge", "scare"), "goal = 'scare'"),
-        (PHANTOM.replace("pla", "plaa"), "published = 'plaa'"),
-        (PHANTOM.replace("goal", "gaol"), "unknown gaol"),
+        (PHANTOM.replace("forge", "scare"), "goal 'scare' is unknown"),
+        (PHANTOM.replace("pla", "plaa"), "is pla meant"),
+        (PHANTOM.replace("goal", "gaol"), "is goal meant"),
         (PHANTOM.replace("inject:", "inyect:"), "inyect"),
         (PHANTOM.replace("shape=object", "shape=ghost"), "ghost"),
         (PHANTOM + '[defences]\nuse = ["ocklusion"]', "ocklusion"),
         (PHANTOM + "[measure]\nscore = 2", "score = 2"),
-        (PHANTOM + "[measure]\nrate = 2", "unknown rate"),
-        (PHANTOM + "[more]\na = 1", "unknown more"),
+        (PHANTOM + "[measure]\nrate = 2", "parameter 'rate' is unknown"),
+        (PHANTOM + "[more]\na = 1", "table 'more' is unknown"),
         (PHANTOM + '[measure]\ndetector = "rulez"', "give rules, learned, or the file of a model"),
         (PHANTOM + '[measure]\ndetector = ["rules", "rules"]', "give one or more that differ"),
         (PHANTOM + "[measure]\ndetector = 3", "give a name or a list of names"),
@@ -91,6 +91,13 @@ def test_a_file_with_an_error_is_refused(written: Callable[..., Path], rest: str
         read_plan(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_attacks_and_defences_may_be_tables(written: Callable[..., Path]) -> None:
+    texts = read_plan(written(PHANTOM + '[defences]\nuse = ["occlusion:core=0.7", "shadow"]'))
+    phantom = PHANTOM.replace('"inject:shape=object"', '{name = "inject", shape = "object"}')
+    tables = read_plan(written(phantom + '[defences]\nuse = [{name = "occlusion", core = 0.7}, "shadow"]'))
+    assert (tables.attacks, tables.defences) == (texts.attacks, texts.defences)
 
 
 def test_attacks_are_no_options_of_drives(written: Callable[..., Path]) -> None:
