@@ -9,22 +9,32 @@ version of numba the same; else functions are compiled on their first call.
 from __future__ import annotations
 
 import functools
+import gc
 import glob
 import hashlib
 import shutil
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from llvmlite.binding import get_host_cpu_features
-from numba.core import caching
+from llvmlite.binding import Linkage, create_new_function_pass_manager, get_host_cpu_features
+from numba.core import caching, types
 from numba.core import config as _numba_config
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from numba.core.environment import lookup_environment
 from numba.core.runtime.nrt import rtsys
+
+try:
+    import fcntl
+except ImportError:  # on Windows
+    fcntl = None  # type: ignore[assignment]
 
 config: Any = _numba_config
 _njit: Any = numba.njit  # its types lack options
@@ -39,41 +49,168 @@ LEVELS = {
 first; a processor with less gets code of its own."""
 
 
-def njit(*, cache: bool = False, **options: Any) -> Callable[[Function], Function]:
+def njit(
+    *, cache: bool = False, needs: Callable[[], object] | None = None, **options: Any
+) -> Callable[[Function], Function]:
     """`numba.njit` with the given options, for functions of this package and of `lidar`.
 
     cache : keep the machine code on disk
+    needs : is called before the function is compiled or its machine code loaded, to load a library
     """
 
     def decorated(function: Function) -> Function:
-        found = _njit(no_cfunc_wrapper=True, **options)(function)
+        found = _njit(no_cfunc_wrapper=True, pipeline_class=_Compiler, **options)(function)
         if isinstance(found, Dispatcher):  # a plain function where numba is told not to compile
             part = _Part(function, options)
             found.get_call_template, found.get_overload = part.get_call_template, part.get_overload  # type: ignore[method-assign]
             if cache:
                 found._cache = _Cache(function)  # type: ignore[attr-defined]  # noqa: SLF001
+                found.compile = functools.partial(_compile_once, found, needs)  # type: ignore[method-assign]
         return found  # type: ignore[no-any-return]
 
     return decorated
 
 
-class _Part:
-    """A function as other compiled functions call it.
+def _compile_once(function: Any, needs: Callable[[], object] | None, signature: Any) -> Any:
+    """Load or compile a function; if another process is compiling it, wait for its machine code."""
+    if needs is not None:
+        needs()
+    if is_compiled(function, signature):
+        return Dispatcher.compile(function, signature)
+    with function._cache.lock(), _without_collection():  # noqa: SLF001
+        return Dispatcher.compile(function, signature)
 
-    What Python needs to call a function, above all to take apart its arguments, is a fourth of the time to
-    compile one. Most functions are only called by others.
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """Search for no cyclic garbage: of the many objects of a compilation few are."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def is_compiled(function: Any, signature: tuple[Any, ...]) -> bool:
+    """Whether the machine code of a function for types of arguments is on disk."""
+    return bool(function._cache.has(signature, function.targetctx))  # noqa: SLF001
+
+
+class _Linked(JITCodeLibrary):
+    """Code of a function and of what it calls, optimised together, once.
+
+    numba optimises and assembles each function, and optimises it again in all that call it.
     """
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Put the variables of functions into registers, which makes all that follows faster."""
+        ll_module.data_layout = self._codegen._data_layout
+        builder = self._codegen._pass_builder()
+        passes = create_new_function_pass_manager()
+        passes.add_sroa_pass()
+        passes.add_instruction_combine_pass()
+        passes.add_simplify_cfg_pass()
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def add_linking_library(self, library: Any) -> None:
+        """Take the code of a function that is called."""
+        self._linking_libraries.append(library)
+
+    def finalize(self) -> None:
+        """Link, optimise and assemble the code, and set the constants that errors of its functions name."""
+        self._link()
+        self._optimize_final_module()
+        self._final_module.verify()
+        self._finalize_final_module()
+        for variable in self._final_module.global_variables:
+            environment = lookup_environment(variable.name)
+            if environment is not None:
+                self._codegen.set_env(variable.name, environment)
+
+    def _link(self) -> None:
+        for library in _called(self):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(_copy_module(library))
+
+
+class _Unassembled(_Linked):
+    """Code of a function that only others call: neither optimised nor assembled by itself."""
+
+    @property
+    def codegen(self) -> Any:
+        """Where the code has no address."""
+        return self
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Do nothing: callers set the constants in their copy of the code."""
+
+    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
+        """0, of no address."""
+        return 0
+
+
+def _called(library: Any) -> list[Any]:
+    """Libraries that a library calls, directly or not."""
+    found: dict[int, Any] = {}
+    todo = list(library._linking_libraries)
+    while todo:
+        one = todo.pop(0)
+        if id(one) not in found:
+            found[id(one)] = one
+            if not one._finalized:
+                todo += one._linking_libraries
+    return list(found.values())
+
+
+def _copy_module(library: Any) -> Any:
+    """A copy of a library's module to be linked into others, which drop the functions that they do not call."""
+    if library._finalized:
+        return library._get_module_for_linking().clone()
+    module = library._final_module.clone()
+    for function in module.functions:
+        if not function.is_declaration and function.linkage == Linkage.external:
+            function.linkage = "linkonce_odr"
+    return module
+
+
+class _Compiler(Compiler):
+    """numba's compiler, which leaves it to the function that is compiled to optimise those of numba that it calls."""
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile a function for the types that this was made for."""
+        codegen = self.state.targetctx.codegen()
+        self.state.library = _Linked(codegen, func.__qualname__)
+        self.state.library.enable_object_caching()
+        before, codegen._library_class = codegen._library_class, _Unassembled
+        try:
+            return super().compile_extra(func)
+        finally:
+            codegen._library_class = before
+
+
+class _Part:
+    """A function as other compiled functions call it, without what Python needs to call it."""
 
     def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
         self._function, self._options = function, options
 
     @functools.cached_property
     def _compiled(self) -> Any:
-        return _njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **self._options)(self._function)
+        wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        return _njit(**wrappers, **self._options)(self._function)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        """Types of a call, for the caller's compilation; compiles the function for them."""
-        return self._compiled.get_call_template(args, kws)
+        """Types of a call, for the caller's compilation; compiles the function for them.
+
+        Constants count as numbers: numba would compile the function for each of them.
+        """
+        return self._compiled.get_call_template(
+            tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()}
+        )
 
     def get_overload(self, sig: Any) -> Any:
         """The function for types of arguments, as `get_call_template` compiled it."""
@@ -119,6 +256,20 @@ class _Cache(caching.NullCache):
         """Keep the machine code for types of arguments."""
         self._of_function.save_overload(sig, data)  # type: ignore[no-untyped-call]
 
+    def has(self, sig: Any, target_context: Any) -> bool:
+        """Whether there is machine code for types of arguments."""
+        return self._of_function.has(sig, target_context)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the right to compile the function against other threads and processes."""
+        if fcntl is None:
+            yield
+            return
+        with self._of_function.lock_path.open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
+
 
 class _FunctionCache(caching.FunctionCache):
     """Machine code of a function on disk, which several processes may write at a time."""
@@ -127,6 +278,7 @@ class _FunctionCache(caching.FunctionCache):
         super().__init__(function)  # type: ignore[no-untyped-call]
         stamp = self._impl.locator.get_source_stamp()
         self._cache_file = _Files(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
+        self.lock_path = Path(self._cache_path, f"{self._impl.filename_base}.lock")
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The machine code for types of arguments; None if there is none.
@@ -137,6 +289,11 @@ class _FunctionCache(caching.FunctionCache):
         rtsys.initialize(target_context)
         with self._guard_against_spurious_io_errors():
             return self._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    def has(self, sig: Any, target_context: Any) -> bool:
+        """Whether there is machine code for types of arguments."""
+        key = self._index_key(sig, target_context.codegen())  # type: ignore[no-untyped-call]
+        return key in self._cache_file._load_index()  # noqa: SLF001
 
 
 class _Files(caching.IndexDataCacheFile):

@@ -37,6 +37,7 @@ from lidar.raycast.lanes import (
     sole,
     unit,
 )
+from lidar.raycast.library import library
 from lidar.raycast.memory import allocate_aligned, compile_out_of_line, float64_at, inline, int32_at, int64_at
 from lidar.raycast.packets import NUDGE, alike, first_bad, gather, trace
 from lidar.raycast.planes import (
@@ -276,7 +277,7 @@ def _again(
             _keep(target, row, prim, copy, ray, inverse, time, ids[k], columns)
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", needs=library)
 def cast(
     given: Packed,
     rays: RayColumns,
@@ -401,7 +402,7 @@ def cast_float64(
     return -1
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@njit(nogil=True, cache=True, error_model="numpy", needs=library)
 def find_occluded(given: Packed, rays: RayColumns, lo: int, hi: int, out: NDArray[np.bool_]) -> Any:
     """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
     target = unpack_target(given)

@@ -1,0 +1,193 @@
+"""Compile functions ahead of their first call, in processes of their own.
+
+``kernels.json`` of a package lists its compiled functions by use, with the types of arguments that they are
+called with: a name for numbers, a name with the dimensions and the layout for arrays (``float64 2C``), a list
+for tuples, and one under the name of the class for named tuples. Functions that it lacks are compiled on their
+first call. ``tests/kernels.py`` writes the lists.
+
+python -m geoscene.support.kernels [USE...]   compiles what both packages list, or what they list for the uses
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import files
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from numba.core import types
+from numba.np.numpy_support import from_dtype
+
+from geoscene.support.compiled import is_compiled
+from geoscene.support.processes import run_tasks
+
+PACKAGES = ("geoscene", "lidar")
+LIST = "kernels.json"
+_BESIDE = "--beside"
+"""Option of a process that another one starts: it leaves that one a core, and ends with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """A compiled function, and the types of arguments that it is called with.
+
+    name      : module and function, with dots
+    arguments : descriptions of types, as in ``kernels.json``
+    """
+
+    name: str
+    arguments: tuple[Any, ...]
+
+    @property
+    def function(self) -> Any:
+        """The function, of numba's class for compiled functions."""
+        module, _, name = self.name.rpartition(".")
+        return getattr(importlib.import_module(module), name)
+
+    @property
+    def signature(self) -> tuple[Any, ...]:
+        """Types of its arguments."""
+        return tuple(map(read_type, self.arguments))
+
+    def is_missing(self) -> bool:
+        """Whether its machine code for these types is not on disk."""
+        return not is_compiled(self.function, self.signature)
+
+    def compile(self) -> None:
+        """Compile it and keep the machine code on disk."""
+        self.function.compile(self.signature)
+
+
+def read_type(entry: Any) -> Any:
+    """The type that an entry of ``kernels.json`` describes."""
+    if isinstance(entry, list):
+        return types.BaseTuple.from_types(tuple(map(read_type, entry)))
+    if isinstance(entry, dict):
+        ((name, fields),) = entry.items()
+        return types.BaseTuple.from_types(tuple(map(read_type, fields)), pyclass=_named(name))
+    name, *shape = entry.split(" ")
+    item = from_dtype(_named(name) if ":" in name else np.dtype(name))
+    if not shape:
+        return item
+    dimensions, layout, *flags = shape
+    return types.Array(
+        item, int(dimensions), layout, readonly="readonly" in flags, aligned="unaligned" not in flags
+    )
+
+
+def describe_type(kind: Any) -> Any:
+    """The entry of ``kernels.json`` for a type; raises TypeError for types that have none."""
+    if isinstance(kind, types.BaseNamedTuple):
+        cls = kind.instance_class
+        return {f"{cls.__module__}:{cls.__name__}": [describe_type(field) for field in kind]}
+    if isinstance(kind, types.BaseTuple):
+        return [describe_type(field) for field in kind]
+    if isinstance(kind, types.Array):
+        flags = " readonly" * (not kind.mutable) + " unaligned" * (not kind.aligned)
+        return f"{_describe_item(kind.dtype)} {kind.ndim} {kind.layout}{flags}"
+    return _describe_item(kind)
+
+
+def _describe_item(kind: Any) -> str:
+    if isinstance(kind, types.Number | types.Boolean):
+        return str(kind)
+    for module in [module for name, module in sys.modules.items() if name.startswith(PACKAGES)]:
+        for name, value in vars(module).items():
+            if isinstance(value, np.dtype) and value.names and from_dtype(value) == kind:
+                return f"{module.__name__}:{name}"
+    raise TypeError(f"{kind} has no description")
+
+
+def _named(name: str) -> Any:
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def read_kernels(uses: Sequence[str] = ()) -> list[Kernel]:
+    """Kernels that the installed packages list for some uses, or for all; first those with most code."""
+    found = []
+    for package in PACKAGES:
+        if find_spec(package):
+            listed = json.loads(files(package).joinpath(LIST).read_text("utf-8"))
+            for use, entries in listed.items():
+                if not uses or use in uses:
+                    found += [Kernel(name, tuple(arguments)) for name, *arguments in entries]
+    return found
+
+
+def compile_kernels(kernels: Sequence[Kernel], *, workers: int) -> None:
+    """Compile kernels in worker processes."""
+    for _ in run_tasks(Kernel.compile, kernels, workers=workers):
+        pass
+
+
+@contextmanager
+def compile_ahead(*uses: str, quiet: bool = False) -> Iterator[None]:
+    """Compile what is missing for some uses in another process while the block runs, which ends it.
+
+    Unless quiet, a line on standard error says so, and another one how long it took. A function that the
+    block calls before is compiled by the one that comes to it first; the other one waits.
+    """
+    missing = [kernel for kernel in read_kernels(uses) if kernel.is_missing()]
+    if not missing:
+        yield
+        return
+    say = silent_line if quiet else print_line
+    say(f"compiling, once: {len(missing)} functions; what they are not needed for goes on")
+    begun = time.monotonic()
+    command = [sys.executable, "-m", __name__, _BESIDE, *uses]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+
+        def wait() -> None:
+            if process.wait() == 0:
+                say(f"compiled in {time.monotonic() - begun:.0f} s")
+
+        threading.Thread(target=wait, daemon=True).start()
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def print_line(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def silent_line(text: str) -> None:
+    """Print nothing."""
+
+
+def _end_with_parent() -> None:
+    sys.stdin.buffer.read()
+    os._exit(1)
+
+
+def main() -> None:
+    """Compile what is missing."""
+    words, cores = sys.argv[1:], os.cpu_count() or 1
+    beside = _BESIDE in words
+    missing = [kernel for kernel in read_kernels([w for w in words if w != _BESIDE]) if kernel.is_missing()]
+    if beside:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
+        cores = max(cores - 1, 1)
+    elif missing:
+        print_line(f"compiling, once: {len(missing)} functions")
+    begun = time.monotonic()
+    compile_kernels(missing, workers=cores)
+    if missing and not beside:
+        print_line(f"compiled in {time.monotonic() - begun:.0f} s")
+
+
+if __name__ == "__main__":
+    main()
