@@ -146,6 +146,7 @@ def build(
     from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
     from geoscene.scene.writer import check_target  # noqa: PLC0415
     from geoscene.support.cluster import connect  # noqa: PLC0415
+    from geoscene.support.kernels import compile_ahead  # noqa: PLC0415
     from geoscene.support.storage import publish, shown, url_of  # noqa: PLC0415
 
     started = time.perf_counter()
@@ -156,6 +157,7 @@ def build(
     if not url_of(out):
         check_target(out, overwrite=report.overwrite)
         note_new_folder(out)
+    compile_ahead("build", quiet=report.quiet)
     bar = partial(progress_bar, quiet=report.quiet)
     with (
         connect(scheduler) if scheduler else nullcontext() as cluster,

@@ -31,7 +31,15 @@ USES = {
         (*ROAD, "--traffic=on", "-o=full"),
         (*ROAD, "--weather=rain=10mm/h", "--road=by-weather", "-o=rain"),
         (*ROAD, "--rig=vlp16", "--fidelity=survey", "--weather=fog=80m", "-o=fog"),
-        (*DRIVE, "--rig=drone", "--survey=all", "--altitude=80", "--turns", "--weather=snow=2mm/h", "-o=snow"),
+        (
+            *DRIVE,
+            "--rig=drone",
+            "--survey=all",
+            "--altitude=80",
+            "--turns",
+            "--weather=snow=2mm/h",
+            "-o=snow",
+        ),
         ("lidar", "map", "town", "-o=map.laz", "--quiet"),
         ("lidar", "map", "town", "-o=map.copc.laz", "--quiet"),
     ],
@@ -75,7 +83,9 @@ def record() -> dict[str, dict[str, int]]:
             for program, *words in commands:
                 command = [sys.executable, "-m", program, *words]
                 subprocess.run(command, cwd=folder, env=os.environ | settings, check=True)
-            listed = {json.dumps([kernel.name, *kernel.arguments]): size for kernel, size in compiled_kernels(cache)}
+            listed = {
+                json.dumps([kernel.name, *kernel.arguments]): size for kernel, size in compiled_kernels(cache)
+            }
             found[use] = {entry: size for entry, size in listed.items() if entry not in known}
             known |= listed.keys()
     return found

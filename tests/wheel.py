@@ -32,21 +32,6 @@ BACKEND = "import setuptools.build_meta as b; print(b.build_{kind}({folder!r}, {
 PLATFORM = "manylinux_2_28_x86_64"
 """As of the wheels of llvmlite, which links the machine code."""
 
-DRIVE = ("lidar", "drive", "scene", "--duration=0.1", "--quiet")
-ROAD = (*DRIVE, "--route=random")
-BOX = "--bbox=24.940,60.168,24.944,60.171"
-USES = (
-    ("geoscene", "build", "--demo", BOX, "--relief=full", "-o=scene", "--quiet"),
-    ("geoscene", "export", "scene", "-o=surface.tif"),
-    (*ROAD, "--traffic=on", "--format=csv,laz,npz", "--deskew=middle", "-o=town"),
-    (*ROAD, "--weather=rain=10mm/h", "--road=by-weather", "-o=rain"),
-    (*ROAD, "--rig=vlp16", "--fidelity=survey", "--weather=fog=80m", "-o=fog"),
-    (*DRIVE, "--rig=drone", "--survey=all", "--altitude=80", "--turns", "--weather=snow=2mm/h", "-o=snow"),
-    ("lidar", "map", "town", "-o=map.laz", "--quiet"),
-    ("lidar", "map", "town", "-o=map.copc.laz", "--quiet"),
-)
-"""Commands that between them call the compiled functions as users do."""
-
 
 def run(*words: str | Path, cwd: Path, settings: Mapping[str, str] | None = None) -> None:
     """Run a command that must succeed, without the repository on the module path."""
@@ -56,11 +41,9 @@ def run(*words: str | Path, cwd: Path, settings: Mapping[str, str] | None = None
 
 
 def compile_functions(level: str) -> None:
-    """Compile for a level of x86-64 what users call; the code is kept beside the sources."""
+    """Compile for a level of x86-64 what both packages list; the code is kept beside the sources."""
     settings = {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": "", "PYTHONPATH": str(ROOT)}
-    with tempfile.TemporaryDirectory() as folder:
-        for program, *words in USES:
-            run(sys.executable, "-m", program, *words, cwd=Path(folder), settings=settings)
+    run(sys.executable, "-m", "geoscene.support.kernels", cwd=ROOT, settings=settings)
 
 
 def fitting_code() -> Iterator[Path]:
@@ -165,7 +148,7 @@ def main() -> None:
         run(binaries / "python", "-m", "geoscene", "info", "scene", cwd=away)
         run(binaries / "python", "-m", "lidar", "map", "drive", "-o", "map.laz", "-q", cwd=away)
         if levels and (missing := sorted(path.stem for path in set(away.rglob("*.nbc")) - brought)):
-            sys.exit(f"the wheel lacks machine code of {', '.join(missing)}; add commands to USES")
+            sys.exit(f"the wheel lacks machine code of {', '.join(missing)}; run tests/kernels.py")
 
 
 if __name__ == "__main__":

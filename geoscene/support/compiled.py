@@ -22,14 +22,13 @@ from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from llvmlite.binding import Linkage, create_new_function_pass_manager, get_host_cpu_features
+from llvmlite.binding import get_host_cpu_features
 from numba.core import caching, types
 from numba.core import config as _numba_config
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
-from numba.core.environment import lookup_environment
 from numba.core.runtime.nrt import rtsys
+
+from geoscene.support.optimised import OwnCompiler
 
 try:
     import fcntl
@@ -38,6 +37,7 @@ except ImportError:  # on Windows
 
 config: Any = _numba_config
 _njit: Any = numba.njit  # its types lack options
+_unliteral: Any = types.unliteral
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGES = ("geoscene", "lidar")
 _V3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
@@ -59,25 +59,25 @@ def njit(
     """
 
     def decorated(function: Function) -> Function:
-        found = _njit(no_cfunc_wrapper=True, pipeline_class=_Compiler, **options)(function)
+        found = _njit(no_cfunc_wrapper=True, pipeline_class=OwnCompiler, **options)(function)
         if isinstance(found, Dispatcher):  # a plain function where numba is told not to compile
             part = _Part(function, options)
             found.get_call_template, found.get_overload = part.get_call_template, part.get_overload  # type: ignore[method-assign]
             if cache:
-                found._cache = _Cache(function)  # type: ignore[attr-defined]  # noqa: SLF001
-                found.compile = functools.partial(_compile_once, found, needs)  # type: ignore[method-assign]
+                found._cache = _Cache(function)  # type: ignore[attr-defined]
+                found.compile = functools.partial(_compile_once, found, needs=needs)  # type: ignore[method-assign]
         return found  # type: ignore[no-any-return]
 
     return decorated
 
 
-def _compile_once(function: Any, needs: Callable[[], object] | None, signature: Any) -> Any:
+def _compile_once(function: Any, signature: Any, *, needs: Callable[[], object] | None) -> Any:
     """Load or compile a function; if another process is compiling it, wait for its machine code."""
     if needs is not None:
         needs()
     if is_compiled(function, signature):
         return Dispatcher.compile(function, signature)
-    with function._cache.lock(), _without_collection():  # noqa: SLF001
+    with function._cache.lock(), _without_collection():
         return Dispatcher.compile(function, signature)
 
 
@@ -95,101 +95,7 @@ def _without_collection() -> Iterator[None]:
 
 def is_compiled(function: Any, signature: tuple[Any, ...]) -> bool:
     """Whether the machine code of a function for types of arguments is on disk."""
-    return bool(function._cache.has(signature, function.targetctx))  # noqa: SLF001
-
-
-class _Linked(JITCodeLibrary):
-    """Code of a function and of what it calls, optimised together, once.
-
-    numba optimises and assembles each function, and optimises it again in all that call it.
-    """
-
-    def _optimize_functions(self, ll_module: Any) -> None:
-        """Put the variables of functions into registers, which makes all that follows faster."""
-        ll_module.data_layout = self._codegen._data_layout
-        builder = self._codegen._pass_builder()
-        passes = create_new_function_pass_manager()
-        passes.add_sroa_pass()
-        passes.add_instruction_combine_pass()
-        passes.add_simplify_cfg_pass()
-        for function in ll_module.functions:
-            if not function.is_declaration:
-                passes.run(function, builder)
-
-    def add_linking_library(self, library: Any) -> None:
-        """Take the code of a function that is called."""
-        self._linking_libraries.append(library)
-
-    def finalize(self) -> None:
-        """Link, optimise and assemble the code, and set the constants that errors of its functions name."""
-        self._link()
-        self._optimize_final_module()
-        self._final_module.verify()
-        self._finalize_final_module()
-        for variable in self._final_module.global_variables:
-            environment = lookup_environment(variable.name)
-            if environment is not None:
-                self._codegen.set_env(variable.name, environment)
-
-    def _link(self) -> None:
-        for library in _called(self):
-            self._reload_init.update(library._reload_init)
-            self._final_module.link_in(_copy_module(library))
-
-
-class _Unassembled(_Linked):
-    """Code of a function that only others call: neither optimised nor assembled by itself."""
-
-    @property
-    def codegen(self) -> Any:
-        """Where the code has no address."""
-        return self
-
-    def set_env(self, name: str, environment: Any) -> None:
-        """Do nothing: callers set the constants in their copy of the code."""
-
-    def get_pointer_to_function(self, name: str) -> int:  # noqa: ARG002
-        """0, of no address."""
-        return 0
-
-
-def _called(library: Any) -> list[Any]:
-    """Libraries that a library calls, directly or not."""
-    found: dict[int, Any] = {}
-    todo = list(library._linking_libraries)
-    while todo:
-        one = todo.pop(0)
-        if id(one) not in found:
-            found[id(one)] = one
-            if not one._finalized:
-                todo += one._linking_libraries
-    return list(found.values())
-
-
-def _copy_module(library: Any) -> Any:
-    """A copy of a library's module to be linked into others, which drop the functions that they do not call."""
-    if library._finalized:
-        return library._get_module_for_linking().clone()
-    module = library._final_module.clone()
-    for function in module.functions:
-        if not function.is_declaration and function.linkage == Linkage.external:
-            function.linkage = "linkonce_odr"
-    return module
-
-
-class _Compiler(Compiler):
-    """numba's compiler, which leaves it to the function that is compiled to optimise those of numba that it calls."""
-
-    def compile_extra(self, func: Any) -> Any:
-        """Compile a function for the types that this was made for."""
-        codegen = self.state.targetctx.codegen()
-        self.state.library = _Linked(codegen, func.__qualname__)
-        self.state.library.enable_object_caching()
-        before, codegen._library_class = codegen._library_class, _Unassembled
-        try:
-            return super().compile_extra(func)
-        finally:
-            codegen._library_class = before
+    return bool(function._cache.has(signature, function.targetctx))
 
 
 class _Part:
@@ -208,9 +114,8 @@ class _Part:
 
         Constants count as numbers: numba would compile the function for each of them.
         """
-        return self._compiled.get_call_template(
-            tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()}
-        )
+        named = {name: _unliteral(kind) for name, kind in kws.items()}
+        return self._compiled.get_call_template(tuple(map(_unliteral, args)), named)
 
     def get_overload(self, sig: Any) -> Any:
         """The function for types of arguments, as `get_call_template` compiled it."""
@@ -231,7 +136,7 @@ def _set_up() -> None:
     if config.CPU_NAME in LEVELS:
         config.CPU_FEATURES = ""
     own = (f"{__name__}.{locator.__name__}" for locator in (_Given, _BesideSource, _OfUser))
-    others = config.CACHE_LOCATOR_CLASSES or ",".join(c.__name__ for c in caching.CacheImpl._locator_classes)  # noqa: SLF001
+    others = config.CACHE_LOCATOR_CLASSES or ",".join(c.__name__ for c in caching.CacheImpl._locator_classes)
     config.CACHE_LOCATOR_CLASSES = ",".join((*own, others))
 
 
@@ -263,11 +168,9 @@ class _Cache(caching.NullCache):
     @contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the right to compile the function against other threads and processes."""
-        if fcntl is None:
-            yield
-            return
         with self._of_function.lock_path.open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            if fcntl is not None:
+                fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
 
@@ -293,7 +196,7 @@ class _FunctionCache(caching.FunctionCache):
     def has(self, sig: Any, target_context: Any) -> bool:
         """Whether there is machine code for types of arguments."""
         key = self._index_key(sig, target_context.codegen())  # type: ignore[no-untyped-call]
-        return key in self._cache_file._load_index()  # noqa: SLF001
+        return key in self._cache_file._load_index()  # type: ignore[no-untyped-call]
 
 
 class _Files(caching.IndexDataCacheFile):

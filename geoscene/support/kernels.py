@@ -1,9 +1,9 @@
 """Compile functions ahead of their first call, in processes of their own.
 
-``kernels.json`` of a package lists its compiled functions by use, with the types of arguments that they are
-called with: a name for numbers, a name with the dimensions and the layout for arrays (``float64 2C``), a list
-for tuples, and one under the name of the class for named tuples. Functions that it lacks are compiled on their
-first call. ``tests/kernels.py`` writes the lists.
+``kernels.json`` of a package lists its compiled functions by use, with the types of their arguments: a name
+for numbers; a name, the dimensions and the layout for arrays (``float64 2 C``); a list for tuples, and one
+under the name of the class for named tuples. Functions that it lacks are compiled on their first call.
+``tests/kernels.py`` writes the lists.
 
 python -m geoscene.support.kernels [USE...]   compiles what both packages list, or what they list for the uses
 """
@@ -17,8 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from importlib.util import find_spec
@@ -33,6 +32,8 @@ from geoscene.support.processes import run_tasks
 
 PACKAGES = ("geoscene", "lidar")
 LIST = "kernels.json"
+_Tuple: Any = types.BaseTuple
+_NamedTuple: Any = types.BaseNamedTuple
 _BESIDE = "--beside"
 """Option of a process that another one starts: it leaves that one a core, and ends with it."""
 
@@ -71,10 +72,10 @@ class Kernel:
 def read_type(entry: Any) -> Any:
     """The type that an entry of ``kernels.json`` describes."""
     if isinstance(entry, list):
-        return types.BaseTuple.from_types(tuple(map(read_type, entry)))
+        return _Tuple.from_types(tuple(map(read_type, entry)))
     if isinstance(entry, dict):
         ((name, fields),) = entry.items()
-        return types.BaseTuple.from_types(tuple(map(read_type, fields)), pyclass=_named(name))
+        return _Tuple.from_types(tuple(map(read_type, fields)), pyclass=_named(name))
     name, *shape = entry.split(" ")
     item = from_dtype(_named(name) if ":" in name else np.dtype(name))
     if not shape:
@@ -87,11 +88,11 @@ def read_type(entry: Any) -> Any:
 
 def describe_type(kind: Any) -> Any:
     """The entry of ``kernels.json`` for a type; raises TypeError for types that have none."""
-    if isinstance(kind, types.BaseNamedTuple):
+    if isinstance(kind, _NamedTuple):
         cls = kind.instance_class
-        return {f"{cls.__module__}:{cls.__name__}": [describe_type(field) for field in kind]}
-    if isinstance(kind, types.BaseTuple):
-        return [describe_type(field) for field in kind]
+        return {f"{cls.__module__}:{cls.__name__}": list(map(describe_type, kind))}
+    if isinstance(kind, _Tuple):
+        return list(map(describe_type, kind))
     if isinstance(kind, types.Array):
         flags = " readonly" * (not kind.mutable) + " unaligned" * (not kind.aligned)
         return f"{_describe_item(kind.dtype)} {kind.ndim} {kind.layout}{flags}"
@@ -131,41 +132,32 @@ def compile_kernels(kernels: Sequence[Kernel], *, workers: int) -> None:
         pass
 
 
-@contextmanager
-def compile_ahead(*uses: str, quiet: bool = False) -> Iterator[None]:
-    """Compile what is missing for some uses in another process while the block runs, which ends it.
+def compile_ahead(*uses: str, quiet: bool = False) -> None:
+    """Start to compile what is missing for some uses in another process, which ends with this one.
 
-    Unless quiet, a line on standard error says so, and another one how long it took. A function that the
-    block calls before is compiled by the one that comes to it first; the other one waits.
+    Unless quiet, a line on standard error says so, and another one how long it took. A function that this
+    process needs meanwhile is compiled by the process that comes to it first; the other one waits.
     """
     missing = [kernel for kernel in read_kernels(uses) if kernel.is_missing()]
     if not missing:
-        yield
         return
-    say = silent_line if quiet else print_line
-    say(f"compiling, once: {len(missing)} functions; what they are not needed for goes on")
     begun = time.monotonic()
+    if not quiet:
+        _say(f"compiling, once: {len(missing)} functions, beside other work")
     command = [sys.executable, "-m", __name__, _BESIDE, *uses]
-    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+    process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
 
-        def wait() -> None:
-            if process.wait() == 0:
-                say(f"compiled in {time.monotonic() - begun:.0f} s")
+    def wait() -> None:
+        if process.wait() == 0 and not quiet:
+            _say(f"compiled in {time.monotonic() - begun:.0f} s")
 
-        threading.Thread(target=wait, daemon=True).start()
-        try:
-            yield
-        finally:
-            process.kill()
+    threading.Thread(target=wait, daemon=True).start()
 
 
-def print_line(text: str) -> None:
-    """Print a line on standard error."""
-    print(text, file=sys.stderr, flush=True)
-
-
-def silent_line(text: str) -> None:
-    """Print nothing."""
+def _say(text: str) -> None:
+    """Print a line on standard error, whole also where several threads print."""
+    sys.stderr.write(f"{text}\n")
+    sys.stderr.flush()
 
 
 def _end_with_parent() -> None:
@@ -182,11 +174,11 @@ def main() -> None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
         cores = max(cores - 1, 1)
     elif missing:
-        print_line(f"compiling, once: {len(missing)} functions")
+        _say(f"compiling, once: {len(missing)} functions")
     begun = time.monotonic()
     compile_kernels(missing, workers=cores)
     if missing and not beside:
-        print_line(f"compiled in {time.monotonic() - begun:.0f} s")
+        _say(f"compiled in {time.monotonic() - begun:.0f} s")
 
 
 if __name__ == "__main__":

@@ -79,6 +79,7 @@ def drive(
         or write them to FILE.rrd for it.
     """
     from geoscene.scene.layout import using  # noqa: PLC0415
+    from geoscene.support.kernels import compile_ahead  # noqa: PLC0415
     from geoscene.support.storage import publish, shown, url_of  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
@@ -93,6 +94,7 @@ def drive(
         shows = opened_live(live_target(live, overwrite=report.overwrite))
     if not url_of(out):
         note_new_folder(out)
+    compile_ahead(*_uses(options, builds=scene is None or scene.is_file()), quiet=report.quiet)
     bar = partial(progress_bar, quiet=report.quiet)
     with bar() as progress:
         found = open_scene_or_map(scene, options, place=place, clouds=clouds, progress=progress)
@@ -160,6 +162,14 @@ def drive(
             file=sys.stderr,
         )
     return 0
+
+
+def _uses(options: DriveOptions, *, builds: bool) -> list[str]:
+    """Uses of compiled functions that a drive has."""
+    from lidar.sensors.rig.specs import load_rig  # noqa: PLC0415
+
+    cameras, traffic = load_rig(options.rig).cameras, options.traffic
+    return ["build"] * builds + ["drive"] + ["cameras"] * bool(cameras) + ["traffic"] * bool(traffic)
 
 
 def _print_built(found: OpenedScene) -> None:
