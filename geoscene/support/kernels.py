@@ -161,7 +161,8 @@ def _say(text: str) -> None:
 
 
 def _end_with_parent() -> None:
-    sys.stdin.buffer.read()
+    """Exit when the parent process ends and with it the pipe; without a lock of ``sys.stdin``, for forks."""
+    os.read(0, 1)
     os._exit(1)
 
 
