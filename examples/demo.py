@@ -4,6 +4,7 @@ Writes to ``demo/`` (or the folder given as the first argument) and lists the fi
 """
 
 import csv
+import os
 import sys
 import time
 from collections import Counter
@@ -18,6 +19,7 @@ from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.support.console import progress_bar
+from geoscene.support.kernels import compile_ahead
 from geoscene.view import view_scene
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
@@ -63,67 +65,75 @@ def busiest_frame(boxes: Path) -> str:
     return f"{max(seen, key=lambda frame: (seen[frame], -frame)):06d}"
 
 
-with progress_bar() as progress:
-    # 1. OpenStreetMap becomes a scene.
-    say("building the scene of the bundled extract")
-    scene = build(
-        read_osm(demo_path()),
-        out / "scene",
-        options=BuildOptions(name="Helsinki"),
-        overwrite=True,
-        progress=progress,
-    )
-    counts, report = scene.manifest["counts"], check_scene(scene)
-    broken = len(report["broken"])
-    say(f"{counts['solids']} buildings, {broken} solids broken; {counts['road_km']} km of road")
+def main() -> None:
+    """Build, drive, draw; worker processes import this module without doing so."""
+    compile_ahead("build", "drive", "cameras", "traffic")
+    with progress_bar() as progress:
+        # 1. OpenStreetMap becomes a scene.
+        say("building the scene of the bundled extract")
+        scene = build(
+            read_osm(demo_path()),
+            out / "scene",
+            options=BuildOptions(name="Helsinki"),
+            overwrite=True,
+            workers=os.cpu_count() or 1,
+            progress=progress,
+        )
+        counts, report = scene.manifest["counts"], check_scene(scene)
+        broken = len(report["broken"])
+        say(f"{counts['solids']} buildings, {broken} solids broken; {counts['road_km']} km of road")
 
-    # 2. The scene as a web page, and pictures of it from above and obliquely.
-    view_scene(scene, out / "scene.html", overwrite=True, progress=progress)
-    world = World.load(scene)
-    write_png(pictures / "scene_top.png", scene_picture(world, view="top", size=(1400, 1400)))
-    write_png(pictures / "scene_oblique.png", scene_picture(world, view="oblique", size=(1600, 1000)))
+        # 2. The scene as a web page, and pictures of it from above and obliquely.
+        view_scene(scene, out / "scene.html", overwrite=True, progress=progress)
+        world = World.load(scene)
+        write_png(pictures / "scene_top.png", scene_picture(world, view="top", size=(1400, 1400)))
+        write_png(pictures / "scene_oblique.png", scene_picture(world, view="oblique", size=(1600, 1000)))
 
-    # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver in busy traffic.
-    say("driving for 38 seconds among cars, cyclists and pedestrians")
-    traffic = TrafficOptions(vehicles=30.0, cyclists=8.0, pedestrians=100.0, parked=0.9)
-    options = DriveOptions(route=ROUTE, duration=38.0, seed=3, traffic=traffic)
-    summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
-    say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
+        # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver in busy traffic.
+        say("driving for 38 seconds among cars, cyclists and pedestrians")
+        traffic = TrafficOptions(vehicles=30.0, cyclists=8.0, pedestrians=100.0, parked=0.9)
+        options = DriveOptions(route=ROUTE, duration=38.0, seed=3, traffic=traffic)
+        summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
+        say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
-    # 4. The camera frame with most road users, and the sweep of that moment by class.
-    camera = out / "drive" / "camera_front"
-    frame = busiest_frame(camera / "boxes.csv")
-    sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{frame}.pcd")
-    mount = load_rig("seed").lidars[0].mount
-    xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
-    label = sweep["label"].astype(np.uint8)
-    image = sweep_picture(xyz, class_colors(label), vehicle=load_vehicle("car"))
-    write_png(pictures / "sweep_class.png", with_legend(image, label))
-    write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{frame}.png"))
-    depth = counts_to_depth(read_png(camera / "depth" / f"{frame}.png"))
-    write_png(pictures / "camera_depth.png", depth_picture(depth))
+        # 4. The camera frame with most road users, and the sweep of that moment by class.
+        camera = out / "drive" / "camera_front"
+        frame = busiest_frame(camera / "boxes.csv")
+        sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{frame}.pcd")
+        mount = load_rig("seed").lidars[0].mount
+        xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
+        label = sweep["label"].astype(np.uint8)
+        image = sweep_picture(xyz, class_colors(label), vehicle=load_vehicle("car"))
+        write_png(pictures / "sweep_class.png", with_legend(image, label))
+        write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{frame}.png"))
+        depth = counts_to_depth(read_png(camera / "depth" / f"{frame}.png"))
+        write_png(pictures / "camera_depth.png", depth_picture(depth))
 
-    # 5. All sweeps as one georeferenced map.
-    say("putting all sweeps together")
-    dataset = open_dataset(out / "drive")
-    options = MapOptions(voxel=0.1, sensors=("lidar_top",))
-    aggregate(dataset, out / "map.laz", options=options, progress=progress)
-    points = read_table(out / "map.laz")
-    static = points["label"] < Class.CAR  # moving road users leave trails
-    label = points["label"][static]
-    world_xyz = np.column_stack([points[axis][static] for axis in "xyz"])
-    image = cloud_picture(world_xyz, class_codes().color[label], size=(1600, 1000), point=0.15)
-    write_png(pictures / "map_class.png", with_legend(image, label))
+        # 5. All sweeps as one georeferenced map.
+        say("putting all sweeps together")
+        dataset = open_dataset(out / "drive")
+        options = MapOptions(voxel=0.1, sensors=("lidar_top",))
+        aggregate(dataset, out / "map.laz", options=options, progress=progress)
+        points = read_table(out / "map.laz")
+        static = points["label"] < Class.CAR  # moving road users leave trails
+        label = points["label"][static]
+        world_xyz = np.column_stack([points[axis][static] for axis in "xyz"])
+        image = cloud_picture(world_xyz, class_codes().color[label], size=(1600, 1000), point=0.15)
+        write_png(pictures / "map_class.png", with_legend(image, label))
 
-say("done; open these:")
-for path, what in {
-    out / "scene.html": "the scene as an interactive page (any browser, no network)",
-    pictures: "pictures of each step",
-    SceneFiles(out / "scene").features: "buildings, land cover, roads (QGIS)",
-    out / "map.laz": "the map, in UTM (CloudCompare, QGIS)",
-    out / "drive" / "lidar_top": "sweeps as PCD and LAZ (lidar drive --format writes others)",
-    out / "drive" / "camera_front": "RGB and depth images",
-    out / "drive" / "boxes.csv": "3D bounding boxes of the other road users",
-    out / "drive" / "poses.csv": "pose of the vehicle at each frame",
-}.items():
-    print(f"  {path}  -  {what}")
+    say("done; open these:")
+    for path, what in {
+        out / "scene.html": "the scene as an interactive page (any browser, no network)",
+        pictures: "pictures of each step",
+        SceneFiles(out / "scene").features: "buildings, land cover, roads (QGIS)",
+        out / "map.laz": "the map, in UTM (CloudCompare, QGIS)",
+        out / "drive" / "lidar_top": "sweeps as PCD and LAZ (lidar drive --format writes others)",
+        out / "drive" / "camera_front": "RGB and depth images",
+        out / "drive" / "boxes.csv": "3D bounding boxes of the other road users",
+        out / "drive" / "poses.csv": "pose of the vehicle at each frame",
+    }.items():
+        print(f"  {path}  -  {what}")
+
+
+if __name__ == "__main__":
+    main()

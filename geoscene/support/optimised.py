@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from llvmlite.binding import Linkage, create_new_function_pass_manager
+from llvmlite.binding import Linkage, create_new_module_pass_manager
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.environment import lookup_environment
@@ -24,16 +24,8 @@ class _Linked(_Library):  # type: ignore[misc]
     """
 
     def _optimize_functions(self, ll_module: Any) -> None:
-        """Put the variables of functions into registers, which makes all that follows faster."""
+        """Set the layout of data; functions are optimised when all are linked."""
         ll_module.data_layout = self._codegen._data_layout
-        builder = self._codegen._pass_builder()
-        passes = create_new_function_pass_manager()
-        passes.add_sroa_pass()
-        passes.add_instruction_combine_pass()
-        passes.add_simplify_cfg_pass()
-        for function in ll_module.functions:
-            if not function.is_declaration:
-                passes.run(function, builder)
 
     def add_linking_library(self, library: Any) -> None:
         """Take the code of a function that is called."""
@@ -42,6 +34,7 @@ class _Linked(_Library):  # type: ignore[misc]
     def finalize(self) -> None:
         """Link, optimise and assemble the code, and set the constants that errors of its functions name."""
         self._link()
+        self._simplify()
         self._optimize_final_module()
         self._final_module.verify()
         self._finalize_final_module()
@@ -54,6 +47,14 @@ class _Linked(_Library):  # type: ignore[misc]
         for library in _called(self):
             self._reload_init.update(library._reload_init)
             self._final_module.link_in(_copy_module(library))
+
+    def _simplify(self) -> None:
+        """Put the variables of all functions into registers before functions are inlined into others."""
+        passes = create_new_module_pass_manager()
+        passes.add_sroa_pass()
+        passes.add_instruction_combine_pass()
+        passes.add_simplify_cfg_pass()
+        passes.run(self._final_module, self._codegen._pass_builder())
 
 
 class _Unassembled(_Linked):

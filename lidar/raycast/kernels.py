@@ -38,7 +38,17 @@ from lidar.raycast.lanes import (
     unit,
 )
 from lidar.raycast.library import library
-from lidar.raycast.memory import allocate_aligned, compile_out_of_line, float64_at, inline, int32_at, int64_at
+from lidar.raycast.memory import (
+    compile_out_of_line,
+    float32_aligned,
+    float64_aligned,
+    float64_at,
+    inline,
+    int32_aligned,
+    int32_at,
+    int64_at,
+    uint32_column,
+)
 from lidar.raycast.packets import NUDGE, alike, first_bad, gather, trace
 from lidar.raycast.planes import (
     INVALID,
@@ -295,11 +305,11 @@ def cast(
     """
     target = unpack_target(given)
     W = len(target.lanes)
-    packet = allocate_aligned(4 * PACKET_ROWS * W)
-    f, u = packet.view(np.float32), packet.view(np.uint32)
-    one, valid = allocate_aligned(128).view(np.float32), allocate_aligned(4 * W).view(np.int32)
-    work, ids = allocate_aligned(8 * WORK_ROWS * W).view(np.float64), np.zeros(W, np.int64)
-    face, instance = allocate_aligned(4 * W).view(np.int32), allocate_aligned(4 * W).view(np.int32)
+    f = float32_aligned(PACKET_ROWS * W)
+    u = uint32_column(f.ctypes.data, (len(f),))
+    one, valid = float32_aligned(32), int32_aligned(W)
+    work, ids = float64_aligned(WORK_ROWS * W), np.zeros(W, np.int64)
+    face, instance = int32_aligned(W), int32_aligned(W)
     stack = np.zeros(STACK, np.int64)
     late, doubtful, waiting = np.zeros(2 * RAY_ROWS * W), np.zeros(2 * W, np.int64), 0
     columns = ranges, faces, instances, cosines, normals
@@ -407,9 +417,9 @@ def find_occluded(given: Packed, rays: RayColumns, lo: int, hi: int, out: NDArra
     """Write whether rays lo to hi hit anything; returns the first invalid ray, or -1."""
     target = unpack_target(given)
     W = len(target.lanes)
-    packet = allocate_aligned(4 * PACKET_RAY_ROWS * W)
-    f, u = packet.view(np.float32), packet.view(np.uint32)
-    one, valid = allocate_aligned(64).view(np.float32), allocate_aligned(4 * W).view(np.int32)
+    f = float32_aligned(PACKET_RAY_ROWS * W)
+    u = uint32_column(f.ctypes.data, (len(f),))
+    one, valid = float32_aligned(16), int32_aligned(W)
     work, ids = np.zeros(RAY_ROWS * W), np.zeros(W, np.int64)
     for k in range(W):
         u[RAY_MASK * W + k] = rays.mask

@@ -75,12 +75,20 @@ uint32_column = _column(types.uint32)
 _UNCOUNTED: dict[str, Any] = {"_nrt": False}
 
 
-@njit(nogil=True)
-def allocate_aligned(size: int) -> Any:
-    """Zeroed bytes that start at a multiple of 64."""
-    raw = np.zeros(size + 64, np.uint8)
-    start = (64 - raw.ctypes.data % 64) % 64
-    return raw[start : start + size]
+def _allocator(kind: Any, size: int) -> Any:
+    @njit(nogil=True)
+    def allocate(count: int) -> Any:
+        raw = np.zeros(count + 64 // size, kind)
+        start = (-raw.ctypes.data % 64) // size
+        return raw[start : start + count]
+
+    return allocate
+
+
+float64_aligned = _allocator(np.float64, 8)
+float32_aligned = _allocator(np.float32, 4)
+int32_aligned = _allocator(np.int32, 4)
+"""A count of zeros that start at a multiple of 64 bytes."""
 
 
 def inline(function: Callable[..., Any]) -> Any:

@@ -163,7 +163,9 @@ def _one_of(color: NDArray[np.uint8], table: NDArray[np.uint8]) -> bool:
 
 @compiled
 def _pick(color: NDArray[np.uint8], feature: int, table: NDArray[np.uint8], key: int) -> None:
-    color[:] = table[int(hash_place(feature, key, 20) * len(table))]
+    row = int(hash_place(feature, key, 20) * len(table))
+    for c in range(3):
+        color[c] = table[row, c]
 
 
 _FACES: weakref.WeakKeyDictionary[World, dict[int, str]] = weakref.WeakKeyDictionary()
