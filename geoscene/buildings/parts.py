@@ -12,6 +12,7 @@ from shapely.errors import GEOSException
 from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
 from geoscene.sources.data import Relation
+from geoscene.support.graphs import components
 from geoscene.support.report import Problem, describe_unexpected
 from geoscene.typing import Bools, Float, Ints
 
@@ -118,12 +119,8 @@ def assign(
 
 def clusters(polygons: Polygons) -> Rows:
     """Cluster number (n,) of polygons; those that touch or overlap, directly or through others, share one."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     i, j = shapely.STRtree(polygons).query(polygons, predicate="intersects")
-    graph = coo_array((np.ones(len(i), np.int8), (i, j)), shape=(len(polygons), len(polygons)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    return components(i, j, count=len(polygons))
 
 
 def remainder(outline: Any, parts: Polygons, *, strip: float) -> tuple[Any, float, float]:

@@ -24,6 +24,7 @@ from geoscene.geometry.watertight import (
     vertex_fans,
     weld,
 )
+from geoscene.support.graphs import components
 from geoscene.typing import Float, Ints
 
 SEAMS = (1e-2, 1e-2, 3e-2)
@@ -127,15 +128,11 @@ def _without_slivers(corners: Float, run: Ints) -> tuple[Float, Ints]:
 
     Rounding leaves such shells, bodies and cavities, where walls of pieces nearly coincide.
     """
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     ids, _ = weld(corners.reshape(-1, 3), np.zeros(3 * len(corners), np.int64))
     faces = ids.reshape(-1, 3)
     n = ids.max(initial=-1) + 1
     links = np.concatenate([faces[:, :2], faces[:, 1:]]).T
-    graph = coo_array((np.ones(links.shape[1], np.int8), links), shape=(n, n))
-    shell = connected_components(graph, directed=False)[1][faces[:, 0]]
+    shell = components(*links, count=n)[faces[:, 0]]
     a, b, c = corners.transpose(1, 0, 2)
     volume = np.bincount(shell, weights=np.vecdot(a, np.cross(b, c)) / 6)
     area = np.bincount(shell, weights=np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
@@ -198,15 +195,11 @@ def _manifold(shell: ShellTriangles, *, first: int, origin: Float) -> Any:
 
 def merged_vertices(points: Float) -> Ints:
     """For each point (n,) the first of those that a chain of steps shorter than 1.5 mm connects with it."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     n = len(points)
     pairs = near_vertices(grid_cells(points), np.zeros(n, np.int64), steps=_MERGE)
     if not len(pairs):
         return np.arange(n)
-    graph = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(n, n))
-    cluster = connected_components(graph, directed=False)[1]
+    cluster = components(*pairs.T, count=n)
     first = np.unique(cluster, return_index=True)[1]
     out: Ints = first[cluster]
     return out

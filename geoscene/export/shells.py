@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.geometry.watertight import corner_fans, edge_uses
+from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Ints
 
 
@@ -15,9 +16,6 @@ def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
     corners : (m, 3) ids of welded vertices
     owner   : (m,) object of each face
     """
-    from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     m = len(corners)
     if not m:
         return np.empty(0, np.int64)
@@ -25,8 +23,7 @@ def shell_numbers(corners: Ints, owner: NDArray[np.integer]) -> Ints:
     _, ids = np.unique(own, return_inverse=True)
     edge, uses, _ = edge_uses(ids.reshape(-1, 3).astype(np.int64))
     face = np.repeat(np.arange(m), 3)
-    links = csr_array((np.ones(3 * m, np.int8), (face, m + edge)), shape=(m + len(uses), m + len(uses)))
-    labels = connected_components(links, directed=False)[1][:m]
+    labels = components(face, m + edge, count=m + len(uses))[:m]
     _, first, numbers = np.unique(labels, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

@@ -27,6 +27,7 @@ from geoscene.ground.partition import (
 )
 from geoscene.ground.triangulate import PlaneTriangles, triangulate, triangulate_lattice
 from geoscene.sources.data import Way
+from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Height
 
 _STATION = 20.0
@@ -156,18 +157,13 @@ def _inside(polygons: NDArray[np.object_]) -> tuple[Float, Float]:
 
 def _still_levels(polygons: NDArray[np.object_], sea: Bools, *, height: Height) -> Float:
     """Levels (n,) of standing waters; waters that touch have the same level."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     n = len(polygons)
     one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     # All sea has one level, even where land divides it.
     first = np.flatnonzero(sea)[:1]
     one = np.concatenate([one, np.repeat(first, sea.sum())])
     other = np.concatenate([other, np.flatnonzero(sea)[: len(one) - len(other)]])
-    water = connected_components(coo_array((np.ones(len(one)), (one, other)), shape=(n, n)), directed=False)[
-        1
-    ]
+    water = components(one, other, count=n)
     shores = shapely.segmentize(shapely.boundary(polygons), _STATION)
     xy, owner = shapely.get_coordinates(shores, return_index=True)
     level = np.full(n, np.inf)

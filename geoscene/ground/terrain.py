@@ -18,6 +18,7 @@ from pyproj.exceptions import ProjError
 
 from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.geometry.frames import Frame, beside
+from geoscene.support.graphs import components
 from geoscene.support.report import Problem
 from geoscene.typing import Bools, Float, Height
 
@@ -427,9 +428,6 @@ def _spikes(values: Float, step: float) -> Bools:
 
     Groups at voids or at the rim are no spikes: what lies beyond is unknown.
     """
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     number = np.arange(values.size).reshape(values.shape)
     pairs = [(number[:, :-1], number[:, 1:]), (number[:-1], number[1:])]
     a, b = (np.concatenate([pair[k].ravel() for pair in pairs]) for k in (0, 1))
@@ -437,8 +435,7 @@ def _spikes(values: Float, step: float) -> Bools:
     if not (rise > step).any():
         return np.zeros(values.shape, np.bool_)
     joined = ~(rise > step)  # voids join whatever is beside them
-    graph = coo_array((joined[joined], (a[joined], b[joined])), shape=(values.size, values.size))
-    group = connected_components(graph, directed=False)[1].reshape(values.shape)
+    group = components(a[joined], b[joined], count=values.size).reshape(values.shape)
     small = np.bincount(group.ravel()) <= _SPIKE
     small[group[np.isnan(values)]] = False
     for edge in (group[0], group[-1], group[:, 0], group[:, -1]):

@@ -11,7 +11,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -230,6 +230,17 @@ def _try_lock(file: IO[bytes]) -> bool:
     except OSError as error:
         return error.errno not in (errno.EACCES, errno.EAGAIN)
     return True
+
+
+def copy_file(source: Path, path: Path) -> None:
+    """Copy a file to a path, whose folders are made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source, path)
+
+
+def write_lines(path: Path, lines: Iterable[str]) -> None:
+    """Write lines of text as a file, atomically."""
+    write_atomically(path, "".join(f"{line}\n" for line in lines).encode())
 
 
 def write_atomically(path: Path, *data: bytes | NDArray[Any]) -> None:

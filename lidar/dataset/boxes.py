@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,19 @@ def read_boxes(path: Path, columns: Collection[str]) -> list[dict[str, Any]]:
             if not all(np.isfinite(box[name]) for name in columns if name not in _TEXT):
                 raise ValueError(f"road user {box['id']} of frame {box['frame']} has no finite box")
     return boxes
+
+
+def boxes_by_frame(
+    path: Path, columns: Collection[str], *, key: str = "id"
+) -> dict[int, dict[int, dict[str, Any]]]:
+    """The rows of a file of boxes by frame and road user (``id`` or ``instance``); none without the file.
+
+    Raises DatasetError for a damaged file.
+    """
+    found: dict[int, dict[int, dict[str, Any]]] = defaultdict(dict)
+    for box in read_boxes(path, columns) if path.exists() else ():
+        found[box["frame"]][box[key]] = box
+    return found
 
 
 def _value(name: str, text: str) -> str | int | float | bool:

@@ -42,7 +42,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Checksums:
-    """What a file of checksums states.
+    """Contents of a file of checksums.
 
     sha256 : by path relative to the folder
     digest : of the folder, hexadecimal
@@ -101,7 +101,7 @@ def add_to_checksums(folder: Path, *, below: str, known: Mapping[str, bytes]) ->
 
 
 def read_checksums(path: Path) -> Checksums:
-    """What a file of checksums states; lines that are damaged are left out."""
+    """Read a file of checksums; damaged lines are left out."""
     data = path.read_bytes()
     found = {}
     for line in data.splitlines(keepends=True):

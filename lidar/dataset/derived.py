@@ -1,4 +1,4 @@
-"""Directories that are made from recorded data: apart from it, and written whole or not at all."""
+"""Directories made from recorded data: outside of it, and written atomically."""
 
 from __future__ import annotations
 

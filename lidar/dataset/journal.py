@@ -149,7 +149,7 @@ class Journal:
                 file.write(f"{sensor},{frame},{points},{frame_digest(digests)}\n")
 
     def file_digests(self, sensor: str, frame: int, *, count: int) -> list[bytes]:
-        """SHA-256 of the files of a finished frame, of which there are ``count``."""
+        """SHA-256 of each of the ``count`` files of a finished frame."""
         size = hashlib.sha256().digest_size
         at = frame * count * size
         own = self._files[sensor][at : at + count * size]

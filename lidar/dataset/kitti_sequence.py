@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_lines
 from geoscene.typing import Float
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.mounts import OPTICAL, Mount
@@ -28,7 +28,7 @@ def write_sequence(
     mount   : of the scanner
     time_ns : (n,) starts of its frames
 
-    The cameras are the rig's first four; without one, a camera at the scanner that looks along its x axis.
+    The cameras are the rig's first four; without one, a camera at the scanner that faces its x axis.
     """
     cameras = [(intrinsic_matrix(camera), camera.mount) for camera in rig.cameras[:4]]
     first = cameras[0][1] if cameras else looking_ahead(mount)
@@ -41,7 +41,7 @@ def write_sequence(
 
 
 def looking_ahead(mount: Mount) -> Mount:
-    """The mount of a camera at a sensor that looks along its x axis."""
+    """Extrinsics of a camera at a sensor's origin whose optical axis is the sensor's x axis."""
     return Mount(mount.translation, tuple(quat_from_matrix(mount.rotation @ OPTICAL).tolist()))
 
 
@@ -58,24 +58,19 @@ def write_calibration(path: Path, projections: Sequence[ArrayLike], *, camera_fr
     """
     four = [*projections[:4], *[projections[0]] * (4 - len(projections))]
     named = [*((f"P{k}", projection) for k, projection in enumerate(four)), ("Tr", camera_from_lidar)]
-    lines = [f"{name}: {numbers(np.asarray(matrix)[:3])}" for name, matrix in named]
-    write_atomically(path, ("\n".join(lines) + "\n").encode("ascii"))
+    write_lines(path, (f"{name}: {numbers(np.asarray(matrix)[:3])}" for name, matrix in named))
 
 
 def write_times(path: Path, time_ns: NDArray[np.integer]) -> None:
     """Write ``times.txt``: seconds since the first frame."""
-    lines = [f"{(int(t) - int(time_ns[0])) * 1e-9:.9e}\n" for t in time_ns]
-    write_atomically(path, "".join(lines).encode("ascii"))
+    write_lines(path, (f"{(int(t) - int(time_ns[0])) * 1e-9:.9e}" for t in time_ns))
 
 
 def write_poses(path: Path, camera: Poses) -> None:
     """Write ``poses.txt``: the poses of the first camera at each frame relative to the first frame."""
-    world_from_camera = np.tile(np.eye(4), (len(camera.position), 1, 1))
-    world_from_camera[:, :3, :3] = camera.rotation
-    world_from_camera[:, :3, 3] = camera.position / camera.scale[0]  # true metres
+    world_from_camera = camera.matrices()
     poses = np.linalg.inv(world_from_camera[0]) @ world_from_camera
-    lines = [f"{numbers(pose[:3])}\n" for pose in poses]
-    write_atomically(path, "".join(lines).encode("ascii"))
+    write_lines(path, (numbers(pose[:3]) for pose in poses))
 
 
 def numbers(values: ArrayLike) -> str:

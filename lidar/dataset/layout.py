@@ -101,7 +101,7 @@ class Paths:
         return self.root / f"{name}{suffix}"
 
     def measurements_truth(self, name: str) -> Path:
-        """What stages did to the measurements of a GNSS receiver or an inertial unit."""
+        """Ground truth of stages on the measurements of a GNSS receiver or an inertial unit."""
         return self.measurements(name, ".truth.csv")
 
     def sensor(self, name: str) -> Path:
@@ -143,7 +143,7 @@ class Paths:
         return self.integrity / "chain.json"
 
     def truth(self, name: str, frame: int) -> Path:
-        """What stages did to a frame of a sensor."""
+        """Ground truth of stages on a frame of a sensor."""
         return self.root / name / "truth" / f"{frame:06d}.npz"
 
     def deskewed(self, name: str, frame: int, *, suffix: str) -> Path:

@@ -20,7 +20,7 @@ from lidar.sensors.navigation.nmea import satellites_used
 
 @dataclass(frozen=True, slots=True)
 class FixHeights:
-    """What the heights of fixes are above.
+    """Vertical reference of the heights of fixes.
 
     vertical   : as in `geoscene.geometry.frames.Frame`
     separation : (n,) metres, geoid above the ellipsoid at each fix; None if unknown
@@ -33,7 +33,7 @@ class FixHeights:
 
 
 def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, FixHeights]:
-    """The fixes of a receiver of a dataset, and what their heights are above.
+    """The fixes of a receiver of a dataset, and the vertical reference of their heights.
 
     vertical : of the dataset's frame
 
@@ -75,7 +75,7 @@ _EMPTY = (
 
 
 def _radians(degrees: Float) -> Float:
-    """Angles (n,) whose value in degrees is the given one, to the last bit where there is one."""
+    """Angles (n,) in radians that convert back to the given degrees bit for bit, where possible."""
     found = np.radians(degrees)
     for ulps in (-2, -1, 1, 2):
         near = found + ulps * np.spacing(found)

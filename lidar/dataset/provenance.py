@@ -1,4 +1,4 @@
-"""Where data come from: scene, sources, licences, versions of programs, and the data they were made from."""
+"""Provenance of data: scene, sources, licences, versions of programs, and the data they were made from."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ def derived_from(source: Path, former: Mapping[str, Any], *, by: str) -> dict[st
 
 
 def write_export_provenance(dataset: Dataset, folder: Path, *, by: str) -> None:
-    """Write what is known of a dataset to a folder in another layout."""
+    """Write the provenance of a dataset to a folder in another layout."""
     _write_known(dataset, folder / PROVENANCE, by=by)
 
 
 def write_map_provenance(dataset: Dataset, out: Path) -> None:
-    """Write what is known of a dataset beside a map that was made from it."""
+    """Write the provenance of a dataset beside a map that was made from it."""
     _write_known(dataset, out.with_name(f"{out.name}.{PROVENANCE}"), by="map")
 
 
@@ -87,13 +87,13 @@ def _write_known(dataset: Dataset, path: Path, *, by: str) -> None:
 
 
 def write_folder_provenance(source: Path, folder: Path, *, by: str) -> None:
-    """Write what is known of a folder of KITTI or nuScenes to one that was made from it."""
+    """Write the provenance of a folder of KITTI or nuScenes to one that was made from it."""
     known = read_folder_provenance(source)
     write_json(folder / PROVENANCE, known | derived_from(source, known, by=by))
 
 
 def read_folder_provenance(folder: Path) -> dict[str, Any]:
-    """What is known of a folder of KITTI or nuScenes; nothing of those that others made.
+    """Provenance of a folder of KITTI or nuScenes; empty for folders that other programs made.
 
     Raises DatasetError for a damaged file.
     """

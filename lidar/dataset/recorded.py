@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -71,6 +71,33 @@ def labelled_clouds(dataset: Dataset, name: str) -> Stream | None:
     return next((stream for stream in streams if stream is not None), None)
 
 
+def all_clouds(dataset: Dataset) -> list[Stream]:
+    """The clouds in the sensor frame with times and labels of all scanners that have some.
+
+    Raises DatasetError if there are none, or for frames without a time.
+    """
+    streams = [labelled_clouds(dataset, name) for name in dataset.sensors("lidar")]
+    if not (found := [stream for stream in streams if stream is not None]):
+        raise no_clouds(dataset)
+    return found
+
+
+def all_images(dataset: Dataset) -> list[Stream]:
+    """The colour images of all cameras that have some; raises as `color_images`."""
+    streams = (color_images(dataset, name) for name in dataset.sensors("camera"))
+    return [stream for stream in streams if stream is not None]
+
+
+def no_clouds(dataset: Dataset, *, of: str = "", formats: Sequence[Format] = ()) -> DatasetError:
+    """The error of a dataset without clouds in the sensor frame.
+
+    of      : scanners or kind of the clouds
+    formats : that would do; by default those with times and labels
+    """
+    names = ", ".join(form.name for form in formats or labelled_formats())
+    return DatasetError(f"{dataset.path}: no clouds{of} in the sensor frame; drive with `formats` {names}")
+
+
 def scanner_clouds(dataset: Dataset, name: str = "") -> Stream:
     """A scanner's clouds in the sensor frame with times and labels; of the first that has some by default.
 
@@ -83,10 +110,7 @@ def scanner_clouds(dataset: Dataset, name: str = "") -> Stream:
     for one in [name] if name else lidars:
         if (clouds := labelled_clouds(dataset, one)) is not None:
             return clouds
-    of = f" of {name}" if name else ""
-    raise DatasetError(
-        f"{dataset.path}: no clouds{of} in the sensor frame with times and labels; drive with --format pcd"
-    )
+    raise no_clouds(dataset, of=f" of {name}" if name else "")
 
 
 def frames_within(clouds: Stream, limits: tuple[int, float], *, every: int = 1) -> Stream:

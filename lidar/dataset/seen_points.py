@@ -48,7 +48,7 @@ class SceneReturns(Columns):
     velocity: Float
 
     def at(self, time_ns: Ints) -> Float:
-        """Where the surfaces (n, 3) of the returns are at other times (n,): road users move on straight."""
+        """Positions (n, 3) of the surfaces of the returns at other times (n,); road users move straight."""
         moved: Float = self.place + self.velocity * ((time_ns - self.time_ns) * 1e-9)[:, None]
         return moved
 
@@ -116,7 +116,7 @@ class ImageView:
         return counts_to_depth(counts.astype(np.uint16))
 
     def sight(self, returns: SceneReturns, row: int) -> Sight:
-        """Where an image shows returns, each at the time of the row of pixels that shows it.
+        """Projection of returns into an image, each at the time of the row of pixels that shows it.
 
         A return is hidden if the depth image shows a nearer surface there; without depth images, if another
         return of the cloud about there is nearer.

@@ -56,6 +56,12 @@ class Poses(Columns):
         found: Float = np.einsum("nji,nj->ni", self.rotation, (points - self.position) / self.scale)
         return found
 
+    def matrices(self) -> Float:
+        """Transformations (n, 4, 4) from the body, with positions in true metres from the scene's origin."""
+        found = np.tile(np.eye(4), (len(self.position), 1, 1))
+        found[:, :3, :3], found[:, :3, 3] = self.rotation, self.position / self.scale[:1]
+        return found
+
     def directions(self, vectors: Float) -> Float:
         """Ray directions (n, 3) in the scene of body vectors (n, 3), row by row.
 

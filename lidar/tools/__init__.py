@@ -1,1 +1,1 @@
-"""What is done with recorded data: maps, odometry, evaluation, attacks and defences, figures."""
+"""Tools for recorded data: maps, odometry, evaluation, attacks and defences, figures."""

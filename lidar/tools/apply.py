@@ -68,14 +68,14 @@ _SENSORS = {"kitti": "hdl64e_s2", "nuscenes": "hdl32e"}
 
 @dataclass(frozen=True, slots=True)
 class ApplySummary:
-    """What stages did to recorded data.
+    """Result of stages on recorded data.
 
     files          : point clouds, images and measurements of receivers and inertial units, as written
     points_in      : returns before the stages
     points         : returns after them
-    effects        : what each stage did
-    sight          : what told whether devices of attackers are in sight: rays in the ``scene``, or recorded
-        ``returns``; empty without any
+    effects        : counts of each stage
+    sight          : how lines of sight to attackers' devices were checked: by rays in the ``scene``, or by
+                     recorded ``returns``; empty without devices
     """
 
     path: Path
@@ -377,6 +377,6 @@ def _apply_to_clouds(
 
 
 def _place_of(path: Path, form: Format, *, device: Sensor) -> tuple[Situation, Callable[[], Seen]]:
-    """What a point cloud of KITTI or nuScenes tells about an attacker's line of sight."""
+    """Situation and echoes of a cloud of KITTI or nuScenes, by which lines of sight are checked."""
     at = Situation(device.name, path.name)
     return at, lambda: (*recorded_echoes(read_foreign(path, form, device=device), device, sent=None), at)

@@ -65,7 +65,7 @@ class _Sizes:
 
 
 def describe(path: str | Path, *, full: bool = False, progress: Progress = silent) -> dict[str, Any]:
-    """What is known of a dataset, or of a folder with clouds of KITTI or nuScenes, as a JSON document.
+    """Describe a dataset, or a folder with clouds of KITTI or nuScenes, as a JSON document.
 
     Only metadata and sizes are read.
 
@@ -327,7 +327,7 @@ def _road_users(dataset: Dataset) -> dict[str, int]:
 
 
 def _foreign(folder: Path, clouds: Sequence[tuple[Path, Format]]) -> dict[str, Any]:
-    """What is known of a folder of KITTI or nuScenes."""
+    """Describe a folder of KITTI or nuScenes."""
     groups: dict[str, dict[str, Any]] = {}
     for path, form in clouds:
         place, size = path.parent.relative_to(folder).as_posix(), path.stat().st_size

@@ -1,4 +1,4 @@
-"""What is known of recorded data, as text for a terminal."""
+"""Descriptions of recorded data as text for a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a dataset was recorded from, its clouds as stages read them, and their files once they are changed."""
+"""Recordings of datasets that are written again, their clouds as stages read them, and changed clouds."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def truth_of_past(dataset: Dataset, device: Scanner | Camera, *, frame: int) -> 
 
 
 def recording_again(dataset: Dataset, out: Path, *, stages: Stages = NO_STAGES) -> Recording:
-    """What the frames of a dataset are written from once more, to another directory.
+    """The recording by which the frames of a dataset are written again, to another directory.
 
     Raises DatasetError for a damaged ``dataset.json``.
     """

@@ -44,7 +44,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True)
 class SignSummary:
-    """What was signed.
+    """Result of signing.
 
     marked : clouds that got the watermark
     rms    : metres by which it moved points, root mean square of their distance

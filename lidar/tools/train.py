@@ -289,7 +289,7 @@ def _best_threshold(probability: Float, true: Bools) -> tuple[float, float, floa
 
 
 def _drives(datasets: Sequence[str | Path]) -> list[dict[str, Any]]:
-    """What drives a model was trained on: their names, scenes, seeds, scanners, and credits of the maps."""
+    """Drives that a model was trained on: their names, scenes, seeds, scanners, and credits of the maps."""
     rows = []
     for path in datasets:
         dataset = open_dataset(path)

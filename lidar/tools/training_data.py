@@ -32,7 +32,7 @@ _BOX = (
 
 @dataclass(frozen=True)
 class _Drive:
-    """What a drive's samples are read from.
+    """Sources of the samples of a drive.
 
     clouds : of the scanner
     images : of each camera
@@ -113,7 +113,7 @@ class TrainingData(Sequence[Any]):
         return sample if self.transform is None else self.transform(sample)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: all but the trajectories, which are read again."""
+        """State for pickling, without the trajectories, which are read again."""
         return self.__dict__ | {"_trajectories": {}}
 
     def split(self, share: float) -> tuple[TrainingData, TrainingData]:
@@ -226,7 +226,7 @@ def training_data(
 
 
 def _drive(dataset: Dataset, sensor: str, *, cameras: Sequence[str]) -> _Drive:
-    """What the samples of a dataset are read from."""
+    """Sources of the samples of a dataset."""
     scanners = dataset.sensors("lidar")
     name = sensor or next(iter(scanners), "")
     if name not in scanners:

@@ -55,7 +55,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class ChainReport:
-    """What the hash chain says.
+    """Comparison with the signed hash chain.
 
     frames, files : that were compared
     """
@@ -97,7 +97,7 @@ class MarkedFrame:
 
 @dataclass
 class WatermarkReport:
-    """What the watermark says of all clouds.
+    """Results of the watermark's test over all clouds.
 
     noise         : standard deviation in metres that the tests allow for
     expected_rate : share of wrong bits by that noise
@@ -133,7 +133,7 @@ class WatermarkReport:
 
 @dataclass(frozen=True)
 class ChecksumReport:
-    """What the checksums of a folder say.
+    """Comparison with the checksums of a folder.
 
     files  : that have checksums
     digest : of the folder, hexadecimal; empty if it has no checksums
@@ -146,7 +146,7 @@ class ChecksumReport:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What watermark, hash chain and checksums say; None for what was not asked for."""
+    """Results of watermark, hash chain and checksums; None for tests that were not run."""
 
     watermark: WatermarkReport | None = None
     chain: ChainReport | None = None
@@ -209,7 +209,7 @@ def verify_dataset(
     false_alarms: float = 0.01,
     progress: Progress = silent,
 ) -> VerifyReport:
-    """What was changed since a folder was written or, with keys, tampered with since `sign_dataset`.
+    """Find changes since a folder was written or, with keys, tampering since `sign_dataset`.
 
     Without ``watermark`` and ``signer`` the checksums of the folder, which may be at a URL, are compared:
     they find damage, but whoever changes files can also change them.
@@ -422,7 +422,7 @@ def _frames_found(
 
 
 def _broken_link(links: list[Link], sensor: str, *, head: tuple[int, bytes]) -> str:
-    """Where a chain is broken, in words; empty if it leads to the signed last link."""
+    """Description of the place where a chain is broken; empty if it leads to the signed last link."""
     former = START
     for entry in links:
         former = link(former, sensor=sensor, frame=entry.frame, time_ns=entry.time_ns, root=entry.root)
@@ -476,7 +476,7 @@ def _files_found(
 def _change(
     path: Path, name: str, *, digests: FrameDigests, rate_hz: float, where: dict[str, Any]
 ) -> Finding:
-    """What differs in a file of a frame."""
+    """Describe the differences in a file of a frame."""
     before = digests.blocks.get(name)
     if before is None:
         return Finding("changed", name, **where)

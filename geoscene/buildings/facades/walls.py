@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from geoscene.geometry.mesh import WALL, Mesh
 from geoscene.geometry.watertight import edge_uses, weld
 from geoscene.support.columns import Columns
+from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Ints
 
 _UPRIGHT = 1e-3
@@ -102,15 +103,10 @@ def _of_largest(value: Float, *, group: Ints, area: Float) -> Float:
 
 def _connect(corners: Float, bearing: Ints) -> Ints:
     """Number (m,) of the wall of each face: faces of one bearing that edges connect."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - slow to import
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
     ids, _ = weld(corners.reshape(-1, 3), np.repeat(bearing, 3))
     edge, uses, _ = edge_uses(ids.reshape(-1, 3))
     face, m = np.repeat(np.arange(len(bearing)), 3), len(bearing)
-    size = m + len(uses)
-    links = coo_array((np.ones(len(edge), np.int8), (face, m + edge)), shape=(size, size))
-    return np.asarray(connected_components(links, directed=False)[1][:m], np.int64)
+    return components(face, m + edge, count=m + len(uses))[:m]
 
 
 def _measure(

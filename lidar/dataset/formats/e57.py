@@ -43,7 +43,7 @@ _BYTE, _SHORT, _INT, _WORD = (0, 255), (0, 2**16 - 1), (-(2**31), 2**31 - 1), (0
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """Where and how a column is stored.
+    """E57 field of a column.
 
     name   : of the E57 field
     kind   : type of the column

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ExportSummary:
-    """What was exported.
+    """Result of an export.
 
     path   : the folder
     counts : number of objects of each kind that were written

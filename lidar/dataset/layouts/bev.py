@@ -17,8 +17,7 @@ from geoscene.support.files import atomic_path, write_json
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
-from lidar.dataset.recorded import labelled_clouds, still_points
-from lidar.errors import DatasetError
+from lidar.dataset.recorded import all_clouds, still_points
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Poses, Trajectory
 
@@ -35,13 +34,10 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without clouds in the sensor frame.
     """
-    streams = [s for name in dataset.sensors("lidar") if (s := labelled_clouds(dataset, name)) is not None]
-    if not streams:
-        raise DatasetError(f"{dataset.path}: no clouds in the sensor frame; drive with `formats` pcd")
+    streams = all_clouds(dataset)
     trajectory, geo = dataset.trajectory(), Georeference(dataset.frame, dataset.crs)
     total, done, count = sum(len(s.files) for s in streams), 0, 0
     for stream in streams:
-        (folder / stream.name).mkdir(parents=True, exist_ok=True)
         mount = stream.mount.matrix
         for row, frame in enumerate(stream.frames.tolist()):
             table = still_points(stream, trajectory, row=row)

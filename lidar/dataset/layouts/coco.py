@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +18,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
 from geoscene.classes import Class, class_codes
-from geoscene.support.files import write_atomically
+from geoscene.support.files import copy_file, write_atomically
 from geoscene.support.progress import Progress
 from geoscene.typing import Ints
-from lidar.dataset.boxes import read_boxes
+from lidar.dataset.boxes import boxes_by_frame
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.png import feature_to_image, image_to_feature, read_png, write_png
-from lidar.dataset.recorded import Stream, color_images
+from lidar.dataset.recorded import Stream, all_images
 from lidar.errors import DatasetError
 from lidar.geometry.time_scales import iso_times
 
@@ -42,6 +40,7 @@ THINGS = (
 
 _ROAD_USERS = frozenset(klass for klass in THINGS if klass >= Class.CAR)
 _BOX = ("left", "top", "right", "bottom")
+_COLUMNS = ("frame", "id", "instance", "class", *_BOX, "pixels", "visibility")
 _SEEN = tuple(f"seen_{side}" for side in _BOX)
 _EDGE = 0.5
 """Pixels from the coordinates of a dataset, whose first pixel has its centre at 0, to COCO's edges at 0."""
@@ -54,8 +53,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without colour images.
     """
-    streams = [color_images(dataset, name) for name in dataset.sensors("camera")]
-    cameras = [stream for stream in streams if stream is not None]
+    cameras = all_images(dataset)
     if not cameras:
         raise DatasetError(f"{dataset.path}: holds no colour images; drive with a rig that has cameras")
     images: list[Row] = []
@@ -63,13 +61,12 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     panoptic: list[Row] = []
     total = sum(len(camera.files) for camera in cameras)
     for camera in cameras:
-        road_users = _boxes(dataset, camera.name)
+        road_users = boxes_by_frame(dataset.paths.sensor_boxes(camera.name), _COLUMNS, key="instance")
         segmented = _has_segments(dataset, camera)
         for row, frame in enumerate(camera.frames.tolist()):
             image = _image(dataset, camera, row=row, number=len(images) + 1)
             images.append(image)
-            (folder / "images").mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(camera.files[row], folder / "images" / image["file_name"])
+            copy_file(camera.files[row], folder / "images" / image["file_name"])
             boxes = road_users.get(frame, {})
             if segmented:
                 segments = _segments(dataset, camera, frame=frame)
@@ -224,7 +221,7 @@ def _annotate_box(box: Row) -> Row:
 
 
 def _of_road_user(box: Row | None) -> Row:
-    """What is known of a road user beside COCO's entries: its number, visibility and whole box."""
+    """Entries of a road user beyond COCO's: track id, visibility and amodal box."""
     if box is None:
         return {}
     whole = _edges([box[name] for name in _BOX])
@@ -240,7 +237,6 @@ def _edges(sides: list[float]) -> list[float]:
 def _panoptic(segments: _Segments, image: Row, *, folder: Path) -> Row:
     """Write the panoptic image of a frame; return its annotation."""
     numbers = _numbers(segments)
-    folder.mkdir(parents=True, exist_ok=True)
     pixels = np.append(0, numbers)[segments.index]
     write_png(folder / image["file_name"], feature_to_image((pixels - 1).astype(np.int32)))
     rows = zip(numbers, segments.klass.tolist(), segments.areas().tolist(), segments.boxes(), strict=True)
@@ -281,16 +277,6 @@ def _has_segments(dataset: Dataset, camera: Stream) -> bool:
     return True
 
 
-def _boxes(dataset: Dataset, name: str) -> dict[int, dict[int, Row]]:
-    """Rows of a camera's boxes by frame and instance; none without traffic."""
-    path = dataset.paths.sensor_boxes(name)
-    found: dict[int, dict[int, Row]] = defaultdict(dict)
-    if path.exists():
-        for row in read_boxes(path, ("frame", "id", "instance", "class", *_BOX, "pixels", "visibility")):
-            found[row["frame"]][row["instance"]] = row
-    return found
-
-
 def _image(dataset: Dataset, camera: Stream, *, row: int, number: int) -> Row:
     """The entry of an image."""
     stamp = iso_times(dataset.start, camera.time_ns[row : row + 1])[0]
@@ -321,5 +307,4 @@ def _about(dataset: Dataset) -> Row:
 
 
 def _write(folder: Path, name: str, *, document: Row) -> None:
-    (folder / "annotations").mkdir(parents=True, exist_ok=True)
     write_atomically(folder / "annotations" / f"{name}.json", json.dumps(document).encode("utf-8"))

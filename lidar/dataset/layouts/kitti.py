@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import numbers, write_calibration, write_poses, write_times
 from lidar.dataset.layout import Dataset
@@ -51,15 +51,13 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 def _write_objects(drive: KittiDrive, sequence: Path) -> int:
     """Write the object labels and the calibration of each frame; return the number of objects."""
     boxes, stream = drive.image_boxes(OBJECTS), drive.cameras[OBJECTS]
-    calibration = "\n".join([*_object_calibration(drive), ""]).encode("ascii")
+    calibration = _object_calibration(drive)
     count = 0
     for row in range(len(drive)):
         frame = int(stream.frames[drive.images[OBJECTS][row]])
         lines = object_lines(drive, number=OBJECTS, row=row, image_boxes=boxes.get(frame, {})).values()
-        write_atomically(
-            sequence / "label_2" / f"{row:06d}.txt", "".join(f"{s}\n" for s in lines).encode("ascii")
-        )
-        write_atomically(sequence / "calib" / f"{row:06d}.txt", calibration)
+        write_lines(sequence / "label_2" / f"{row:06d}.txt", lines)
+        write_lines(sequence / "calib" / f"{row:06d}.txt", calibration)
         count += len(lines)
     return count
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_atomically, write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.kitti_sequence import numbers
@@ -133,8 +133,8 @@ def _write_calibration(drive: KittiDrive, folder: Path) -> None:
         f"image_{number:02d}: {numbers((unit_from_vehicle @ _mount(drive, number).matrix)[:3])}"
         for number in range(4)
     ]
-    _write(folder / "calib_cam_to_pose.txt", to_unit)
-    _write(folder / "calib_cam_to_velo.txt", [numbers(np.linalg.inv(drive.camera_from_lidar)[:3])])
+    write_lines(folder / "calib_cam_to_pose.txt", to_unit)
+    write_lines(folder / "calib_cam_to_velo.txt", [numbers(np.linalg.inv(drive.camera_from_lidar)[:3])])
     lines = []
     for number in _CAMERAS:
         stream = drive.cameras.get(number, next(iter(drive.cameras.values()), None))
@@ -146,7 +146,7 @@ def _write_calibration(drive: KittiDrive, folder: Path) -> None:
         values = {"S": size, "K": K, "D": np.zeros(5), "R": moved[:3, :3], "T": moved[:3, 3]}
         values |= {"S_rect": size, "R_rect": np.eye(3), "P_rect": np.column_stack([K, K @ moved[:3, 3]])}
         lines += [f"{name}_{number:02d}: {numbers(value)}" for name, value in values.items()]
-    _write(folder / "perspective.txt", lines)
+    write_lines(folder / "perspective.txt", lines)
 
 
 def _mount(drive: KittiDrive, number: int) -> Mount:
@@ -156,18 +156,11 @@ def _mount(drive: KittiDrive, number: int) -> Mount:
 
 def _write_poses(drive: KittiDrive, folder: Path) -> None:
     """Write the poses of the inertial unit and of the first camera at each frame."""
-    vehicle = drive.trajectory.at(drive.clouds.time_ns)
-    world_from_vehicle = np.tile(np.eye(4), (len(drive), 1, 1))
-    world_from_vehicle[:, :3, :3] = vehicle.rotation
-    world_from_vehicle[:, :3, 3] = vehicle.position / vehicle.scale[:1]
+    world_from_vehicle = drive.trajectory.at(drive.clouds.time_ns).matrices()
     unit = world_from_vehicle @ _vehicle_from_unit(drive)
     camera = world_from_vehicle @ drive.reference.matrix
-    _write(folder / "poses.txt", [f"{row} {numbers(pose[:3])}" for row, pose in enumerate(unit)])
-    _write(folder / "cam0_to_world.txt", [f"{row} {numbers(pose)}" for row, pose in enumerate(camera)])
-
-
-def _write(path: Path, lines: Iterable[str]) -> None:
-    write_atomically(path, "".join(f"{line}\n" for line in lines).encode("ascii"))
+    write_lines(folder / "poses.txt", [f"{row} {numbers(pose[:3])}" for row, pose in enumerate(unit)])
+    write_lines(folder / "cam0_to_world.txt", [f"{row} {numbers(pose)}" for row, pose in enumerate(camera)])
 
 
 def _instances(drive: KittiDrive) -> dict[int, tuple[str, int, int]]:
@@ -239,7 +232,6 @@ class _Labels:
             pixels = np.where(self.features[place] == feature, self.values[place], pixels)
         folder, name = self.out / f"image_{number:02d}", f"{row:010d}.png"
         for kind, image in (("semantic", (pixels // _INSTANCES).astype(np.uint8)), ("instance", pixels)):
-            (folder / kind).mkdir(parents=True, exist_ok=True)
             write_png(folder / kind / name, image)
         if number == self.cameras[0]:
             for value in np.unique(pixels).tolist():

@@ -7,13 +7,12 @@ per metre, 0 without data, with the images and their intrinsics.
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from geoscene.support.files import write_atomically, write_json
+from geoscene.support.files import copy_file, write_json, write_lines
 from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset
@@ -41,9 +40,9 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     half = int(0.5e9 / float(clouds.sensor["rate_hz"]))
     total, done, depths = sum(len(view.images.files) for view in views), 0, 0
     for channel, view in zip(_channels(views), views, strict=True):
-        write_atomically(
+        write_lines(
             folder / "train" / name / "intrinsics" / f"{channel}.txt",
-            f"{numbers(intrinsic_matrix(view.camera))}\n".encode("ascii"),
+            [numbers(intrinsic_matrix(view.camera))],
         )
         for row, time_ns in enumerate(view.images.time_ns.tolist()):
             cloud = int(np.abs(clouds.time_ns + half - time_ns).argmin())
@@ -63,11 +62,9 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
             parts = place / "proj_depth" / "velodyne_raw", place / "proj_depth" / "groundtruth", place
             paths = [part / channel / f"{row:010d}.png" for part in parts[:2]]
             paths.append(place / channel / "data" / f"{row:010d}.png")
-            for path in paths:
-                path.parent.mkdir(parents=True, exist_ok=True)
             write_png(paths[0], depth_to_counts(sparse))
-            shutil.copyfile(_depth_file(dataset, view, row=row), paths[1])
-            shutil.copyfile(dataset.frame_file(view.images.files[row]), paths[2])
+            copy_file(_depth_file(dataset, view, row=row), paths[1])
+            copy_file(dataset.frame_file(view.images.files[row]), paths[2])
             done, depths = done + 1, depths + int(np.isfinite(sparse).sum())
             progress("depth completion", done, total=total)
     cameras = [view.camera.name for view in views]

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import shutil
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,24 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.support.files import write_atomically
+from geoscene.support.files import copy_file, write_lines
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, read_boxes
+from lidar.dataset.boxes import COLUMNS, boxes_by_frame
 from lidar.dataset.formats import FORMATS, LABELS, kitti
 from lidar.dataset.kitti_sequence import looking_ahead, projection
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import (
     Stream,
+    all_images,
     clouds_in,
-    color_images,
     labelled_clouds,
     labelled_formats,
     mount_of,
     nearest,
+    no_clouds,
     recorded_labels,
     still_points,
 )
-from lidar.errors import DatasetError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import iso_times
@@ -112,43 +110,38 @@ class KittiDrive:
     def boxes(self) -> Boxes:
         """3D boxes as seen from the scanner; none without traffic."""
         path = self.dataset.paths.sensor_boxes(self.clouds.name)
-        return _by_frame(path, (*COLUMNS, "points", "visibility")) if path.exists() else {}
+        return boxes_by_frame(path, (*COLUMNS, "points", "visibility"))
 
     def image_boxes(self, number: int) -> Boxes:
         """2D boxes in a camera's images; none without traffic."""
         path = self.dataset.paths.sensor_boxes(self.cameras[number].name)
         columns = ("frame", "id", "left", "top", "right", "bottom", "pixels", "visibility")
-        return _by_frame(path, columns) if path.exists() else {}
+        return boxes_by_frame(path, columns)
 
     def write_cloud(self, path: Path, *, row: int, labels: Path | None = None) -> None:
         """Write a frame's cloud and, if wanted and recorded, SemanticKITTI's labels of its points."""
-        path.parent.mkdir(parents=True, exist_ok=True)
         source = self.clouds.files[row]
         if source.name.endswith(FORMATS["kitti"].suffix):
-            shutil.copyfile(source, path)
+            copy_file(source, path)
             folder, frame = self.dataset.paths.sensor(self.clouds.name), int(self.clouds.frames[row])
             recorded = LABELS["semantickitti"].path(folder, frame)
             if labels is not None and self.dataset.frame_file(recorded).exists():
-                labels.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(recorded, labels)
+                copy_file(recorded, labels)
             return
         table = still_points(self.clouds, self.trajectory, row=row)
         kitti.write(path, table)
         if labels is not None:
             found = recorded_labels(table, self.boxes.get(int(self.clouds.frames[row]), {}).values())
-            labels.parent.mkdir(parents=True, exist_ok=True)
             kitti.write_labels(labels, found)
 
     def write_image(self, path: Path, *, number: int, row: int) -> None:
         """Write the image of a frame from a camera."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(self.cameras[number].files[self.images[number][row]], path)
+        copy_file(self.cameras[number].files[self.images[number][row]], path)
 
 
 def write_stamps(path: Path, dataset: Dataset, *, times: Ints) -> None:
     """Write UTC time stamps with nanoseconds, a line each."""
-    lines = [f"{stamp[:-1].replace('T', ' ')}\n" for stamp in iso_times(dataset.start, times)]
-    write_atomically(path, "".join(lines).encode("ascii"))
+    write_lines(path, (stamp[:-1].replace("T", " ") for stamp in iso_times(dataset.start, times)))
 
 
 def read_drive(dataset: Dataset, *, numbers: Sequence[int] = _NUMBERS) -> KittiDrive:
@@ -164,12 +157,8 @@ def read_drive(dataset: Dataset, *, numbers: Sequence[int] = _NUMBERS) -> KittiD
     )
     clouds = next((stream for stream in found if stream is not None), None)
     if clouds is None:
-        formats = ", ".join(form.name for form in [*labelled_formats(), FORMATS["kitti"]])
-        raise DatasetError(
-            f"{dataset.path}: holds no clouds in the sensor frame; drive with `formats` {formats}"
-        )
-    streams = [color_images(dataset, name) for name in dataset.sensors("camera")]
-    cameras = [s for s in streams if s is not None and _is_rectified(s)]
+        raise no_clouds(dataset, formats=[*labelled_formats(), FORMATS["kitti"]])
+    cameras = [stream for stream in all_images(dataset) if _is_rectified(stream)]
     return KittiDrive(dataset, clouds, _assign_numbers(cameras, numbers))
 
 
@@ -189,10 +178,3 @@ def _assign_numbers(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[i
     for camera in others[len(free) :]:
         log.warning("%s: left out: there are %d cameras in this layout", camera.name, len(numbers))
     return dict(sorted({**own, **dict(zip(free, others, strict=False))}.items()))
-
-
-def _by_frame(path: Path, columns: Sequence[str]) -> Boxes:
-    rows: Boxes = defaultdict(dict)
-    for row in read_boxes(path, columns):
-        rows[row["frame"]][row["id"]] = row
-    return rows

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
 from lidar.dataset.kitti_sequence import numbers
@@ -70,8 +70,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     drive = read_drive(dataset)
     date = dataset.start.strftime("%Y_%m_%d")
     _write_calibrations(drive, folder / date)
-    meanings = "".join(f"{name}: {meaning}\n" for name, meaning in _OXTS.items())
-    write_atomically(folder / "dataformat.txt", meanings.encode("ascii"))
+    write_lines(folder / "dataformat.txt", (f"{name}: {meaning}" for name, meaning in _OXTS.items()))
     out = folder / date / f"{date}_drive_0001_sync"
     time_ns = drive.clouds.time_ns
     period_ns = round(1e9 / float(drive.clouds.sensor["rate_hz"]))
@@ -84,8 +83,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     oxts = oxts_columns(drive)
     rows = zip(*(oxts[name].tolist() for name in _OXTS), strict=True)
     for row, values in enumerate(rows):
-        text = " ".join(str(value) for value in values) + "\n"
-        write_atomically(out / "oxts" / "data" / f"{row:010d}.txt", text.encode("ascii"))
+        write_lines(out / "oxts" / "data" / f"{row:010d}.txt", [" ".join(map(str, values))])
         drive.write_cloud(out / "velodyne_points" / "data" / f"{row:010d}.bin", row=row)
         for number in drive.cameras:
             drive.write_image(
@@ -174,5 +172,5 @@ def _rigid(transform: Float) -> dict[str, ArrayLike]:
 
 
 def _write_calibration(path: Path, stamp: str, *, values: dict[str, ArrayLike]) -> None:
-    lines = [f"calib_time: {stamp}", *(f"{name}: {numbers(value)}" for name, value in values.items()), ""]
-    write_atomically(path, "\n".join(lines).encode("ascii"))
+    lines = (f"{name}: {numbers(value)}" for name, value in values.items())
+    write_lines(path, [f"calib_time: {stamp}", *lines])

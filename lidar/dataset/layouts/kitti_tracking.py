@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset
@@ -47,15 +47,13 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
                 training / f"image_{number:02d}" / SEQUENCE / f"{row:06d}.png", number=number, row=row
             )
         progress("KITTI tracking", row + 1, total=len(drive))
-    write_atomically(
-        training / "label_02" / f"{SEQUENCE}.txt", "".join(f"{s}\n" for s in lines).encode("ascii")
-    )
+    write_lines(training / "label_02" / f"{SEQUENCE}.txt", lines)
     named = {f"P{k}": matrix for k, matrix in enumerate(drive.projections)}
     named |= {"R_rect": np.eye(3), "Tr_velo_cam": drive.camera_from_lidar[:3]}
     named |= {"Tr_imu_velo": drive.lidar_from_imu[:3]}
-    calibration = "".join(
-        f"{name}{':' if name.startswith('P') else ''} {numbers(matrix)}\n" for name, matrix in named.items()
+    write_lines(
+        training / "calib" / f"{SEQUENCE}.txt",
+        (f"{name}{':' if name.startswith('P') else ''} {numbers(matrix)}" for name, matrix in named.items()),
     )
-    write_atomically(training / "calib" / f"{SEQUENCE}.txt", calibration.encode("ascii"))
     images = len(drive) * len(drive.cameras)
     return {"clouds": len(drive), "images": images, "tracks": len(tracks), "boxes": len(lines)}

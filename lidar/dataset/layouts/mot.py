@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from geoscene.classes import Class
-from geoscene.support.files import write_atomically
+from geoscene.support.files import copy_file, write_lines
 from geoscene.support.progress import Progress
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset
-from lidar.dataset.recorded import Stream, color_images
+from lidar.dataset.recorded import Stream, all_images
 from lidar.errors import DatasetError
 
 CLASSES = {
@@ -43,7 +42,7 @@ class TrackedBox:
         """A line of MOT, whose numbers of images, tracks and pixels begin at 1."""
         left, top, right, bottom = self.box
         place = f"{left + 1:.2f},{top + 1:.2f},{right - left:.2f},{bottom - top:.2f}"
-        return f"{self.image + 1},{self.track + 1},{place},1,{self.kind},{self.visibility:.4f}\n"
+        return f"{self.image + 1},{self.track + 1},{place},1,{self.kind},{self.visibility:.4f}"
 
 
 _COLUMNS = ("frame", "id", "left", "top", "right", "bottom", "pixels", "visibility")
@@ -56,31 +55,27 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without colour images or road users.
     """
-    streams = [s for name in dataset.sensors("camera") if (s := color_images(dataset, name)) is not None]
-    streams = [s for s in streams if dataset.paths.sensor_boxes(s.name).exists()]
+    streams = [s for s in all_images(dataset) if dataset.paths.sensor_boxes(s.name).exists()]
     if not streams:
         raise DatasetError(f"{dataset.path}: no images with boxes of road users; drive with `traffic`")
     total, done, boxes = sum(len(s.files) for s in streams), 0, 0
     tracks: set[int] = set()
     for stream in streams:
         place = folder / "train" / stream.name
-        (place / "img1").mkdir(parents=True, exist_ok=True)
         lines = sequence(dataset, stream)
         tracks |= {line.track for line in lines}
         width, height = int(stream.sensor["width"]), int(stream.sensor["height"])
-        write_atomically(place / "gt" / "gt.txt", "".join(line.text() for line in lines).encode("ascii"))
+        write_lines(place / "gt" / "gt.txt", (line.text() for line in lines))
         info = {"name": stream.name, "imDir": "img1", "frameRate": f"{float(stream.sensor['rate_hz']):g}"}
         info |= {"seqLength": str(len(stream.files)), "imWidth": str(width), "imHeight": str(height)}
         info |= {"imExt": ".png"}
-        text = "[Sequence]\n" + "".join(f"{key}={value}\n" for key, value in info.items())
-        write_atomically(place / "seqinfo.ini", text.encode("ascii"))
+        write_lines(place / "seqinfo.ini", ["[Sequence]", *(f"{key}={value}" for key, value in info.items())])
         for k, path in enumerate(stream.files):
-            shutil.copyfile(dataset.frame_file(path), place / "img1" / f"{k + 1:06d}.png")
+            copy_file(dataset.frame_file(path), place / "img1" / f"{k + 1:06d}.png")
             done += 1
             progress("MOT", done, total=total)
         boxes += len(lines)
-    names = ["name", *(stream.name for stream in streams)]
-    write_atomically(folder / "seqmaps" / "all.txt", "".join(f"{name}\n" for name in names).encode("utf-8"))
+    write_lines(folder / "seqmaps" / "all.txt", ["name", *(stream.name for stream in streams)])
     return {"images": done, "tracks": len(tracks), "boxes": boxes}
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from PIL import Image, ImageDraw
 from geoscene.classes import Class, class_codes
 from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
-from geoscene.support.files import write_atomically
+from geoscene.support.files import copy_file, write_atomically
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.boxes import COLUMNS, read_boxes
@@ -33,12 +32,11 @@ from lidar.dataset.recorded import (
     Stream,
     color_images,
     labelled_clouds,
-    labelled_formats,
     nearest,
+    no_clouds,
     recorded_labels,
     still_points,
 )
-from lidar.errors import DatasetError
 from lidar.geometry.poses import Trajectory
 
 Row = dict[str, Any]
@@ -102,10 +100,7 @@ def streams_of(dataset: Dataset) -> dict[str, Stream]:
         if stream is not None:
             streams["LIDAR_TOP" if lidar and "LIDAR_TOP" not in streams else name.upper()] = stream
     if "LIDAR_TOP" not in streams:
-        names = ", ".join(form.name for form in labelled_formats())
-        raise DatasetError(
-            f"{dataset.path}: holds no labelled clouds in the sensor frame; drive with `formats` {names}"
-        )
+        raise no_clouds(dataset)
     return streams
 
 
@@ -166,7 +161,6 @@ class _Export:
             self.tables["sample_data"] += rows
         self._annotate(top, keys, samples=samples)
         self._describe(samples)
-        (self.out / VERSION).mkdir(parents=True, exist_ok=True)
         for name in (*_TABLES, *(("lidarseg",) if self.tables["lidarseg"] else ())):
             document = json.dumps(self.tables[name], indent=0)
             write_atomically(self.out / VERSION / f"{name}.json", document.encode("utf-8"))
@@ -220,11 +214,10 @@ class _Export:
         suffix, folder = ".pcd.bin" if lidar else ".png", "samples" if key else "sweeps"
         name = f"{folder}/{channel}/{self.name}__{channel}__{self._stamp(time)}{suffix}"
         path = self.out / name
-        path.parent.mkdir(parents=True, exist_ok=True)
         if lidar:
             self._write_cloud(stream, k, path=path, token=token, labelled=key)
         else:
-            shutil.copyfile(source, path)
+            copy_file(source, path)
         return {
             "token": token,
             "sample_token": samples[sample]["token"],
@@ -244,7 +237,6 @@ class _Export:
         nuscenes.write(path, table)
         if labelled:
             name = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
-            (self.out / name).parent.mkdir(parents=True, exist_ok=True)
             nuscenes.write_labels(self.out / name, recorded_labels(table))
             self.tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": name})
 
@@ -323,7 +315,6 @@ class _Export:
             }
         ]
         mask = "maps/drivable.png"
-        (self.out / "maps").mkdir(parents=True, exist_ok=True)
         write_png(self.out / mask, self._map_mask())
         self.tables["map"] = [
             {

@@ -22,8 +22,7 @@ from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.png import write_png
-from lidar.dataset.recorded import cloud_points, labelled_clouds
-from lidar.errors import DatasetError
+from lidar.dataset.recorded import all_clouds, cloud_points
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.scanner import firings
 from lidar.sensors.rig.specs import Rig, rig_of
@@ -46,9 +45,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without clouds in the sensor frame.
     """
-    streams = [s for name in dataset.sensors("lidar") if (s := labelled_clouds(dataset, name)) is not None]
-    if not streams:
-        raise DatasetError(f"{dataset.path}: no clouds in the sensor frame; drive with `formats` pcd")
+    streams = all_clouds(dataset)
     total = sum(len(s.files) for s in streams)
     done = kept = left = 0
     devices = {device.name: device for device in scanners(_rig(dataset))}
@@ -57,8 +54,6 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
         shape = _shape([dataset.frame_file(path) for path in stream.files])
         shift = shifts(devices[stream.name], shape)
         place = folder / stream.name
-        for kind in ("range", "png", "label", "instance"):
-            (place / kind).mkdir(parents=True, exist_ok=True)
         for frame, table in zip(stream.frames.tolist(), tables, strict=True):
             rows, cell = pixels(table, shape, shift=shift)
             image = np.full((shape[0] * shape[1], len(CHANNELS)), np.nan, np.float32)

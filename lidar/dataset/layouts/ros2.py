@@ -85,7 +85,7 @@ def _connection(bag: Any, topic: Topic) -> Any:
 
 
 def _about(drive: RosDrive) -> dict[str, str]:
-    """What the recording states of itself: where its map frame lies, and whom the map is from."""
+    """Custom metadata of the recording: CRS, origin and scale of its map frame, and attribution."""
     dataset = drive.dataset
     with reading_file(dataset.paths.manifest):
         attribution = str(dataset.manifest["attribution"])

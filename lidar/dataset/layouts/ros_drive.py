@@ -1,4 +1,4 @@
-"""What all topics of a drive share in a ROS 2 recording: frames, names and time stamps.
+"""Frames, names and time stamps shared by all topics of a drive in a ROS 2 recording.
 
 Frames: ``map`` (REP 105: true metres from the scene's origin, x east, y north, z up), ``base_link`` (the
 vehicle) and one of each sensor's name; a camera has ``<name>`` with the axes of a body (x forward, y left,

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from geoscene.classes import Class
-from geoscene.support.files import write_atomically
+from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, read_boxes
+from lidar.dataset.boxes import COLUMNS, boxes_by_frame, read_boxes
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.layouts.waymo_parquet import DISTORTION, SHUTTER, Component, Row
 from lidar.dataset.layouts.waymo_range_images import (
@@ -32,8 +32,8 @@ from lidar.dataset.layouts.waymo_range_images import (
 )
 from lidar.dataset.recorded import (
     Stream,
+    all_images,
     cloud_points,
-    color_images,
     labelled_clouds,
     labelled_formats,
     nearest,
@@ -77,7 +77,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     Raises DatasetError for a drive without labelled clouds in the sensor frame.
     """
     drive = _drive(dataset)
-    write_atomically(folder / SEGMENTS, f"{drive.context}\n".encode())
+    write_lines(folder / SEGMENTS, [drive.context])
     counts = dict.fromkeys(("frames", "clouds", "images", "3D boxes", "2D boxes", "points without pixel"), 0)
     with ExitStack() as opened:
         files = {tag: Component(tag, folder, context=drive.context) for tag in _written(drive)}
@@ -101,7 +101,7 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
 @dataclass(frozen=True)
 class _Drive:
-    """What is written of a drive.
+    """A drive as Waymo's components hold it.
 
     lasers  : of scanners, the first of which gives the frames
     cameras : by number
@@ -135,9 +135,8 @@ class _Drive:
 
     def matrix(self, time_ns: int) -> Float:
         """The pose (4, 4) of the vehicle at a time, world from vehicle."""
-        pose, out = self.trajectory.at([time_ns]), np.eye(4)
-        out[:3, :3], out[:3, 3] = pose.rotation[0], pose.position[0] / pose.scale[0]
-        return out
+        matrix: Float = self.trajectory.at([time_ns]).matrices()[0]
+        return matrix
 
 
 def _drive(dataset: Dataset) -> _Drive:
@@ -199,14 +198,11 @@ def _lasers(dataset: Dataset) -> tuple[RangeImageGrid, ...]:
 def _cameras(dataset: Dataset) -> dict[int, Stream]:
     """Pinhole cameras by the number of the name whose direction is nearest to theirs."""
     streams = []
-    for name in dataset.sensors("camera"):
-        stream = color_images(dataset, name)
-        if stream is None:
-            continue
+    for stream in all_images(dataset):
         if stream.sensor["model"] == "pinhole":
             streams.append(stream)
         else:
-            log.warning("%s: left out: Waymo has no fisheye cameras", name)
+            log.warning("%s: left out: Waymo has no fisheye cameras", stream.name)
     ahead = [np.arctan2(*(stream.mount.rotation @ OPTICAL.T)[1::-1, 0]) for stream in streams]
     away = np.subtract.outer(ahead, np.radians(list(CAMERAS.values())))
     rows, columns = linear_sum_assignment(np.abs(np.angle(np.exp(1j * away))))
@@ -235,13 +231,9 @@ def _boxes(dataset: Dataset, top: Stream) -> tuple[dict[int, list[Row]], dict[tu
 
 def _flat_boxes(dataset: Dataset, camera: Stream) -> dict[int, list[Row]]:
     """2D boxes with visible pixels of a camera, by frame."""
-    path = dataset.paths.sensor_boxes(camera.name)
-    found: dict[int, list[Row]] = defaultdict(list)
-    if path.exists():
-        for box in read_boxes(path, ("frame", "id", "class", "pixels")):
-            if box["pixels"]:
-                found[box["frame"]].append(box)
-    return found
+    boxes = boxes_by_frame(dataset.paths.sensor_boxes(camera.name), ("frame", "id", "class", "pixels"))
+    seen = {frame: [box for box in of.values() if box["pixels"]] for frame, of in boxes.items()}
+    return {frame: of for frame, of in seen.items() if of}
 
 
 def _frame_rows(drive: _Drive, row: int) -> tuple[dict[str, list[Row]], int]:

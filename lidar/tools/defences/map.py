@@ -1,4 +1,4 @@
-"""Returns behind what the map says is solid, and missing ones where it says that there must be some."""
+"""Returns behind solid surfaces of the map, and missing returns where the map has a surface."""
 
 from __future__ import annotations
 

@@ -145,7 +145,7 @@ def _tells(picture: Picture, pixels: Float) -> NDArray[np.bool_]:
 
 
 def suspicion_of(evidence: Evidence) -> float:
-    """Suspicion of an object from what a picture says of it: without edges and without contrast."""
+    """Suspicion of an object whose pixels in an image have neither edges nor contrast."""
     return (1 - evidence.edges) * (1 - evidence.contrast)
 
 

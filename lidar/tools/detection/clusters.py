@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Ints
 from lidar.tools.detection.boxes import Rectangle, fit_rectangle
 from lidar.tools.detection.detector import CloudPoints
@@ -225,9 +224,7 @@ def _link(xy: NDArray[np.floating], link: NDArray[np.floating]) -> Ints:
     pairs = cKDTree(xy).query_pairs(float(link.max()), output_type="ndarray")
     apart = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1)
     pairs = pairs[apart <= np.minimum(link[pairs[:, 0]], link[pairs[:, 1]])]
-    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(xy), len(xy)))
-    number: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
-    return number
+    return components(*pairs.T, count=len(xy))
 
 
 def _aspect(seen: Rectangle) -> float:

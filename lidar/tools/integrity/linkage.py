@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.support.graphs import components
 from geoscene.typing import Ints
 
 _NEAREST = 8
@@ -33,7 +34,7 @@ def linked_clusters(points: NDArray[np.floating], *, p: float) -> Ints:
     cell = cell.reshape(n)
     away, near = (column.reshape(n, -1) for column in cKDTree(points).query(points, k=min(_NEAREST, n), p=p))
     row, place = np.nonzero(away <= 1)
-    cluster = join(np.column_stack([cell[row], cell[near[row, place]]]), count=len(corner))
+    cluster = components(cell[row], cell[near[row, place]], count=len(corner))
     beside = cKDTree(corner).query_pairs(np.ceil(1 / side), p=np.inf, output_type="ndarray")
     members = _Members(cell)
     while len(beside := beside[cluster[beside[:, 0]] != cluster[beside[:, 1]]]):
@@ -48,19 +49,9 @@ def linked_clusters(points: NDArray[np.floating], *, p: float) -> Ints:
             most = 1
             first, second = (points[members.of(number)] for number in beside[0])
             met = beside[: int(cKDTree(first).query(second, p=p)[0].min() <= 1)]
-        cluster = join(cluster[met], count=len(corner))[cluster]
+        cluster = components(*cluster[met].T, count=len(corner))[cluster]
         beside = beside[most:]
     return cluster[cell]
-
-
-def join(links: NDArray[np.integer], *, count: int) -> Ints:
-    """Number (count,) of the connected component of each node; links (k, 2) are pairs of nodes."""
-    from scipy.sparse import coo_array  # noqa: PLC0415  (0.2 s)
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
-
-    graph = coo_array((np.ones(len(links), np.int8), (links[:, 0], links[:, 1])), shape=(count, count))
-    number: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
-    return number
 
 
 class _Members:

@@ -108,7 +108,7 @@ def link(former: bytes, *, sensor: str, frame: int, time_ns: int, root: bytes) -
 
 
 def signed_message(heads: Mapping[str, tuple[int, bytes]], tables: Mapping[str, bytes]) -> bytes:
-    """What is signed: the root over the last links of all sensors and the digests of all other files.
+    """The signed message: root over the last links of all sensors and the digests of all other files.
 
     heads  : number of frames and last link, by sensor
     tables : digest by path

@@ -1,4 +1,4 @@
-"""Where a cloud's watermark is broken: returns that were added or moved, and gaps of removed ones."""
+"""Tampered places by a cloud's watermark: returns that were added or moved, and gaps of removed ones."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.support.graphs import components
 from geoscene.typing import Float, Ints
 from lidar.tools.integrity.blocks import SECTORS, BlockTest, block_of, block_test
-from lidar.tools.integrity.linkage import join, linked_clusters
+from lidar.tools.integrity.linkage import linked_clusters
 from lidar.tools.integrity.watermark import CHAINED, Decoded, WatermarkCells, WatermarkKey, earlier
 
 NOISE = 0.001
@@ -42,7 +43,7 @@ _WIDEST = 170.0
 
 @dataclass(frozen=True)
 class Place:
-    """Where returns were added, moved or removed.
+    """A bounding box in which returns were added, moved or removed.
 
     kind    : ``added or moved``, or ``removed``; a moved cluster is both, at its two places
     low, high : (3,) corners of the box in the sensor frame, metres; of removed returns in the directions of
@@ -60,7 +61,7 @@ class Place:
 
 @dataclass(frozen=True)
 class FrameVerdict:
-    """What a watermark says of a frame.
+    """Verdict of the watermark on a frame.
 
     bits, wrong : of all returns
     blocks      : the test of each block
@@ -230,6 +231,5 @@ def _clusters(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
     turn = xyz[:, :2] / level[:, None] / np.radians(_TURN)
     near = linked_clusters(xyz / _LINK, p=2)
     beside = linked_clusters(np.column_stack([turn, 0.9 * ring, away / _DEPTH]), p=np.inf)
-    rows = np.arange(n)
-    links = np.column_stack([np.append(rows, rows), np.append(n + near, n + near.max() + 1 + beside)])
-    return join(links, count=int(links.max()) + 1)[:n]
+    rows, groups = np.arange(n), np.append(n + near, n + near.max() + 1 + beside)
+    return components(np.append(rows, rows), groups, count=int(groups.max()) + 1)[:n]

@@ -59,7 +59,7 @@ class WatermarkCells:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What a watermark says of the returns of a frame.
+    """Decoded watermark of the returns of a frame.
 
     wrong : (n, 3) bool, bits of x, y, z that are not those of the key
     off   : (n, 3) metres from the nearest lattice point, of either bit

@@ -46,7 +46,7 @@ class Selection:
         self._placed = None if trajectory is None else trajectory.time_ns[[0, -1]] * 1e-9
 
     def may_hold(self, start_ns: int, period_ns: int) -> bool:
-        """Whether a frame that lasts from ``start_ns`` can have returns of the time asked for."""
+        """Whether a frame that lasts from ``start_ns`` can have returns within the time of the options."""
         if self._options.time is None:
             return True
         first, last = (seconds * 1e9 for seconds in self._options.time)
@@ -109,7 +109,7 @@ class Selection:
 
 
 def _region(dataset: Dataset, options: MapOptions) -> Any:
-    """The region asked for in the export CRS, prepared for queries; None for everything.
+    """The region of the options in the export CRS, prepared for queries; None for everything.
 
     Raises InputError for a file without polygons.
     """

@@ -44,7 +44,7 @@ class MapClouds:
     trajectory : that places the points, from clouds in the sensor frame; by default the true one
     colors     : of images; tables then have red, green, blue and ``imaged``, whether a camera saw the point
 
-    Raises DatasetError for a dataset without such clouds, and InputError if none is of the time asked for.
+    Raises DatasetError for a dataset without such clouds, and InputError if none is within the selected time.
     """
 
     def __init__(

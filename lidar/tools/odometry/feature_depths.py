@@ -21,7 +21,7 @@ _EPIPOLAR = 3.0  # standard deviations of a match from its epipolar plane
 
 
 def unhidden(pixel: Float, distance: Float) -> Bools:
-    """Which points (n,) no nearer surface hides.
+    """Visibility (n,) of points: whether no nearer surface hides them.
 
     pixel    : (n, 2) at which they appear
     distance : (n,) from the camera

@@ -1,4 +1,4 @@
-"""The method ``fused``: what a dataset has of GNSS, inertial units and odometry, fused."""
+"""The method ``fused``: fusion of the GNSS, inertial units and odometry of a dataset."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def fused_odometry(
     settings: OdometrySettings,
     progress: Progress,
 ) -> MotionEstimate:
-    """Poses of the vehicle in the scene by its receiver, inertial unit and odometry, as far as there are any.
+    """Poses of the vehicle in the scene by its receiver and, if available, inertial unit and odometry.
 
     relative : method of odometry, ``none``, or empty for small_gicp or else stereo, if the data are there
     names    : of the sensors to use; by default the first receiver and unit, and what the method takes

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.errors import need
 from geoscene.typing import Bools, Float
+from lidar.tools.odometry.deskewing import moved_back
 
 _FORWARD = 0.34  # cosine of 70 degrees: bearings nearer to the axis have image coordinates
 _CERTAIN = 0.999  # probability that a sample of the trials is without outliers
@@ -64,23 +65,6 @@ class Sighted:
         columns = (self.point, self.bearing, self.sigma, self.fuzz, self.share)
         point, bearing, sigma, fuzz, share = (column[rows] for column in columns)
         return Sighted(point, bearing, sigma, fuzz, self.origin, share, self.motion)
-
-
-def scaled_motion(motion: Float, factor: float) -> Float:
-    """The motion (4, 4) in ``factor`` times the time: rotation and translation grow evenly."""
-    out = np.eye(4)
-    out[:3, :3] = Rotation.from_rotvec(factor * Rotation.from_matrix(motion[:3, :3]).as_rotvec()).as_matrix()
-    out[:3, 3] = factor * motion[:3, 3]
-    return out
-
-
-def moved_back(points: Float, share: Float, *, motion: Float) -> Float:
-    """Points (n, 3) of the frame at share 0 in the frames that a body has at shares (n,) of a motion."""
-    if not share.any():
-        return points
-    turn = Rotation.from_rotvec(share[:, None] * Rotation.from_matrix(motion[:3, :3]).as_rotvec())
-    moved: Float = turn.inv().apply(points - share[:, None] * motion[:3, 3])
-    return moved
 
 
 def tangents(bearing: Float) -> Float:

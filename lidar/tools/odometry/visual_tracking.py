@@ -11,18 +11,17 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from geoscene.errors import need
 from geoscene.support.progress import Progress
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.recorded import Stream
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.odometry.deskewing import still
+from lidar.tools.odometry.deskewing import scaled_motion, still, turns
 from lidar.tools.odometry.features import ImageFeatures, matches, read_features
 from lidar.tools.odometry.keyframes import Keyframe, refine_window
 from lidar.tools.odometry.settings import OdometrySettings
-from lidar.tools.odometry.view_geometry import Sighted, pose_of, scaled_motion, triangulate, two_view_pose
+from lidar.tools.odometry.view_geometry import Sighted, pose_of, triangulate, two_view_pose
 
 ENOUGH = 15
 """Inliers from which a pose is that of the image."""
@@ -78,7 +77,9 @@ def _at_start(features: ImageFeatures, distance: Float, *, motion: Float) -> tup
     local = np.where(known, distance, 1.0)[:, None] * features.bearing
     moved = still(local, features.seconds, motion=motion)
     length = np.linalg.norm(moved, axis=1)
-    bearing = np.where(known[:, None], moved / length[:, None], _turn(features, motion))
+    bearing = np.where(
+        known[:, None], moved / length[:, None], turns(motion, features.seconds).apply(features.bearing)
+    )
     return replace(features, bearing=bearing), np.where(known, length, np.nan)
 
 
@@ -336,13 +337,3 @@ def _loops(
             sigma = np.sqrt(np.maximum(np.diag(found[2]), 1e-10)) + np.repeat([0.001, 0.01], 3)
             return [(k, len(keyframes) - 1, np.linalg.inv(earlier.pose) @ found[0], sigma)]
     return []
-
-
-def _turn(features: ImageFeatures, motion: Float) -> Float:
-    """Bearings (n, 3) at the frame's start: rows exposed later are turned back.
-
-    motion : (4, 4) of the camera in a second
-    """
-    turn = Rotation.from_rotvec(features.seconds[:, None] * Rotation.from_matrix(motion[:3, :3]).as_rotvec())
-    bearing: Float = turn.apply(features.bearing)
-    return bearing

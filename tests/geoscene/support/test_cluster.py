@@ -59,7 +59,7 @@ def test_rebuild_on_a_cluster_reuses_tiles(address, osm, tmp_path):
 
 def test_a_worker_that_does_not_see_the_folder_is_named_before_planning(address, osm, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.pipeline.build.make_plan", lambda *_, **__: pytest.fail("planned"))
-    monkeypatch.setattr("geoscene.support.cluster.digest_of", lambda _: "what this process sees")
+    monkeypatch.setattr("geoscene.support.cluster.file_digest", lambda _: "what this process sees")
     with (
         connect(address) as cluster,
         pytest.raises(InputError, match=r"scene\.part: worker tcp.* does not see"),

@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
+from geoscene.support.graphs import components
 from lidar.errors import InputError
-from lidar.tools.integrity.linkage import join, linked_clusters
+from lidar.tools.integrity.linkage import linked_clusters
 from lidar.tools.integrity.tampering import frame_verdict
 from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey, bit_error_rate
 
@@ -221,7 +222,7 @@ def test_clusters_are_chains_of_points_within_a_distance_of_one(eighths, p):
     linked = np.linalg.norm(points[:, None] - points[None], ord=p, axis=2) <= 1
     same = (
         own[:, None] == own
-        for own in (linked_clusters(points, p=p), join(np.argwhere(linked), count=len(points)))
+        for own in (linked_clusters(points, p=p), components(*np.argwhere(linked).T, count=len(points)))
     )
     np.testing.assert_array_equal(*same)
 
