@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +91,7 @@ class _Scan:
     def __init__(
         self, image: Any, columns: tuple[str, ...], *, pose: Float, scale: float, start: float
     ) -> None:
-        e57 = self._e57 = _library()
+        e57 = _library()
         self._image, self._pose, self._start = image, pose, start
         self.count, self._digest = 0, hashlib.sha256()
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -142,56 +142,55 @@ class _Scan:
         self.count += n
 
     def close(self, *, name: str, about: str) -> uuid.UUID:
-        """Enter what sums the scan up; returns its identifier, which follows from its content."""
+        """Enter name, pose, time and bounds of the scan; return its identifier, a hash of its content."""
         self._writer.close()
         identity = uuid.uuid5(uuid.NAMESPACE_URL, f"{EXTENSION[1]} {name} {about} {self._digest.hexdigest()}")
-        node, w = self.node, Rotation.from_matrix(self._pose[:3, :3]).as_quat(canonical=True)
-        translation = dict(zip("xyz", self._pose[:3, 3], strict=True))
-        turned = {"w": w[3], "x": w[0], "y": w[1], "z": w[2]}
-        pose = {"rotation": self._structure(turned), "translation": self._structure(translation)}
-        node.set("guid", self._e57.StringNode(self._image, f"{{{identity}}}"))
-        node.set("name", self._e57.StringNode(self._image, name))
-        node.set("description", self._e57.StringNode(self._image, about))
-        node.set("pose", self._structure(pose))
-        node.set("acquisitionStart", date_time(self._image, self._start + _ADJUSTED))
+        x, y, z, w = Rotation.from_matrix(self._pose[:3, :3]).as_quat(canonical=True).tolist()
+        translation = dict(zip("xyz", self._pose[:3, 3].tolist(), strict=True))
+        entries: dict[str, Any] = {
+            "guid": f"{{{identity}}}",
+            "name": name,
+            "description": about,
+            "pose": {"rotation": {"w": w, "x": x, "y": y, "z": z}, "translation": translation},
+            "acquisitionStart": _date_time(self._start),
+        }
         if self.count:
-            bounds = zip("xyz", self._low, self._high, strict=True)
-            edges = {
-                k: v for a, low, high in bounds for k, v in ((f"{a}Minimum", low), (f"{a}Maximum", high))
-            }
-            node.set("cartesianBounds", self._structure(edges))
+            bounds = zip("xyz", self._low.tolist(), self._high.tolist(), strict=True)
+            edges = [limits for axis, *ends in bounds for limits in _limits(axis, ends).items()]
+            entries["cartesianBounds"] = dict(edges)
             if {"ring", "column"} <= self.fields.keys():
-                indices = dict(zip(("rowMinimum", "rowMaximum"), self._rows, strict=True))
-                indices |= dict(zip(("columnMinimum", "columnMaximum"), self._columns, strict=True))
-                node.set("indexBounds", self._structure(indices))
-        node.set("intensityLimits", self._structure({"intensityMinimum": 0.0, "intensityMaximum": 255.0}))
+                entries["indexBounds"] = _limits("row", self._rows) | _limits("column", self._columns)
+        entries["intensityLimits"] = _limits("intensity", (0.0, 255.0))
         if "red" in self.fields:
-            ends = {f"color{c}{end}": v for c in ("Red", "Green", "Blue") for end, v in _ENDS.items()}
-            node.set("colorLimits", self._structure(ends))
+            colors = [_limits(f"color{name}", _BYTE) for name in ("Red", "Green", "Blue")]
+            entries["colorLimits"] = colors[0] | colors[1] | colors[2]
+        _enter(self._image, self.node, entries=entries)
         return identity
 
-    def _structure(self, values: dict[str, Any]) -> Any:
-        return _structure(self._image, values)
+
+def _limits(name: str, ends: Sequence[float]) -> dict[str, float]:
+    return {f"{name}Minimum": ends[0], f"{name}Maximum": ends[1]}
 
 
-_ENDS = {"Minimum": 0, "Maximum": 255}
+def _date_time(adjusted_gps: float) -> dict[str, float]:
+    """E57's entries of a time in adjusted GPS seconds."""
+    return {"dateTimeValue": adjusted_gps + _ADJUSTED, "isAtomicClockReferenced": 1}
 
 
-def _structure(image: Any, values: dict[str, Any]) -> Any:
-    """A structure of numbers and of other nodes."""
+def _enter(image: Any, node: Any, *, entries: dict[str, Any]) -> None:
+    """Set entries of a structure: texts, numbers, and structures as dictionaries."""
     e57 = _library()
-    node = e57.StructureNode(image)
-    for name, value in values.items():
-        if isinstance(value, int):
-            node.set(name, e57.IntegerNode(image, value, *_WORD))
+    for name, value in entries.items():
+        if isinstance(value, dict):
+            child = e57.StructureNode(image)
+            _enter(image, child, entries=value)
+        elif isinstance(value, str):
+            child = e57.StringNode(image, value)
+        elif isinstance(value, int):
+            child = e57.IntegerNode(image, value, *_WORD)
         else:
-            node.set(name, e57.FloatNode(image, float(value)) if isinstance(value, float) else value)
-    return node
-
-
-def date_time(image: Any, gps: float) -> Any:
-    """A time in GPS seconds since 1980, as E57 states it."""
-    return _structure(image, {"dateTimeValue": gps, "isAtomicClockReferenced": 1})
+            child = e57.FloatNode(image, value)
+        node.set(name, child)
 
 
 def _buffers(image: Any, arrays: dict[str, NDArray[Any]]) -> Any:
@@ -220,16 +219,16 @@ def _written(path: Path, info: LasInfo) -> Iterator[tuple[Any, list[uuid.UUID]]]
             image.extensionsAdd("", e57.E57_V1_0_URI)
             image.extensionsAdd(*EXTENSION)
             root = image.root()
-            root.set("formatName", e57.StringNode(image, "ASTM E57 3D Imaging Data File"))
+            _enter(image, root, entries={"formatName": "ASTM E57 3D Imaging Data File"})
             root.set("versionMajor", e57.IntegerNode(image, e57.E57_FORMAT_MAJOR))
             root.set("versionMinor", e57.IntegerNode(image, e57.E57_FORMAT_MINOR))
-            root.set("coordinateMetadata", e57.StringNode(image, info.crs.to_wkt()))
             created = float(gps_seconds(info.created, np.zeros(1, np.int64))[0])
-            root.set("creationDateTime", date_time(image, created + _ADJUSTED))
+            about = {"coordinateMetadata": info.crs.to_wkt(), "creationDateTime": _date_time(created)}
+            _enter(image, root, entries=about)
             root.set("data3D", e57.VectorNode(image, True))
             yield image, identities
             whole = uuid.uuid5(uuid.NAMESPACE_URL, f"{EXTENSION[1]} {' '.join(map(str, identities))}")
-            root.set("guid", e57.StringNode(image, f"{{{whole}}}"))
+            _enter(image, root, entries={"guid": f"{{{whole}}}"})
             image.close()
         except e57.E57Exception as error:
             raise not_written(path, error) from error
@@ -333,7 +332,8 @@ def _table(image: Any, scan: Any, *, size: int) -> Table:
             raise ValueError(f"states {n} points, and holds {found}")
         reader.close()
     local = np.column_stack([arrays[axis] for axis in _AXES])
-    world = local @ _rotation(scan).T + _translation(scan)
+    turn, place = _pose(scan)
+    world = local @ turn.T + place
     table: Table = dict(zip("xyz", world.T.copy(), strict=True))
     for name, field in fields.items():
         table[name] = (arrays[field.name] + field.first).astype(field.kind)
@@ -344,17 +344,12 @@ def _table(image: Any, scan: Any, *, size: int) -> Table:
     return table
 
 
-def _rotation(scan: Any) -> Float:
-    """The (3, 3) rotation of a scan's pose."""
-    if not (scan.isDefined("pose") and scan["pose"].isDefined("rotation")):
-        return np.eye(3)
-    turned = scan["pose"]["rotation"]
-    matrix: Float = Rotation.from_quat([turned[k].value() for k in "xyzw"]).as_matrix()
-    return matrix
-
-
-def _translation(scan: Any) -> Float:
-    """The (3,) translation of a scan's pose."""
-    if not (scan.isDefined("pose") and scan["pose"].isDefined("translation")):
-        return np.zeros(3)
-    return np.array([scan["pose"]["translation"][k].value() for k in "xyz"])
+def _pose(scan: Any) -> tuple[Float, Float]:
+    """Rotation (3, 3) and translation (3,) of a scan; none where the file states none."""
+    turn, place = np.eye(3), np.zeros(3)
+    if scan.isDefined("pose/rotation"):
+        turned = scan["pose"]["rotation"]
+        turn = Rotation.from_quat([turned[k].value() for k in "xyzw"]).as_matrix()
+    if scan.isDefined("pose/translation"):
+        place = np.array([scan["pose"]["translation"][k].value() for k in "xyz"])
+    return turn, place

@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 from geoscene.typing import Bools, Float
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
+from lidar.tools.odometry.deskewing import moved_back
 from lidar.tools.odometry.features import ImageFeatures, matches
-from lidar.tools.odometry.view_geometry import moved_back, tangents, triangulate
+from lidar.tools.odometry.view_geometry import tangents, triangulate
 
 _NEIGHBOURS = 8
 _CELL = 8.0  # pixels: side of the cells in which nearer points hide farther ones
