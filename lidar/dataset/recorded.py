@@ -113,6 +113,19 @@ def scanner_clouds(dataset: Dataset, name: str = "") -> Stream:
     raise no_clouds(dataset, of=f" of {name}" if name else "")
 
 
+def instance_clouds(dataset: Dataset, name: str) -> Stream:
+    """A scanner's clouds in the sensor frame with times, labels and instances.
+
+    Raises DatasetError if there are no such clouds.
+    """
+    clouds = labelled_clouds(dataset, name)
+    if clouds is None or "instance" not in cloud_points(clouds.files[0]):
+        raise DatasetError(
+            f"{dataset.path}: {name} has no clouds with labels and instances; drive again with `formats` pcd"
+        )
+    return clouds
+
+
 def frames_within(clouds: Stream, limits: tuple[int, float], *, every: int = 1) -> Stream:
     """Each n-th of the frames of a stream from the first of ``limits`` up to, not including, the second.
 

@@ -313,8 +313,6 @@ def _apply_to_image(dataset: Dataset, recording: Recording, *, camera: Camera, f
     )
     found = altered_image(image, recording.settings.stages, at=situation_of(recording, camera, frame=frame))
     assert found.rgb is not None  # noqa: S101
-    for path in (paths["rgb"], paths["truth"]):
-        path.parent.mkdir(parents=True, exist_ok=True)
     write_png(paths["rgb"], found.rgb)
     truth = truth_of_past(dataset, camera, frame=frame)
     with reading_file(truth):
@@ -362,8 +360,6 @@ def _apply_to_clouds(
         at = Situation(device.name, frame, earlier=former.cloud, effects=effects)
         altered = altered_recording(past.cloud, chosen, sensor=device, at=at, sent=None)
         truth = foreign_truth(out, place, form=form)
-        for target in (out / place, truth):
-            target.parent.mkdir(parents=True, exist_ok=True)
         form.write(out / place, cloud_table(altered.cloud))
         write_truth(truth, truth_since(past, altered, start_ns=0))
         if form is KITTI and (labels := foreign_labels(path)).is_file():

@@ -144,8 +144,6 @@ def _convert_cloud(
     """Write one recorded cloud in the format of a recording, and de-skewed if that says so."""
     path = source.path(dataset.paths.sensor(scanner.name), frame)
     paths = recording.paths(scanner, frame)
-    for target in paths.values():
-        target.parent.mkdir(parents=True, exist_ok=True)
     (form,) = recording.settings.cloud_formats
     if source.module == form.module and form.frame == "world":
         with reading_file(path):

@@ -113,8 +113,6 @@ def write_altered(
     settings, cloud = recording.settings, altered.cloud
     source = replace(recording, out=dataset.path).paths(scanner, frame)
     paths = recording.paths(scanner, frame)
-    for path in paths.values():
-        path.parent.mkdir(parents=True, exist_ok=True)
     table = cloud_points(source[form.name])
     if form.kitti:  # recorded without the vehicle's motion: all points are those of the frame's start
         cloud = replace(cloud, time_ns=np.zeros_like(cloud.time_ns))
@@ -134,9 +132,7 @@ def write_altered(
                 instances = [int(row["instance"]) for row in rows]
             hits = [np.count_nonzero(cloud.feature == instance) for instance in instances]
             write_columns(Paths(recording.out).frame_boxes(scanner.name, frame), columns | {"points": hits})
-    target = Paths(recording.out).truth(scanner.name, frame)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    write_truth(target, truth)
+    write_truth(Paths(recording.out).truth(scanner.name, frame), truth)
 
 
 def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:

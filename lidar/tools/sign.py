@@ -173,8 +173,6 @@ def _mark_frame(
     """Write a cloud with the watermark; return the distances (n,) in metres by which points moved."""
     source = replace(recording, out=dataset.path).paths(scanner, frame)
     paths = recording.paths(scanner, frame)
-    for path in paths.values():
-        path.parent.mkdir(parents=True, exist_ok=True)
     table = cloud_points(source[form.name])
     cloud = table_cloud(table, start_ns=scanner.frame_start_ns(frame))
     marked = watermark.embedded(cloud.xyz, cells_of(cloud, sensor=scanner.name, frame=frame))

@@ -17,7 +17,7 @@ from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.layout import Dataset, open_dataset
-from lidar.dataset.recorded import Stream, cloud_points, labelled_clouds
+from lidar.dataset.recorded import Stream, cloud_points, instance_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.tools.detection.clusters import PLAIN, find_clusters
 from lidar.tools.detection.detector import KINDS
@@ -151,7 +151,6 @@ def train(
             "drives": _drives(datasets),
         },
     )
-    Path(out).parent.mkdir(parents=True, exist_ok=True)
     model.write(Path(out))
     progress("forest", 1, total=1)
     columns = [{kind: row[k] for kind, row in chosen.items()} for k in range(3)]
@@ -175,12 +174,7 @@ def _jobs(datasets: Sequence[Dataset], *, every: int) -> list[_Job]:
         if not scanners:
             raise DatasetError(f"{dataset.path}: has no scanner")
         for name in scanners:
-            clouds = labelled_clouds(dataset, name)
-            if clouds is None or "instance" not in cloud_points(clouds.files[0]):
-                raise DatasetError(
-                    f"{dataset.path}: {name} has no clouds with labels and instances; drive again with"
-                    " `formats` pcd"
-                )
+            clouds = instance_clouds(dataset, name)
             jobs.append(_Job(len(jobs), clouds, np.arange(0, len(clouds.files), every), 4 * k))
     return jobs
 

@@ -16,7 +16,7 @@ from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.png import read_png
-from lidar.dataset.recorded import Stream, cloud_points, color_images, labelled_clouds, nearest, still_points
+from lidar.dataset.recorded import Stream, cloud_points, color_images, instance_clouds, nearest, still_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
@@ -231,11 +231,7 @@ def _drive(dataset: Dataset, sensor: str, *, cameras: Sequence[str]) -> _Drive:
     name = sensor or next(iter(scanners), "")
     if name not in scanners:
         raise InputError(f"`sensor` {name}: no scanner of {dataset.path}, which has {_list(scanners)}")
-    clouds = labelled_clouds(dataset, name)
-    if clouds is None or "instance" not in cloud_points(clouds.files[0]):
-        raise DatasetError(
-            f"{dataset.path}: {name} has no clouds with labels and instances; drive again with `formats` pcd"
-        )
+    clouds = instance_clouds(dataset, name)
     images, known = dict[str, Stream](), dataset.sensors("camera")
     for camera in cameras:
         if camera not in known:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,10 +9,9 @@ import numpy as np
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict
-from lidar.world.world import World
 
 _SECTORS = 360
 _RADIUS = 30.0
@@ -35,14 +33,11 @@ class Azimuth(Defence):
         0.35, "share of the turn that may lack a ring's returns, as towards side streets", low=0, high=0.9
     )
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         expected = self._of_turn(frame)
-        if known := [self._of_earlier(past, frame) for past in frames[:-1]]:
+        if known := [self._of_earlier(past, frame) for past in window.frames[:-1]]:
             least = np.min(known, axis=0)
             expected = np.maximum(expected, np.where(np.isfinite(least), least, 0.0))
         sector = np.clip((self._lack(frame, expected) - _OPEN) / (1 - _OPEN), 0, 1)

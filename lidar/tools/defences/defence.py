@@ -16,6 +16,25 @@ from lidar.tools.defences.verdict import Verdict
 from lidar.world.world import World
 
 
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Consecutive frames of a scanner, the last of which a defence judges.
+
+    frames : at most `Defence.history` earlier ones, oldest first, and the one to judge
+    scene  : world of the map, without road users; None unless `Defence.needs` has it
+    rng    : random numbers of this defence and frame
+    """
+
+    frames: Sequence[Observation]
+    scene: World | None
+    rng: np.random.Generator
+
+    @property
+    def frame(self) -> Observation:
+        """The frame to judge."""
+        return self.frames[-1]
+
+
 @dataclass(frozen=True)
 class Defence(Parameters):
     """Base of all defences; its fields are made by `lidar.parameters.parameter`.
@@ -34,15 +53,8 @@ class Defence(Parameters):
         return ""
 
     @abstractmethod
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
-        """The verdict on the last of consecutive frames of a scanner.
-
-        frames : at most ``history`` earlier ones, oldest first, and the one to judge
-        scene  : what the map says is around, without road users; None unless ``needs`` has it
-        rng    : random numbers of this defence and frame
-        """
+    def judge(self, window: Window) -> Verdict:
+        """The verdict on the last frame of a window."""
 
     def pictures(
         self, frame: Observation, verdict: Verdict, *, threshold: float

@@ -127,34 +127,22 @@ def defend(
         if out is not None:
             check_target(out, source=dataset.path, overwrite=overwrite)
     with nullcontext() if out is None else atomic_folder(out, mark=_MARK, names=_NAMES) as part:
-        return _defend(
-            datasets,
-            defences,
-            calibration=calibration,
-            detector=detector,
-            rule=rule,
-            scene=scene,
-            out=part,
-            seed=seed,
-            progress=progress,
-        )
+        job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+        rule = rule if len(job.defences) > 1 else ""
+        found = _judge(job, calibration, rule=rule, out=part, progress=progress)
+        if part is not None:
+            document = found.document() | {"datasets": [str(d.path) for d in datasets], "fusion": rule}
+            document |= {"calibration": calibration.note}
+            document |= {"detector": {"name": detector.name, "identity": detector.identity}}
+            write_json(part / _MARK, document | {"options": [n.to_json() for n in job.defences]})
+    return found
 
 
-def _defend(
-    datasets: Sequence[Dataset],
-    defences: Sequence[NamedDefence],
-    *,
-    calibration: Calibration,
-    detector: Detector,
-    rule: str,
-    scene: Scene | None,
-    out: Path | None,
-    seed: int,
-    progress: Progress,
+def _judge(
+    job: DefenceJob, calibration: Calibration, *, rule: str, out: Path | None, progress: Progress
 ) -> Defended:
-    job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+    """Judge and score frames; with ``out`` write the verdicts."""
     defences = job.defences
-    rule = rule if len(defences) > 1 else ""
     for named in defences:
         calibration.tail(named.name, "frames")
     thresholds = {
@@ -179,19 +167,14 @@ def _defend(
             tables.add(place, judged, truth=truth, thresholds=thresholds)
             _write_returns(out / place / f"{frame.number:06d}.npz", judged.verdicts)
             _write_pictures(out / place, judged, defences=defences, thresholds=thresholds)
-    rng = generator(seed, "bootstrap")
-    found = Defended(
+    if out is not None:
+        tables.write(out)
+    rng = generator(job.seed, "bootstrap")
+    return Defended(
         tally.frames,
         {key: score(samples, threshold=thresholds[key], rng=rng) for key, samples in tally.samples().items()},
         {name: float(np.median(seconds)) for name, seconds in tally.seconds.items()},
     )
-    if out is not None:
-        tables.write(out)
-        extra: dict[str, Any] = {"datasets": [str(d.path) for d in datasets], "fusion": rule}
-        extra |= {"calibration": calibration.note}
-        extra |= {"detector": {"name": detector.name, "identity": detector.identity}}
-        write_json(out / _MARK, found.document() | extra | {"options": [n.to_json() for n in defences]})
-    return found
 
 
 def score_rows(found: Defended) -> list[list[str]]:
@@ -245,7 +228,6 @@ def calibrate(
     found = Calibration({key: tail_of(samples) for key, samples in tally.samples().items()}, note)
     joint = tally.joint(found, rng=generator(seed, "calibration"))
     found = replace(found, joint=joint, detector=detector.identity)
-    out.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(out, calibration_text(found).encode())
     return found
 
@@ -318,7 +300,6 @@ def _write_returns(path: Path, verdicts: dict[str, Verdict]) -> None:
             )
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **columns)  # type: ignore[arg-type]
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, buffer.getvalue())
 
 
@@ -333,9 +314,7 @@ def _write_pictures(
         threshold = thresholds.get((named.name, "objects"), 1.0)
         shown = named.defence.pictures(judged.frame, judged.verdicts[named.name], threshold=threshold)
         for name, image in shown.items():
-            path = folder / named.name / f"{judged.frame.number:06d}_{name}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_png(path, image)
+            write_png(folder / named.name / f"{judged.frame.number:06d}_{name}.png", image)
 
 
 class _Tables:

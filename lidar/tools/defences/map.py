@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +11,7 @@ from geoscene.typing import Float
 from lidar.parameters import parameter
 from lidar.raycast.geometry import ALL
 from lidar.sensors.physics.link import amplitude
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import FEW, Gaps, Verdict, greatest
 from lidar.world.surfaces import FOLIAGE, GLASS, WATER
@@ -35,14 +34,11 @@ class Map(Defence):
     )
     width: float = parameter(3.0, "width of a sector of missing returns", unit="degrees", low=1, high=90)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the last frame."""
-        del rng
-        frame = frames[-1]
-        assert scene is not None, "the runner gives the scene that it needs"  # noqa: S101
-        expected, cosine = map_ranges(frame, scene)
+        frame = window.frame
+        assert window.scene is not None, "the runner gives the scene that it needs"  # noqa: S101
+        expected, cosine = map_ranges(frame, window.scene)
         known = frame.pulse >= 0
         at = expected[np.maximum(frame.pulse, 0)]
         behind = frame.distance - at - self.tolerance - self.share * at

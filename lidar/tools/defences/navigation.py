@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,11 +10,10 @@ from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import NavigationMeasurements as Measured
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict
-from lidar.world.world import World
 
 _LAG = 10
 """Frames over which increments are compared."""
@@ -55,15 +53,12 @@ class NavigationDefence(Defence):
     )
     drift: float = parameter(0.2, "error of the turn by the gyroscope", unit="degrees", low=0.001, high=10)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the last frame against the one `_LAG` frames earlier, or the earliest."""
-        del scene
-        frame, past = frames[-1], frames[0]
-        if len(frames) < 2:
+        frame, past = window.frame, window.frames[0]
+        if len(window.frames) < 2:
             return Verdict(None, None, 0.0)
-        found = match_sweeps(frame, past, sigma=self.sigma, floor=self.floor, rng=rng)
+        found = match_sweeps(frame, past, sigma=self.sigma, floor=self.floor, rng=window.rng)
         if found is None:
             return Verdict(None, None, 0.0)
         squared = float(found.shift @ np.linalg.solve(found.covariance, found.shift))

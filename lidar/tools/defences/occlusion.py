@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,9 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
-from lidar.world.world import World
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +64,9 @@ class Occlusion(Defence):
     cell: float = parameter(0.25, "size of the voxels of free space", unit="m", low=0.05, high=2)
     core: float = parameter(0.8, "part of the box that rays must cross, of its size", low=0.1, high=1)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the boxes of the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         objects = np.array([self._suspicion(frame, row) for row in range(len(frame.objects))])
         return of_objects(len(frame), frame.members, objects=objects)
 

@@ -16,10 +16,9 @@ from scipy.spatial import ConvexHull, QhullError
 from geoscene.typing import Float
 from lidar.parameters import parameter
 from lidar.sensors.rig.camera_model import project
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation, Picture, pixels_of
 from lidar.tools.defences.verdict import Verdict, of_objects
-from lidar.world.world import World
 
 _BLUR = 1.0
 """Pixels, standard deviation of the filter before edges are computed."""
@@ -63,12 +62,9 @@ class Overlay(Defence):
     )
     edge: float = parameter(12.0, "grey levels per pixel of an edge of strength 1/2", low=0.1, high=255)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the bounding boxes of the last frame that are in view of a camera."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         objects = np.zeros(len(frame.objects))
         for row in range(len(frame.objects)):
             found = [e for picture in frame.pictures if (e := self.evidence(frame, row, picture=picture))]

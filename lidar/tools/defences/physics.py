@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,9 @@ from geoscene.typing import Bools, Float
 from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import FEW, Verdict, greatest
-from lidar.world.world import World
 
 _ON_STEP = 0.02
 """Steps by which a range that is a multiple of the range step may be off."""
@@ -36,12 +34,9 @@ class Physics(Defence):
                               low=1e-4, high=10)  # fmt: skip
     brightness: float = parameter(1.5, "power over that of a white Lambertian target which is unusual", low=1)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the returns of the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         fired, sensor = frame.firings, frame.sensor
         known, pulse = frame.pulse >= 0, np.maximum(frame.pulse, 0)
         away = frame.xyz - fired.origin[pulse]

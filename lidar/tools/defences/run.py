@@ -14,6 +14,7 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import url_of
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
+from lidar.tools.defences.defence import Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.reading import RecordedScans
 from lidar.tools.defences.registry import NamedDefence
@@ -106,10 +107,10 @@ def judged_frames(
         _ = frame.members  # the detector, which several defences share
         seconds = {DETECTOR: time.perf_counter() - began}
         for named in defences:
-            window = list(past)[-1 - named.defence.history :]
             rng = generator(seed, "defence", named.name, scans.sensor.name, frame.number)
+            window = Window(list(past)[-1 - named.defence.history :], world, rng)
             began = time.perf_counter()
-            verdicts[named.name] = named.defence.judge(window, scene=world, rng=rng)
+            verdicts[named.name] = named.defence.judge(window)
             seconds[named.name] = time.perf_counter() - began
             _check_length(verdicts[named.name], frame, name=named.name)
         yield Judged(frame, verdicts, seconds)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
-from lidar.world.world import World
 
 
 @dataclass(frozen=True)
@@ -30,12 +28,9 @@ class Shadow(Defence):
         0.3, "distance behind the object at which its shadow begins", unit="m", low=0, high=5
     )
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the boxes of the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         objects = np.array([self._suspicion(frame, row) for row in range(len(frame.objects))])
         return of_objects(len(frame), frame.members, objects=objects)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +9,8 @@ from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
-from lidar.tools.defences.observation import Observation
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.verdict import FEW, Verdict, greatest
-from lidar.world.world import World
 
 _BINS = 24
 _NEAREST, _FARTHEST = 1.0, 200.0  # metres, of the bins of range
@@ -26,12 +23,9 @@ class StatisticalDefence(Defence):
     neighbours: int = parameter(6, "nearest returns of which the mean distance counts", low=1, high=50)
     half: float = parameter(6.0, "ratio to the median at that range that has suspicion 0.5", low=1, high=100)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the returns of the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         n = len(frame)
         if n <= self.neighbours:
             return Verdict(np.zeros(n), np.zeros(len(frame.objects)), 0.0)

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, of_objects
-from lidar.world.world import World
 
 _LAGS = (1, 2, 3, 5, 8)
 """Frames back that are compared."""
@@ -41,17 +40,13 @@ class Temporal(Defence):
     speed: float = parameter(25.0, "greatest speed of objects that is tried", unit="m/s", low=0, high=100)
     step: float = parameter(1.0, "step of the speeds that are tried", unit="m/s", low=0.1, high=10)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the boxes of the last frame by the others."""
-        del scene
-        frame = frames[-1]
-        numbers = {past.number: past for past in frames[:-1]}
+        frame = window.frame
+        numbers = {past.number: past for past in window.frames[:-1]}
         earlier = [numbers[frame.number - lag] for lag in _LAGS if frame.number - lag in numbers]
-        objects = np.array(
-            [self._suspicion(frame, row, earlier=earlier, rng=rng) for row in range(len(frame.objects))]
-        )
+        rows = range(len(frame.objects))
+        objects = np.array([self._suspicion(frame, k, earlier=earlier, rng=window.rng) for k in rows])
         return of_objects(len(frame), frame.members, objects=objects)
 
     def _suspicion(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +13,9 @@ from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
 from lidar.sensors.physics.range_error import signal_sigma
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Verdict, greatest
-from lidar.world.world import World
 
 _OF_MEDIAN = 1 / 0.6745
 """Standard deviation of a Gaussian over the median of its magnitude."""
@@ -35,12 +33,9 @@ class Timing(Defence):
 
     needs = frozenset({"firing_jitter"})
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the returns and objects of the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         noise = _noise(frame)
         returns, objects = np.zeros(len(frame)), np.zeros(len(frame.objects))
         rows, off = _off_neighbours(frame, np.arange(len(frame)), noise=noise)

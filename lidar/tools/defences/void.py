@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +11,9 @@ from geoscene.typing import Float
 from lidar.parameters import parameter
 from lidar.sensors.physics.intensity import apparent_of_code
 from lidar.sensors.physics.link import amplitude
-from lidar.tools.defences.defence import Defence
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.observation import Observation
 from lidar.tools.defences.verdict import Gaps, Verdict, greatest
-from lidar.world.world import World
 
 _NEAREST, _BRIGHT = 3.0, 12.0
 """Metres from which on the ground is looked at, and up to which its brightness is measured."""
@@ -32,12 +30,9 @@ class Void(Defence):
     reach: float = parameter(30.0, "distance up to which the ground is looked at", unit="m", low=5, high=100)
     half: float = parameter(6.0, "area of a void that has suspicion 0.5", unit="m^2", low=0.1, high=1000)
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the last frame."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         pulse, place, empty = ground_pulses(frame, reach=self.reach)
         if not len(pulse):
             return Verdict(None, None, 0.0)

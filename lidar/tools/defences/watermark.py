@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -10,14 +9,12 @@ from typing import ClassVar
 import numpy as np
 
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence
-from lidar.tools.defences.observation import Observation
+from lidar.tools.defences.defence import Defence, Window
 from lidar.tools.defences.verdict import Gaps, Verdict
 from lidar.tools.integrity.keys import read_secret
 from lidar.tools.integrity.tampering import NOISE, FrameVerdict, frame_verdict
 from lidar.tools.integrity.watermark import STEP, WatermarkCells
 from lidar.tools.integrity.watermark import WatermarkKey as Mark
-from lidar.world.world import World
 
 
 @dataclass(frozen=True)
@@ -44,12 +41,9 @@ class WatermarkDefence(Defence):
         """The key, if it was not given."""
         return "" if self.key else "needs the key of the watermark: watermark:key=FILE"
 
-    def judge(
-        self, frames: Sequence[Observation], *, scene: World | None, rng: np.random.Generator
-    ) -> Verdict:
+    def judge(self, window: Window) -> Verdict:
         """Judge the returns of the last frame; the frame by its block with most wrong bits for its size."""
-        del scene, rng
-        frame = frames[-1]
+        frame = window.frame
         cells = WatermarkCells(frame.sensor.name, frame.number, frame.ring, frame.column, frame.echo)
         mark = Mark(read_secret(Path(self.key)), self.step)
         found = frame_verdict(mark, frame.xyz, cells=cells, noise=self.noise, false_alarms=self.false_alarms)

@@ -265,9 +265,8 @@ class _ForeignFrame(_Frame):
         if self._form.name == "kitti" and labels.is_file():
             _write_rows(labels, self._out / labels.relative_to(self._source), kept=kept, size=4)
         if self._truth is not None:
-            target = foreign_truth(self._out, self._place, form=self._form)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            write_truth(target, _filtered_truth(self._truth, kept))
+            truth = _filtered_truth(self._truth, kept)
+            write_truth(foreign_truth(self._out, self._place, form=self._form), truth)
 
 
 def _write_rows(path: Path, out: Path, *, kept: Bools, size: int) -> None:

@@ -16,6 +16,7 @@ from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.defences.azimuth import Azimuth
+from lidar.tools.defences.defence import Window
 from lidar.tools.defences.map import Map
 from lidar.tools.defences.navigation import NavigationDefence as Consistency
 from lidar.tools.defences.observation import NavigationMeasurements, Picture
@@ -50,7 +51,7 @@ def frame():
 
 
 def judged(defence, *frames, scene=None):
-    return defence.judge(frames, scene=scene, rng=np.random.default_rng(1))
+    return defence.judge(Window(frames, scene, np.random.default_rng(1)))
 
 
 def split(frame, forged, suspicion):
