@@ -117,5 +117,5 @@ def test_a_drive_names_the_extra_that_its_format_needs_before_it_starts(monkeypa
 
 
 def test_a_removed_format_names_its_successors():
-    with pytest.raises(InputError, match="`formats` pcd-compressed: no longer written; use pcd"):
+    with pytest.raises(InputError, match="pcd-compressed: no longer written; use pcd"):
         RecordingSettings(formats=("pcd-compressed",))
