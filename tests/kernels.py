@@ -24,7 +24,7 @@ USES = {
     "build": [("geoscene", "build", "--demo", BOX, "-o=scene", "--quiet")],
     "drive": [(*ROAD, "--rig=vlp16", "-o=scanner")],
     "cameras": [(*ROAD, "-o=cameras")],
-    "traffic": [(*ROAD, "--traffic=on", "--format=csv,laz,pcd-compressed", "--deskew=middle", "-o=town")],
+    "traffic": [(*ROAD, "--traffic=on", "--format=csv,laz", "--deskew=middle", "-o=town")],
     "other": [
         ("geoscene", "build", "--demo", BOX, "--relief=full", "-o=scene", "--overwrite", "--quiet"),
         ("geoscene", "export", "scene", "-o=surface.tif"),

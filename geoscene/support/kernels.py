@@ -143,7 +143,7 @@ def compile_ahead(*uses: str, quiet: bool = False) -> None:
         return
     begun = time.monotonic()
     if not quiet:
-        _say(f"compiling, once: {len(missing)} functions, beside other work")
+        _say(f"compiling, once, beside other work; functions: {len(missing)}")
     command = [sys.executable, "-m", __name__, _BESIDE, *uses]
     process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
 
@@ -175,7 +175,7 @@ def main() -> None:
         threading.Thread(target=_end_with_parent, daemon=True).start()
         cores = max(cores - 1, 1)
     elif missing:
-        _say(f"compiling, once: {len(missing)} functions")
+        _say(f"compiling, once; functions: {len(missing)}")
     begun = time.monotonic()
     compile_kernels(missing, workers=cores)
     if missing and not beside:
