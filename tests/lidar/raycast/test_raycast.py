@@ -524,7 +524,7 @@ def test_rays_miss_an_empty_mesh(backend):
 def test_hits_do_not_depend_on_earlier_updates():
     """Parts attached and detached step by step give the same hits as the final set at once."""
     rng = np.random.default_rng(11)
-    parts = {k: caster.split(*caster.checked(*soup(rng, 50)))[0] for k in range(8)}
+    parts = {k: caster.split(*caster.check_mesh(*soup(rng, 50)))[0] for k in range(8)}
     way = directions(rng, 20_000)
     moved = Caster(origin=np.zeros(3), dynamic=True)
     moved.update(attach={k: parts[k] for k in (0, 3, 5, 6)})
