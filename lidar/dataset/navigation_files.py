@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import warnings
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.csv_tables import BLOCK_ROWS
 from geoscene.typing import Float
-from lidar.dataset.layout import Paths, opened_rows, read_rows, reading_file
+from lidar.dataset.layout import Paths, read_rows, reading_file
 from lidar.sensors.navigation.measurements import NAMES, STATES, Fixes, Inertial
 from lidar.sensors.navigation.nmea import satellites_used
 
@@ -89,16 +87,20 @@ def _state(quality: NDArray[np.int8]) -> NDArray[np.int8]:
     return np.array(table, np.int8)[np.searchsorted((0, 1, 2, 4, 5), quality)]
 
 
-def read_samples(path: Path) -> Iterator[Inertial]:
-    """The samples of an inertial unit of a dataset, in blocks.
+_SAMPLES = (
+    "time_ns",
+    *(f"{name}_{c}" for name in ("gyro", "accel", "true_gyro", "true_accel") for c in "xyz"),
+)
+
+
+def read_samples(path: Path) -> Inertial:
+    """The samples of an inertial unit of a dataset.
 
     Raises DatasetError for a file that cannot be read.
     """
-    with opened_rows(path) as rows:
-        while block := list(islice(rows, BLOCK_ROWS)):
-            time_ns = np.array([int(row["time_ns"]) for row in block], np.int64)
-            columns = (
-                np.array([[float(row[f"{name}_{axis}"]) for axis in "xyz"] for row in block])
-                for name in ("gyro", "accel", "true_gyro", "true_accel")
-            )
-            yield Inertial(time_ns, *columns)
+    with reading_file(path), path.open(encoding="utf-8") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a file without samples
+        names = next(file, "").rstrip("\n").split(",")
+        columns = [names.index(name) for name in _SAMPLES]
+        values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2).reshape(-1, len(columns))
+        return Inertial(values[:, 0].astype(np.int64), *np.split(values[:, 1:], 4, axis=1))

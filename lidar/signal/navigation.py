@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -32,23 +32,17 @@ def altered_fixes(fixes: Fixes, stages: Stages, *, at: Situation) -> Fixes:
     return replace(found, **truth)
 
 
-def altered_samples(
-    blocks: Iterable[Inertial], stages: Stages, *, at: Situation
-) -> Iterator[tuple[Inertial, Inertial]]:
-    """Each block of an inertial unit's samples after the stages on them, and as without; truth stays."""
-    chosen = [
-        (named.label, cast("SamplesStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame))
-        for named in stages.at("samples", at.sensor)
-    ]
-    for original in blocks:
-        found = original
-        for name, stage, rng in chosen:
-            before, found = found, stage.samples(found, at=at, rng=rng)
-            if len(found) != len(original):
-                raise LidarError(f"stage {name} returned {len(found)} of {len(original)} samples")
-            if at.effects is not None:
-                at.effects.add(name, {"samples changed": samples_truth(found, before)["changed"].sum()})
-        yield replace(found, true_gyro=original.true_gyro, true_accel=original.true_accel), original
+def altered_samples(samples: Inertial, stages: Stages, *, at: Situation) -> Inertial:
+    """The samples of an inertial unit after the stages on them; ground truth stays."""
+    found = samples
+    for named in stages.at("samples", at.sensor):
+        rng = named.rng(stages.seed, at.sensor, frame=at.frame)
+        before, found = found, cast("SamplesStage", named.stage).samples(found, at=at, rng=rng)
+        if len(found) != len(samples):
+            raise LidarError(f"stage {named.label} returned {len(found)} of {len(samples)} samples")
+        if at.effects is not None:
+            at.effects.add(named.label, {"samples changed": samples_truth(found, before)["changed"].sum()})
+    return replace(found, true_gyro=samples.true_gyro, true_accel=samples.true_accel)
 
 
 def fixes_truth(

@@ -172,4 +172,4 @@ class SamplesStage(Protocol):
     """A stage on the samples of an inertial unit."""
 
     def samples(self, samples: Inertial, *, at: Situation, rng: np.random.Generator) -> Inertial:
-        """The samples that are recorded, as many. Long drives come in blocks, in order of time."""
+        """The samples that are recorded, as many, in order of time."""

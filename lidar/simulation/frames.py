@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import partial
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -135,6 +135,7 @@ class Simulation:
         )
         stages = recording.settings.stages
         fixes, samples = _fixes(plan, stages), _samples(plan, stages)
+        since_ns = np.iinfo(np.int64).min  # the first frame has all readings before it, too
         for number, (start_ns, end_ns, group) in enumerate(_steps(plan, measured)):
             pose = plan.trajectory.at([start_ns])
             x, y, z = pose.position[0].tolist()
@@ -145,9 +146,10 @@ class Simulation:
                 pose,
                 np.array([*plan.scene.frame.to_geographic(x, y), z], float),
                 measured=tuple(group),
-                fixes={name: source.until(end_ns) for name, source in fixes.items()},
-                samples={name: source.until(end_ns) for name, source in samples.items()},
+                fixes={name: _within(readings, (since_ns, end_ns)) for name, readings in fixes.items()},
+                samples={name: _within(readings, (since_ns, end_ns)) for name, readings in samples.items()},
             )
+            since_ns = end_ns
 
 
 def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = silent) -> Simulation:
@@ -186,23 +188,11 @@ def _steps(
         yield first.frame_start_ns(frame), plan.trajectory.duration_ns + 1, group
 
 
-class _Source(Generic[Readings]):
-    """Readings of a receiver or an inertial unit, taken in order of time."""
-
-    def __init__(self, blocks: Iterator[Readings]) -> None:
-        self._blocks: Iterator[Readings] = blocks
-        self._next: Readings = next(blocks)
-
-    def until(self, time_ns: int) -> Readings:
-        """The readings before a time that were not taken yet."""
-        while not (self._next.time_ns >= time_ns).any():
-            if (block := next(self._blocks, None)) is None:
-                break
-            self._next = type(block).concatenate([self._next, block])
-        row = int(np.searchsorted(self._next.time_ns, time_ns))
-        taken: Readings = self._next.take(slice(row))
-        self._next = self._next.take(slice(row, None))
-        return taken
+def _within(readings: Readings, span_ns: tuple[int, int]) -> Readings:
+    """The readings from a time on and before another."""
+    first, last = np.searchsorted(readings.time_ns, span_ns)
+    taken: Readings = readings.take(slice(int(first), int(last)))
+    return taken
 
 
 def _unit(plan: DrivePlan, spec: GnssSpec | ImuSpec) -> Situation:
@@ -215,22 +205,19 @@ def _unit(plan: DrivePlan, spec: GnssSpec | ImuSpec) -> Situation:
     )
 
 
-def _fixes(plan: DrivePlan, stages: Stages) -> dict[str, _Source[Fixes]]:
+def _fixes(plan: DrivePlan, stages: Stages) -> dict[str, Fixes]:
     """The fixes of the rig's receivers after the stages on them."""
-    seed, found = plan.options.seed, dict[str, _Source[Fixes]]()
+    seed, found = plan.options.seed, dict[str, Fixes]()
     for spec in plan.rig.gnss:
         fixes = observed_fixes(plan.scene, spec, trajectory=plan.trajectory, start=plan.start, seed=seed)
-        fixes = altered_fixes(fixes, stages, at=_unit(plan, spec))
-        found[spec.name] = _Source(iter([fixes]))
+        found[spec.name] = altered_fixes(fixes, stages, at=_unit(plan, spec))
     return found
 
 
-def _samples(plan: DrivePlan, stages: Stages) -> dict[str, _Source[Inertial]]:
+def _samples(plan: DrivePlan, stages: Stages) -> dict[str, Inertial]:
     """The samples of the rig's inertial units after the stages on them."""
-    found = dict[str, _Source[Inertial]]()
+    found = dict[str, Inertial]()
     for spec in plan.rig.imus:
-        blocks = observe_imu(plan.trajectory, plan.scene.frame, spec=spec, seed=plan.options.seed)
-        at = _unit(plan, spec)
-        pairs = altered_samples(blocks, stages, at=at)
-        found[spec.name] = _Source(samples for samples, _ in pairs)
+        samples = observe_imu(plan.trajectory, plan.scene.frame, spec=spec, seed=plan.options.seed)
+        found[spec.name] = altered_samples(samples, stages, at=_unit(plan, spec))
     return found

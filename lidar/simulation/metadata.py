@@ -159,6 +159,6 @@ def write_metadata(
         heights = heights_of(scene.frame, fixes)
         record_fixes(paths, fixes, at=at, stages=stages, start=start, heights=heights)
     for unit in rig.imus:
-        samples = partial(observe_imu, trajectory, scene.frame, spec=unit, seed=seed)
+        samples = observe_imu(trajectory, scene.frame, spec=unit, seed=seed)
         at = situation(unit.name, unit.mount)
         record_samples(paths, samples, at=at, stages=stages, start=start)

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import replace
 from datetime import datetime
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +13,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
 from geoscene.support.csv_tables import table_blocks, write_blocks, write_columns
 from geoscene.support.files import atomic_path
-from lidar.dataset.layout import Paths, opened_rows, reading_file
+from lidar.dataset.layout import Paths, reading_file
 from lidar.dataset.navigation_files import FixHeights
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import iso_times
@@ -81,9 +77,8 @@ def record_fixes(
     """
     if stages.at("fixes", at.sensor):
         original, fixes = fixes, altered_fixes(fixes, stages, at=at)
-        with _opened_past(past) as rows:
-            before = _next_past(rows, past, count=len(fixes))
-        write_columns(paths.measurements_truth(at.sensor), fixes_truth(fixes, original, past=before))
+        truth = fixes_truth(fixes, original, past=_read_past(past, count=len(fixes)))
+        write_columns(paths.measurements_truth(at.sensor), truth)
     _write_fixes(paths, at.sensor, fixes=fixes, start=start, heights=heights)
 
 
@@ -109,39 +104,29 @@ def _write_fixes(paths: Paths, name: str, *, fixes: Fixes, start: datetime, heig
         file.writelines(nmea(fixes, start, vertical=heights.vertical, separation=heights.separation))
 
 
-@contextmanager
-def _opened_past(path: Path | None) -> Iterator[Iterator[dict[str, str]]]:
-    """Yield the rows of a truth file of earlier stages, if there is one."""
-    if path is None:
-        yield iter(())
-        return
-    with opened_rows(path) as rows:
-        yield rows
+def _read_past(path: Path | None, *, count: int) -> dict[str, NDArray[Any]] | None:
+    """The measurements (count,) in a truth file of earlier stages; None without one.
 
-
-def _next_past(
-    rows: Iterator[dict[str, str]], path: Path | None, *, count: int
-) -> dict[str, NDArray[Any]] | None:
-    """The measurements in the next rows of a truth file; None without one.
-
-    Raises DatasetError for fewer rows.
+    Raises DatasetError for a damaged file.
     """
-    if path is None:
+    if path is None or not count:
         return None
-    block = list(islice(rows, count))
-    with reading_file(path):
-        if len(block) < count:
+    kinds = {"time_ns": np.int64, "quality": np.int8, "satellites": np.int8}
+    with reading_file(path), path.open(encoding="utf-8") as file:
+        names = next(file, "").rstrip("\n").split(",")
+        values = np.loadtxt(file, delimiter=",", ndmin=2)
+        if len(values) < count:
             raise ValueError("is of fewer measurements")
-        kinds = {"time_ns": np.int64, "quality": np.int8, "satellites": np.int8}
-        names = [name for name in (block[0] if block else ()) if name != "changed"]
         return {
-            name: np.array([row[name] for row in block]).astype(kinds.get(name, np.float64)) for name in names
+            name: column.astype(kinds.get(name, np.float64))
+            for name, column in zip(names, values[:count].T, strict=True)
+            if name != "changed"
         }
 
 
 def record_samples(
     paths: Paths,
-    samples: Callable[[], Iterator[Inertial]],
+    samples: Inertial,
     *,
     at: Situation,
     stages: Stages,
@@ -150,23 +135,14 @@ def record_samples(
 ) -> None:
     """Write the samples of the inertial unit ``at.sensor`` after the stages, with the truth of changes.
 
-    samples : the unit's samples in blocks, as without stages; called twice if there are stages
-    past    : truth file of the samples, if stages changed them already
+    past : truth file of the samples, if stages changed them already
     """
-    path = paths.measurements(at.sensor)
-    if not stages.at("samples", at.sensor):
-        write_blocks(path, (_sample_columns(rows, start) for rows in samples()))
-        return
-    with _opened_past(past) as rows:
-        write_blocks(
-            paths.measurements_truth(at.sensor),
-            (
-                samples_truth(*pair, past=_next_past(rows, past, count=len(pair[0])))
-                for pair in altered_samples(samples(), stages, at=at)
-            ),
-        )
-    again = altered_samples(samples(), stages, at=replace(at, effects=None))  # which are counted already
-    write_blocks(path, (_sample_columns(rows, start) for rows, _ in again))
+    if stages.at("samples", at.sensor):
+        original, samples = samples, altered_samples(samples, stages, at=at)
+        truth = samples_truth(samples, original, past=_read_past(past, count=len(samples)))
+        write_columns(paths.measurements_truth(at.sensor), truth)
+    blocks = (samples.take(rows) for rows in table_blocks(len(samples)))
+    write_blocks(paths.measurements(at.sensor), (_sample_columns(rows, start) for rows in blocks))
 
 
 def _sample_columns(rows: Inertial, start: datetime) -> dict[str, Any]:

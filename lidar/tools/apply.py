@@ -214,8 +214,8 @@ def _apply_to_unit(dataset: Dataset, recording: Recording, *, spec: GnssSpec | I
     truth = dataset.paths.measurements_truth(spec.name)
     past = truth if truth.exists() else None
     if isinstance(spec, ImuSpec):
-        path = dataset.paths.measurements(spec.name)
-        record_samples(out, partial(read_samples, path), at=at, stages=stages, start=start, past=past)
+        samples = read_samples(dataset.paths.measurements(spec.name))
+        record_samples(out, samples, at=at, stages=stages, start=start, past=past)
         return
     fixes, heights = read_fixes(dataset.paths, spec.name, vertical=dataset.frame.vertical)
     record_fixes(out, fixes, at=at, stages=stages, start=start, heights=heights, past=past)

@@ -108,17 +108,17 @@ def _imu_variances(spec: ImuSpec | None) -> tuple[float, float]:
 
 
 def _samples(drive: RosDrive, name: str, *, variances: tuple[float, float]) -> Iterator[Message]:
-    for block in read_samples(drive.dataset.paths.measurements(name)):
-        for k, time_ns in enumerate(block.time_ns.tolist()):
-            make = functools.partial(
-                ros.imu,
-                block.gyro[k],
-                block.accel[k],
-                stamp_ns=drive.stamp(time_ns),
-                frame_id=drive.names[name],
-                variances=variances,
-            )
-            yield time_ns, make
+    samples = read_samples(drive.dataset.paths.measurements(name))
+    for k, time_ns in enumerate(samples.time_ns.tolist()):
+        make = functools.partial(
+            ros.imu,
+            samples.gyro[k],
+            samples.accel[k],
+            stamp_ns=drive.stamp(time_ns),
+            frame_id=drive.names[name],
+            variances=variances,
+        )
+        yield time_ns, make
 
 
 def _gnss(drive: RosDrive, name: str) -> list[Topic]:

@@ -10,14 +10,12 @@ of the local vertical due to travel); f includes the Coriolis acceleration.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.support.csv_tables import table_blocks
 from geoscene.typing import Float
 from lidar.geometry.attitude import body_rates, matrix_from_quat
 from lidar.geometry.poses import Trajectory
@@ -48,24 +46,12 @@ def true_inertial(
 
     Central differences of the trajectory's attitudes and of the unit's velocity, interpolated linearly.
     """
-    blocks = [*_true_blocks(trajectory, frame, spec=spec, time_ns=time_ns)]
-    rate, force = (np.concatenate([np.empty((0, 3)), *(block[k] for block in blocks)]) for k in (1, 2))
+    at, seconds = time_ns * 1e-9, trajectory.time_ns * 1e-9
+    rate, force = (
+        np.stack([np.interp(at, seconds, column) for column in signal.T], axis=1) @ spec.mount.rotation
+        for signal in _at_poses(trajectory, frame, spec=spec)
+    )
     return rate, force
-
-
-def _true_blocks(
-    trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, time_ns: NDArray[np.int64]
-) -> Iterator[tuple[slice, Float, Float]]:
-    """Rows of times, and `true_inertial` of these, in order: blocks for tables."""
-    own = spec.mount.rotation
-    seconds = trajectory.time_ns * 1e-9
-    signals = _at_poses(trajectory, frame, spec=spec)
-    for rows in table_blocks(len(time_ns)):
-        at = time_ns[rows] * 1e-9
-        rate, force = (
-            np.stack([np.interp(at, seconds, v[:, k]) for k in range(3)], axis=1) @ own for v in signals
-        )
-        yield rows, rate, force
 
 
 def _at_poses(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec) -> tuple[Float, Float]:
@@ -101,88 +87,49 @@ def _earth(trajectory: Trajectory, frame: Frame, *, velocity: Float) -> tuple[Fl
     return earth, transport, normal_gravity(lat, z)
 
 
-def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Iterator[Inertial]:
-    """The measurements of an inertial unit along a drive, in blocks for tables; an empty one for none.
+def observe_imu(trajectory: Trajectory, frame: Frame, *, spec: ImuSpec, seed: int) -> Inertial:
+    """The measurements of an inertial unit along a drive.
 
     Random numbers are keyed by seed and unit and drawn in time order from the start, so that a shorter
     drive has the same first rows, bit for bit.
     """
-    time_ns = _times(trajectory, spec)
-    noise = _Noise(spec, seed)
-    for rows, rate, force in _true_blocks(trajectory, frame, spec=spec, time_ns=time_ns):
-        errors = noise.following(len(rate))
-        yield Inertial(time_ns[rows], rate + errors[:, :3], force + errors[:, 3:], rate, force)
-
-
-def _times(trajectory: Trajectory, spec: ImuSpec) -> NDArray[np.int64]:
-    """Times (n,) of a unit's measurements along a drive."""
     step = 1e9 / spec.rate_hz
     count = int(np.floor((trajectory.duration_ns - spec.time_offset_ns) / step + 1e-9)) + 1
-    return np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
+    time_ns = np.round(np.arange(max(count, 0)) * step).astype(np.int64) + spec.time_offset_ns
+    rate, force = true_inertial(trajectory, frame, spec=spec, time_ns=time_ns)
+    errors = inertial_noise(spec, len(time_ns), seed=seed)
+    return Inertial(time_ns, rate + errors[:, :3], force + errors[:, 3:], rate, force)
 
 
 def inertial_noise(spec: ImuSpec, count: int, *, seed: int) -> Float:
     """Errors (n, 6) of gyros, rad/s, and accelerometers, m/s^2: white noise, random walk, flicker."""
-    return _Noise(spec, seed).following(count)
+    dt = 1.0 / spec.rate_hz
+    white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
+    step = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
+    draw = generator(seed, spec.name, "imu").standard_normal((count, 12))
+    total: Float = draw[:, :6] * white + np.cumsum(draw[:, 6:] * step, axis=0)
+    for first, instability in ((0, spec.gyro_instability), (3, spec.accel_instability)):
+        if instability and count:
+            name = f"{spec.name}/imu/{first}"
+            total[:, first : first + 3] += instability * _flicker(count, dt, seed=seed, name=name)
+    return total
 
 
-class _Noise:
-    """Errors of a unit, drawn in blocks of rows; their values do not depend on the blocks."""
-
-    def __init__(self, spec: ImuSpec, seed: int) -> None:
-        dt = 1.0 / spec.rate_hz
-        self._random = generator(seed, spec.name, "imu")
-        self._white = np.repeat([spec.gyro_noise, spec.accel_noise], 3) / np.sqrt(dt)
-        self._step = np.repeat([spec.gyro_walk, spec.accel_walk], 3) * np.sqrt(dt)
-        self._walk = np.full(6, -0.0)  # changes no step, not even the sign of zero
-        self._flicker = [
-            (axes, instability, _Flicker(dt, seed=seed, name=f"{spec.name}/imu/{axes.start}"))
-            for axes, instability in (
-                (slice(0, 3), spec.gyro_instability),
-                (slice(3, 6), spec.accel_instability),
-            )
-            if instability
-        ]
-
-    def following(self, count: int) -> Float:
-        """Errors (n, 6) of the next ``count`` measurements."""
-        draw = self._random.standard_normal((count, 12))
-        steps = draw[:, 6:] * self._step
-        steps[:1] += self._walk
-        walk = np.cumsum(steps, axis=0)
-        total: Float = draw[:, :6] * self._white + walk
-        self._walk = walk[-1] if count else self._walk
-        for axes, instability, flicker in self._flicker:
-            total[:, axes] += instability * flicker.following(count)
-        return total
-
-
-class _Flicker:
-    """Three columns of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
+def _flicker(count: int, dt: float, *, seed: int, name: str) -> Float:
+    """Three columns (n, 3) of noise whose spectrum is 1 / (2 pi f), with an Allan deviation of 0.664.
 
     The sum of stationary first-order Gauss-Markov processes, a factor of e apart in correlation time, each of
     variance 1 / pi: between the shortest and the longest time their spectra add up to it (IEEE Std 952-1997,
     annex C, for the spectrum of bias instability and its Allan deviation, B sqrt(2 ln 2 / pi)).
     """
+    from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
 
-    def __init__(self, dt: float, *, seed: int, name: str) -> None:
-        self._random = [generator(seed, name, time) for time in _FLICKER_TIMES]
-        self._phi = np.exp(-dt / _FLICKER_TIMES)
-        self._state = np.zeros((len(_FLICKER_TIMES), 1, 3))
-        self._begun = False
-
-    def following(self, count: int) -> Float:
-        """The next ``count`` rows (n, 3)."""
-        from scipy.signal import lfilter  # noqa: PLC0415 - slow to import
-
-        total = np.zeros((count, 3))
-        for k, (random, phi) in enumerate(zip(self._random, self._phi, strict=True)):
-            noise = random.standard_normal((count, 3)) / np.sqrt(np.pi)
-            noise[0 if self._begun else 1 :] *= np.sqrt(1 - phi**2)
-            sums, self._state[k] = lfilter([1.0], [1.0, -phi], noise, axis=0, zi=self._state[k])
-            total += sums
-        self._begun = self._begun or count > 0
-        return total
+    total = np.zeros((count, 3))
+    for time, phi in zip(_FLICKER_TIMES, np.exp(-dt / _FLICKER_TIMES), strict=True):
+        noise = generator(seed, name, time).standard_normal((count, 3)) / np.sqrt(np.pi)
+        noise[1:] *= np.sqrt(1 - phi**2)
+        total += lfilter([1.0], [1.0, -phi], noise, axis=0)
+    return total
 
 
 def imu_columns(rows: Inertial) -> dict[str, NDArray[Any]]:

@@ -131,10 +131,7 @@ def fixes_of(dataset: Dataset, receiver: str) -> Fixed:
 
 def unit_of(dataset: Dataset, name: str, *, noise: Noise, fixes: Fixed) -> Unit:
     """An inertial unit of a dataset, where its vehicle is by its fixes."""
-    blocks = list(read_samples(dataset.paths.measurements(name)))
-    time_ns = np.concatenate([block.time_ns for block in blocks])
-    gyro, accel = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("gyro", "accel"))
-    samples = Inertial(time_ns, gyro, accel, np.empty((0, 3)), np.empty((0, 3)))  # the truth is not used
+    samples = read_samples(dataset.paths.measurements(name))
     x, y = fixes.position[0, :2] * fixes.scale
     lon, lat = dataset.frame.to_geographic(np.array([x]), np.array([y]))
     turn = float(dataset.frame.convergence(lon, lat)[0])

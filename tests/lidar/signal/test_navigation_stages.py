@@ -125,7 +125,7 @@ def test_files_of_receivers_and_inertial_units_read_back(plain):
     again = nmea(fixes, dataset.start, vertical=heights.vertical, separation=heights.separation)
     text = height_note(heights.vertical, heights.geoid) + "".join(again)
     assert text == (plain / "roof.nmea").read_bytes().decode()
-    samples = np.concatenate([block.accel for block in read_samples(plain / "unit.csv")])
+    samples = read_samples(plain / "unit.csv").accel
     assert np.array_equal(samples, numbers(plain / "unit.csv", "accel_x", "accel_y", "accel_z"))
 
 

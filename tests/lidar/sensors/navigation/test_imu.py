@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
-from geoscene.support import csv_tables
 from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
@@ -17,7 +16,6 @@ from lidar.sensors.navigation.imu import (
     observe_imu,
     true_inertial,
 )
-from lidar.sensors.navigation.measurements import Inertial
 from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.sensors.rig.specs import ImuSpec
 
@@ -47,7 +45,7 @@ def track(position, velocity, quat):
 
 
 def observed(trajectory, *, spec, seed):
-    return Inertial.concatenate(list(observe_imu(trajectory, FRAME, spec=spec, seed=seed)))
+    return observe_imu(trajectory, FRAME, spec=spec, seed=seed)
 
 
 def test_gravity_is_that_of_wgs84():
@@ -173,7 +171,7 @@ def test_an_imu_without_noise_reports_the_truth():
 
 
 @pytest.mark.parametrize("offset_ns", [0, 3_000_000, 20_000_000_000])
-def test_measurements_do_not_depend_on_the_blocks_in_which_they_are_drawn(offset_ns, monkeypatch):
+def test_measurements_are_the_truth_plus_noise(offset_ns):
     spec = ImuSpec(
         "imu", Mount(), rate_hz=170.0, gyro_instability=2e-6, accel_instability=7e-4, time_offset_ns=offset_ns
     )
@@ -181,9 +179,3 @@ def test_measurements_do_not_depend_on_the_blocks_in_which_they_are_drawn(offset
     noise = inertial_noise(spec, len(whole), seed=4)
     np.testing.assert_array_equal(whole.gyro, whole.true_gyro + noise[:, :3])
     np.testing.assert_array_equal(whole.accel, whole.true_accel + noise[:, 3:])
-    monkeypatch.setattr(csv_tables, "BLOCK_ROWS", 100)
-    blocks = list(observe_imu(circling(), FRAME, spec=spec, seed=4))
-    assert max(len(block) for block in blocks) <= 100
-    parts = Inertial.concatenate(blocks)
-    for name, column in whole.columns().items():
-        np.testing.assert_array_equal(getattr(parts, name), column)
