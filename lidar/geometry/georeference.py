@@ -18,7 +18,7 @@ AFFINE_LIMIT = 1e-4
 
 
 _NODES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2) / 2
-"""Where (9, 2) an affine map is compared with the projection, in sides of the points' box from its middle."""
+"""Test points (9, 2) at which an affine map is compared with the projection, in sides of the points' box."""
 
 
 def export_crs(frame: Frame, crs: str = "utm") -> CRS:

@@ -130,7 +130,7 @@ def pushes(
 
 
 def _way_out(low: Float, high: Float, *, half: float) -> float:
-    """The smallest lateral shift that moves a body out of all intervals; NaN if there is none."""
+    """Smallest lateral shift that moves a body out of all intervals; NaN if none within `ASIDE` does."""
     ways = np.concatenate([high + half, low - half])
     ways += np.copysign(0.05, ways)
     free = ((ways[:, None] - half >= high) | (ways[:, None] + half <= low)).all(axis=1) & (

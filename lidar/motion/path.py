@@ -107,7 +107,7 @@ def plan_path(
     margin    : metres that the body keeps from obstacles
 
     Raises BlockedError where the vehicle cannot follow the route, or cannot without touching an obstacle: its
-    ``turns`` say what a detour must avoid. Raises RouteError for a route too short to drive.
+    ``turns`` are those that rerouting must avoid. Raises RouteError for a route too short to drive.
     """
     if not isinstance(obstacles, shapely.STRtree):
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))

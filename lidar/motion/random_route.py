@@ -18,7 +18,7 @@ _LAST_START = 0.9
 _FIRST_END = 0.1
 """Share of a street from which on a route ends."""
 _SHORTEST = 0.75
-"""Share of the longest route that is left at the start, where no route is as long as is wanted."""
+"""Share of the longest route that must be left at the start if no route has the requested length."""
 _MINOR = 0.1
 """Weight of service roads and tracks in random choices; of other streets 1."""
 _MOST_STREETS = 1_000_000
@@ -27,11 +27,11 @@ _MOST_STREETS = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class _Streets:
-    """What a route can do in each state, in units of the route that is wanted.
+    """States of the search for a route, in units of the requested route.
 
     edge        : (s,) edge of each state
-    cost        : (m,) share of the wanted route that each edge is
-    left        : (s,) share that can be driven from the start of each state on; over 2 for any
+    cost        : (m,) length of each edge
+    left        : (s,) longest drive from the start of each state; over 2 where it is unlimited
     first, after : states that follow state k are ``after[first[k] : first[k + 1]]``
     """
 
@@ -102,7 +102,7 @@ def random_edges(
 
 
 def _streets(states: TurnStates, cost: Float, *, turns: Bools) -> _Streets:
-    """How much can be driven from each state on by some of the turns (t,)."""
+    """Longest drives from each state by some of the turns (t,)."""
     before, after = states.before[turns], states.after[turns]
     label, size = _components(states, cost, before=before, after=after)
     enough = (size > 0) & (size >= min(1.0, size.max(initial=0.0)))

@@ -18,7 +18,7 @@ from lidar.motion.path import MARGIN, Path, Surface, plan_path
 from lidar.motion.route import Route, RouteOptions, Spec, plan_route
 from lidar.motion.vehicle import Vehicle
 
-DETOURS = 40
+_ATTEMPTS = 40
 """Maximum number of plans."""
 
 
@@ -48,7 +48,7 @@ def plan_route_and_path(
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
     avoid: set[tuple[int, int]] = set()
     blocked: BlockedError
-    for _ in range(DETOURS):
+    for _ in range(_ATTEMPTS):
         try:
             route = plan_route(graph, frame, spec=spec, options=options, avoid=avoid)
         except RouteError:

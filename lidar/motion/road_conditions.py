@@ -1,4 +1,4 @@
-"""Roads in weather: what grip and visibility leave of speeds and accelerations."""
+"""Roads in weather: speeds and accelerations that grip and visibility permit."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RoadConditions:
 
     @property
     def share(self) -> float:
-        """Grip over that of a dry road: drivers use the same share of the grip that there is."""
+        """Grip over that of a dry road: drivers use the same share of the available grip."""
         return self.grip / DRY_GRIP
 
     @property
@@ -43,8 +43,9 @@ class RoadConditions:
         """Greatest speed in m/s from which a driver stops within the visibility."""
         if math.isinf(self.visibility):
             return math.inf
-        brake = min(_BRAKING, self.grip * GRAVITY)
-        return brake * (math.sqrt(_REACTION_S**2 + 2 * self.visibility / brake) - _REACTION_S)
+        deceleration = min(_BRAKING, self.grip * GRAVITY)
+        braking_s = math.sqrt(_REACTION_S**2 + 2 * self.visibility / deceleration) - _REACTION_S
+        return deceleration * braking_s
 
     def braking_distance(self, speed: float) -> float:
         """Metres within which a vehicle stops that uses all of the grip, without the reaction time."""

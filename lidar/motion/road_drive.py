@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,37 @@ _HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
 _DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
+
+
+@dataclass(frozen=True, slots=True)
+class RoadDriveOptions:
+    """Options of a drive on roads.
+
+    vehicle   : a built-in vehicle, or a TOML file
+    seed      : of a random route
+    duration  : seconds to record; the whole route, or 60 s of a random one, by default
+    side      : side of the road that is driven on
+    from_rest : start and end a random drive at rest; by default its route is longer than the record and the
+                vehicle is at speed at both ends
+    """
+
+    vehicle: str
+    seed: int = 0
+    duration: float | None = None
+    side: Side = "right"
+    from_rest: bool = False
+
+    def record(self, spec: Spec) -> tuple[float | None, bool]:
+        """Seconds to record, None for the whole route, and whether the vehicle is at speed at both ends."""
+        seconds = self.duration if self.duration is not None or spec != "random" else _RANDOM_SECONDS
+        return seconds, spec == "random" and not self.from_rest
+
+    def route_options(self, spec: Spec) -> RouteOptions:
+        """Options of its route."""
+        seconds, at_speed = self.record(spec)
+        if seconds is not None and at_speed:
+            seconds += ROUTE_MARGIN_S
+        return RouteOptions(seed=self.seed, duration=seconds, side=self.side)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +133,7 @@ def road_map(scene: Scene) -> RoadMap:
 
 
 def road_surface(scene: Scene) -> Surface:
-    """Heights of the ground or bridge surface near given heights; the given ones where there is none."""
+    """Heights of the ground or bridge surface near given heights; the given heights where none is found."""
     world = World(scene)
 
     def surface(x: Float, y: Float, z: Float) -> Float:  # noqa: PLR0917 - a Surface
@@ -121,35 +151,25 @@ def plan_road_drive(
     scene: Scene,
     spec: Spec,
     *,
-    vehicle: str,
-    seed: int = 0,
-    duration: float | None = None,
-    side: str = "right",
-    from_rest: bool = False,
+    options: RoadDriveOptions,
     progress: Progress = silent,
 ) -> RoadPlan:
     """The route and the path of a vehicle through a scene.
-
-    duration  : seconds to record; the whole route, or 60 s of a random one, by default
-    from_rest : start and end a random drive at rest; by default its route is longer than the record and the
-                vehicle is at speed at both ends
 
     Streets too narrow for the vehicle are avoided. Raises RouteError if there is no route.
     """
     whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
-    body = load_vehicle(vehicle)
     obstacles = ground_footprints(scene)
     progress("planning", 0, total=0)
-    seconds, at_speed = _record(spec, duration, from_rest=from_rest)
     try:
         route, path = plan_route_and_path(
             graph,
             scene.frame,
             spec=spec,
-            vehicle=body,
-            options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
+            vehicle=load_vehicle(options.vehicle),
+            options=options.route_options(spec),
             obstacles=obstacles,
             ground=road_surface(scene),
         )
@@ -159,45 +179,22 @@ def plan_road_drive(
         raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
     number = np.append(np.flatnonzero(kept), -1).astype(np.int32)
     path = replace(path, edge=number[path.edge])
-    return RoadPlan(whole, route, path, seconds, at_speed)
+    return RoadPlan(whole, route, path, *options.record(spec))
 
 
-def road_course(
-    roads: RoadMap,
-    spec: Spec,
-    *,
-    vehicle: str,
-    seed: int = 0,
-    duration: float | None = None,
-    side: str = "right",
-    from_rest: bool = False,
-) -> tuple[Float, list[Float]]:
+def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tuple[Float, list[Float]]:
     """Scene metres (n, 2) of the path that `plan_road_drive` will plan, and of all routes that it will try.
 
     Raises RouteError as `plan_road_drive` does.
     """
-    seconds, at_speed = _record(spec, duration, from_rest=from_rest)
     tried: list[Float] = []
     _, path = plan_route_and_path(
         graph_on_tiles(roads.graph, roads),
         roads.frame,
         spec=spec,
-        vehicle=load_vehicle(vehicle),
-        options=_route_options(seconds, at_speed=at_speed, seed=seed, side=side),
+        vehicle=load_vehicle(options.vehicle),
+        options=options.route_options(spec),
         obstacles=_obstacles(roads.footprints, roads.min_height),
         tried=lambda route: tried.append(route.line[:, :2]),
     )
     return path.position[:, :2], tried
-
-
-def _record(spec: Spec, duration: float | None, *, from_rest: bool) -> tuple[float | None, bool]:
-    """Seconds to record, None for the whole route, and whether the vehicle is at speed at both ends."""
-    seconds = duration if duration is not None or spec != "random" else _RANDOM_SECONDS
-    return seconds, spec == "random" and not from_rest
-
-
-def _route_options(seconds: float | None, *, at_speed: bool, seed: int, side: str) -> RouteOptions:
-    more = ROUTE_MARGIN_S if at_speed else 0.0
-    return RouteOptions(
-        seed=seed, duration=None if seconds is None else seconds + more, side=cast("Side", side)
-    )

@@ -65,7 +65,7 @@ class Route:
 
 @dataclass(frozen=True, slots=True)
 class RouteOptions:
-    """How a route is planned.
+    """Options of route planning.
 
     seed       : of a random route
     duration   : seconds of a random route at the speed limits; 600 if neither this nor `length` is given

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.errors import InputError
 from lidar.motion.motion import DWELL_S, Motion, legs_of, speed_limits
 from lidar.motion.path import Path
@@ -68,7 +68,7 @@ def motion_within(
     if len(time_s) < 2 or (np.diff(max_distance) < -1e-9).any():
         raise InputError("the maximum distances of a speed profile must not decrease")
     limit = speed_limits(path, vehicle)
-    parts: list[_Part] = []
+    parts: list[tuple[Float, Float, Ints]] = []
     begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
     for first, last in legs_of(path):
         if parts and total - begin < 2 * STEP_S:
@@ -91,31 +91,13 @@ def motion_within(
         if driven and last < len(path):
             rest = round(DWELL_S / dt)
             s, v = np.append(s, np.full(rest, s[-1])), np.append(v, np.zeros(rest))
-        parts.append(_Part(origin, first, last - 1, s, v))
+        s = origin + s
+        row = np.clip(np.searchsorted(path.s, s, side="right") - 1, first, last - 1)
+        parts.append((s, v, row))
         begin += len(s) * dt
         if not driven:
             break
-    return _join(parts, path, rate_hz=rate_hz)
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """The profile of a leg: metres to its start, its first and last row, distances and speeds (n,) in it."""
-
-    origin: float
-    first: int
-    last: int
-    s: Float
-    v: Float
-
-
-def _join(parts: list[_Part], path: Path, *, rate_hz: float) -> Motion:
-    """The profile of all legs."""
-    s = np.concatenate([part.origin + part.s for part in parts])
-    v = np.concatenate([part.v for part in parts])
-    sizes = [len(part.s) for part in parts]
-    first, last = (np.repeat([getattr(part, end) for part in parts], sizes) for end in ("first", "last"))
-    row = np.clip(np.searchsorted(path.s, s, side="right") - 1, first, last)
+    s, v, row = (np.concatenate(column) for column in zip(*parts, strict=True))
     time_ns = np.round(np.arange(len(s)) * (1e9 / rate_hz)).astype(np.int64)
     return Motion(time_ns, s, v, np.gradient(v, 1.0 / rate_hz), row)
 

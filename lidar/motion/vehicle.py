@@ -13,7 +13,7 @@ from lidar.errors import InputError
 from lidar.toml_table import read_table
 
 KINDS = ("road", "foot", "air")
-"""Where a vehicle moves: on the carriageway, on foot, or through the air."""
+"""Kinds of motion: on the carriageway, on foot, or through the air."""
 
 _POSITIVE = (
     *("length", "width", "turning_radius", "steering", "max_speed", "pace"),

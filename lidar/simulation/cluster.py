@@ -81,7 +81,7 @@ def record_on_cluster(
     ]
     done, total = 0, sum(len(task.frames) for task in tasks)
     progress("driving", done, total=total)
-    write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=plan.jobs[:0])))
+    write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=())))
     try:
         for result in cluster.run_tasks(_record_task, tasks):
             for sensor, frame, points, digests in result.frames:

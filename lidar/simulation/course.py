@@ -25,7 +25,7 @@ from lidar.sensors.rig.devices import Camera
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.flight_planning import flight_course
 from lidar.simulation.frame_loop import CHUNK
-from lidar.simulation.plan import flight_options, sensors_of
+from lidar.simulation.plan import flight_options, road_drive_options, sensors_of
 from lidar.traffic.surroundings import LEFT
 
 _ASIDE = 15.0
@@ -66,17 +66,7 @@ def drive_course(roads: RoadMap, options: DriveOptions) -> DriveCourse:
             flight_course(roads, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
         )
     options.check_on_roads(vehicle.name)
-    return DriveCourse(
-        *road_course(
-            roads,
-            route,
-            vehicle=options.vehicle or rig.vehicle,
-            seed=options.seed,
-            duration=options.duration,
-            side=options.side_in(roads),
-            from_rest=options.from_rest,
-        )
-    )
+    return DriveCourse(*road_course(roads, route, options=road_drive_options(options, roads)))
 
 
 def needed_area(roads: RoadMap, options: DriveOptions) -> Any:

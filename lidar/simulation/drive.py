@@ -33,7 +33,7 @@ from lidar.simulation.boxes import merge_box_files, merge_signal_files
 from lidar.simulation.frame_loop import check_attackers, recording_chunks, run_jobs
 from lidar.simulation.measured import MeasuredCloud, MeasuredImages
 from lidar.simulation.metadata import write_metadata
-from lidar.simulation.plan import DrivePlan, Jobs, SensorFrame, plan_drive
+from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.record import record_frame
 from lidar.simulation.recording import Recording
 from lidar.world.thread_worlds import Worlds
@@ -276,12 +276,12 @@ def _verify(recording: Recording, jobs: Sequence[SensorFrame], *, progress: Prog
     return journal
 
 
-def _pending(plan: DrivePlan, journal: Journal) -> Jobs:
+def _pending(plan: DrivePlan, journal: Journal) -> list[SensorFrame]:
     """The frames that are not finished."""
     finished = {name: np.zeros(count, bool) for name, count in plan.frames.items()}
     for name, done in finished.items():
         done[journal.entries.of(name).frame] = True
-    return plan.jobs.where(lambda job: not finished[job.sensor.name][job.frame])
+    return [job for job in plan.jobs if not finished[job.sensor.name][job.frame]]
 
 
 def _points(plan: DrivePlan, journal: Journal) -> dict[str, int]:

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.classes import Class, materials
 from geoscene.pipeline.limits import Limit, height_limit
-from geoscene.pipeline.reach import OFFSET
+from geoscene.pipeline.reach import OFFSET, RoadMap
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float, Ints
@@ -26,7 +26,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import check_duration, check_start
 from lidar.motion.flight import Flight
 from lidar.motion.road_conditions import vehicle_on
-from lidar.motion.road_drive import RoadPlan, plan_road_drive
+from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
 from lidar.motion.vehicle import Vehicle, load_vehicle
 from lidar.options import DriveOptions
 from lidar.raycast.device import check_device
@@ -57,41 +57,6 @@ class SensorFrame:
 
 
 @dataclass(frozen=True, slots=True)
-class Jobs(Sequence[SensorFrame]):
-    """Frames of several sensors in order of time; a job is created on access.
-
-    sensors : the sensors
-    order   : (n,) int16, row of each frame's sensor
-    frame   : (n,) int32, number of each frame
-    """
-
-    sensors: tuple[Scanner | Camera, ...]
-    order: NDArray[np.int16]
-    frame: NDArray[np.int32]
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        return len(self.frame)
-
-    @overload
-    def __getitem__(self, row: int) -> SensorFrame: ...
-    @overload
-    def __getitem__(self, row: slice) -> Jobs: ...
-    def __getitem__(self, row: int | slice) -> SensorFrame | Jobs:
-        """A job, or the jobs of some rows."""
-        if isinstance(row, slice):
-            return Jobs(self.sensors, self.order[row], self.frame[row])
-        order, frame = int(self.order[row]), int(self.frame[row])
-        sensor = self.sensors[order]
-        return SensorFrame(sensor.frame_start_ns(frame), order, frame, sensor)
-
-    def where(self, keep: Callable[[SensorFrame], bool]) -> Jobs:
-        """The jobs for which ``keep`` is true."""
-        mask = np.fromiter(map(keep, self), bool, len(self))
-        return Jobs(self.sensors, self.order[mask], self.frame[mask])
-
-
-@dataclass(frozen=True, slots=True)
 class DrivePlan:
     """Immutable plan of a drive: everything that `drive` records, fixed before the first frame.
 
@@ -118,7 +83,7 @@ class DrivePlan:
     signals: SignalStates | None
     scanning_ns: Ints | None
     geo: Georeference
-    jobs: Jobs
+    jobs: Sequence[SensorFrame]
 
     @property
     def max_range(self) -> float:
@@ -135,8 +100,7 @@ class DrivePlan:
     @property
     def frames(self) -> dict[str, int]:
         """Number of frames, by sensor."""
-        count = np.bincount(self.jobs.order, minlength=len(self.sensors)).tolist()
-        return dict(zip((s.name for s in self.sensors), count, strict=True))
+        return {s.name: s.frame_count(self.trajectory.duration_ns) for s in self.sensors}
 
     @property
     def limits(self) -> list[Limit]:
@@ -298,17 +262,14 @@ def sensors_of(rig: Rig, options: DriveOptions) -> tuple[Scanner | Camera, ...]:
     return sensors
 
 
-def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> Jobs:
+def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[SensorFrame]:
     """Frames of all sensors that end within ``duration_ns``, in order of time."""
-    counts = [sensor.frame_count(duration_ns) for sensor in sensors]
-    starts = [
-        np.fromiter(map(sensor.frame_start_ns, range(count)), np.int64, count)
-        for sensor, count in zip(sensors, counts, strict=True)
+    frames = [
+        SensorFrame(sensor.frame_start_ns(frame), order, frame, sensor)
+        for order, sensor in enumerate(sensors)
+        for frame in range(sensor.frame_count(duration_ns))
     ]
-    order = np.repeat(np.arange(len(counts), dtype=np.int16), counts)
-    frame = np.concatenate([np.empty(0, np.int32), *(np.arange(n, dtype=np.int32) for n in counts)])
-    rows = np.lexsort((frame, order, np.concatenate([np.empty(0, np.int64), *starts])))
-    return Jobs(tuple(sensors), order[rows], frame[rows])
+    return sorted(frames, key=attrgetter("start_ns", "order", "frame"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,34 +300,37 @@ def plan_motion(
         return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
     if vehicle.kind != "air":
         options.check_on_roads(vehicle.name)
-        travel = plan_road_drive(
-            scene,
-            route,
-            vehicle=options.vehicle or load_rig(options.rig).vehicle,
-            seed=options.seed,
-            duration=options.duration,
-            side=options.side_in(scene),
-            from_rest=options.from_rest,
-            progress=progress,
-        )
+        on_roads = road_drive_options(options, scene)
+        planned = plan_road_drive(scene, route, options=on_roads, progress=progress)
         trajectory = drive_with_signals(
-            travel.path,
+            planned.path,
             vehicle,
-            graph=travel.graph,
+            graph=planned.graph,
             seed=options.seed,
             side=options.side_in(scene),
             bounds=scene.bounds,
-            duration=travel.duration,
-            at_speed=travel.at_speed,
+            duration=planned.duration,
+            at_speed=planned.at_speed,
             road=options.road_conditions(),
         )
-        if travel.duration is not None:  # what cannot pull up within a short time is recorded until then
-            trajectory = trajectory.until(round(travel.duration * 1e9))
-        return RoadMotion(travel, trajectory)
+        if planned.duration is not None:  # what cannot pull up within a short time is recorded until then
+            trajectory = trajectory.until(round(planned.duration * 1e9))
+        return RoadMotion(planned, trajectory)
     from lidar.simulation.flight_planning import plan_flight  # noqa: PLC0415
 
     progress("planning", 0, total=0)
     return plan_flight(scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
+
+
+def road_drive_options(options: DriveOptions, scene: Scene | RoadMap) -> RoadDriveOptions:
+    """Options of the drive on roads, from those of a drive."""
+    return RoadDriveOptions(
+        options.vehicle or load_rig(options.rig).vehicle,
+        seed=options.seed,
+        duration=options.duration,
+        side=options.side_in(scene),
+        from_rest=options.from_rest,
+    )
 
 
 def flight_options(options: DriveOptions) -> FlightOptions:

@@ -26,13 +26,12 @@ from lidar.traffic.trips import Driver, TripCourse, driver_on
 
 _ROOM = (0.4, 0.2)
 """Metres added to length and width of the ego's bounding box, for its deviation from the simulated motion."""
-_BRAKE = 0.7  # share of its braking that the driver uses for what is ahead, and
-_PULL = 0.8  # of its acceleration
+_DECELERATION, _ACCELERATION = 0.7, 0.8  # shares of the vehicle's maxima that the driver uses
 _HEADWAY_S, _GAP = 1.4, 2.0
 _KEEP = (0.8, 0.3)  # metres that others keep from the ego's box before and beside it
 _NEAR = 6.0  # metres in plan from an edge's middle within which the ego may be on it
 _BEYOND = 2.0
-"""Metres of stations at the path's end, all there: a simulated vehicle stops short of its last station."""
+"""Metres of stations beyond the path's end: a simulated vehicle stops short of its last station."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,13 +103,11 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     actor_path = ActorPath(
         np.column_stack([xy, axle[:, 2]]),
         heading,
-        path.curvature[row],
-        path.edge[row].astype(np.int64),
-        np.zeros(len(at), np.int64),
-        path.limit[row],
+        path.edge[row],
+        np.zeros(len(at), np.int8),
         scale,
     )
-    deceleration, acceleration = _BRAKE * vehicle.deceleration, _PULL * vehicle.acceleration
+    deceleration, acceleration = _DECELERATION * vehicle.deceleration, _ACCELERATION * vehicle.acceleration
     driver = Driver(vehicle.turning_radius, vehicle.max_speed, _HEADWAY_S, acceleration, deceleration, _GAP)
     driver = replace(driver, hard=driver_on(driver, road).hard)
     desired = np.interp(at, s, desired_speed(path, vehicle))

@@ -123,17 +123,7 @@ def drive_in_traffic(
         )
         rounds += 1
         if rounds == _ROUNDS or _apart(before, ego) < _SAME * setup.scale:
-            others = simulated_actors(
-                scene,
-                graph,
-                ego=ego,
-                vehicle=vehicle,
-                setup=setup,
-                seed=seed,
-                options=options,
-                obeys_signals=True,
-            )
-            return ego, others
+            return ego, simulated_actors(setup, ego, vehicle=vehicle, obeys_signals=True)
 
 
 def _driven(

@@ -82,38 +82,20 @@ def replay(
         side=options.side,
     )
     setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=parked_only)
-    moving = _moving(fcd, begin, scene=scene, graph=graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed)
-    parked = parked_vehicles(
-        scene,
-        ego,
-        vehicle=vehicle,
-        setup=setup,
-        swept=[_bounding_boxes(moving)],
-        seed=seed,
-        share=options.parked,
-    )
+    moving = _moving(fcd, begin, setup=setup, ego=ego, vehicle=vehicle)
+    parked = parked_vehicles(setup, ego, vehicle=vehicle, swept=[_bounding_boxes(moving)])
     return join_actors([moving, parked], first_feature=first_feature(scene))
 
 
-def _moving(
-    fcd: Fcd,
-    begin: float,
-    *,
-    scene: Scene,
-    graph: RoadGraph,
-    ego: Trajectory,
-    vehicle: Vehicle,
-    setup: TrafficSetup,
-    seed: int,
-) -> Actors:
+def _moving(fcd: Fcd, begin: float, *, setup: TrafficSetup, ego: Trajectory, vehicle: Vehicle) -> Actors:
     """The moving road users of a file in the ego's surroundings."""
-    scale = setup.scale
+    scene, scale = setup.scene, setup.scale
     front, heading = _scene_positions(fcd, scene)
     shapes, stretch, parts = [], [], []
     any_in_scene = False
     for k, name in enumerate(fcd.name):
         rows = slice(fcd.first[k], fcd.first[k + 1])
-        rng = generator(seed, "traffic", "fcd", name)
+        rng = generator(setup.seed, "traffic", "fcd", name)
         shape, grow = _body(fcd.vclass[k], float(fcd.length[k]), rng=rng)
         back = shape.length * grow[0] / 2 * scale if fcd.vclass[k] != "pedestrian" else 0.0
         time = fcd.time[rows] - begin
@@ -140,7 +122,7 @@ def _moving(
         step=np.round(step).astype(np.int64),
         middle=middle,
         yaw=yaw,
-        hint=_hints(graph, middle, yaw=yaw, foot=foot),
+        hint=_hints(setup.graph, middle, yaw=yaw, foot=foot),
         speed=speed,
         travelled=travelled / scale,
     )

@@ -160,21 +160,17 @@ def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool =
 class ActorPath(Columns):
     """The path of a road user's centre, with stations every `STEP` true metres.
 
-    xyz       : (n, 3) scene metres
-    heading   : (n,) radians, unwrapped
-    curvature : (n,) 1/m, true
-    edge      : (n,) int64 edge of the graph, -1 off it
-    lane      : (n,) int64 lane on the edge
-    limit     : (n,) m/s
-    scale     : scene metres per true metre
+    xyz     : (n, 3) scene metres
+    heading : (n,) radians, unwrapped
+    edge    : (n,) int32 edge of the graph, -1 off it
+    lane    : (n,) int8 lane on the edge
+    scale   : scene metres per true metre
     """
 
     xyz: Float
     heading: Float
-    curvature: Float
-    edge: Ints
-    lane: Ints
-    limit: Float
+    edge: NDArray[np.int32]
+    lane: NDArray[np.int8]
     scale: float
 
 
@@ -282,17 +278,16 @@ def path_along_lanes(
     at = np.arange(0.0, max(along[-1], 6 * gap), gap)
     line = polylines.points_at(xyz, at, along=along)
     row = own[np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(own) - 1)]
-    edge, lane = edges[row].astype(np.int64), picked[row].astype(np.int64)
-    return round_corners(line, edge, lane=lane, limit=graph.speed[edge], radius=radius, scale=scale)
+    return round_corners(line, edges[row], lane=picked[row], radius=radius, scale=scale)
 
 
 def round_corners(
-    line: Float, edge: Ints, *, lane: Ints, limit: Float, radius: float, scale: float
+    line: Float, edge: NDArray[np.int32], *, lane: NDArray[np.int8], radius: float, scale: float
 ) -> ActorPath:
     """The path along a line (n, 3) of evenly spaced points, rounded to a turning radius.
 
-    radius            : true metres
-    edge, lane, limit : columns of `ActorPath` at the points
+    radius     : true metres
+    edge, lane : columns of `ActorPath` at the points
     """
     gap = STEP * scale
     smooth = relax(line[:, :2], 0.95 / radius / scale, reach=0.45 * radius)
@@ -301,19 +296,11 @@ def round_corners(
     even = np.arange(0.0, length[-1], gap)
     near = np.clip(np.searchsorted(length, even), 0, len(line) - 1)
     out = polylines.points_at(np.column_stack([smooth, line[:, 2]]), even, along=length)
-    return ActorPath(
-        out,
-        polylines.headings(out),
-        polylines.curvatures(out) * scale,
-        edge[near],
-        lane[near],
-        limit[near],
-        scale,
-    )
+    return ActorPath(out, polylines.headings(out), edge[near], lane[near], scale)
 
 
 def _joint(a: Float, b: Float, *, radius: float) -> tuple[Float, Float, Float]:
-    """Two lanes cut back where they meet, and the curve (c, 3) between them."""
+    """Two lanes, cut back at their junction, and the curve (c, 3) between them."""
     u, v = polylines.unit(a[-1, :2] - a[-2, :2]), polylines.unit(b[1, :2] - b[0, :2])
     gap = b[0, :2] - a[-1, :2]
     sine, cosine = float(u[0] * v[1] - u[1] * v[0]), float(u @ v)

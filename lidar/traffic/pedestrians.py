@@ -57,7 +57,7 @@ def sidewalks_around(
         return out
     g = lanes.graph
     tree = shapely.STRtree(obstacles)
-    # people walk beside the line, and are to be on the sidewalk there
+    # pedestrians walk beside the line and must stay on the sidewalk
     pavement = shapely.buffer(pavement, -(_LANE + _EDGE) * area.scale)
     shapely.prepare(pavement)
     for e in np.flatnonzero(area.near).tolist():
@@ -209,10 +209,8 @@ def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, sca
     even = np.arange(0.0, along[-1], gap)
     keep = np.concatenate([[True], np.diff(along) > 1e-6])
     points = polylines.points_at(line[keep], even, along=along[keep])
-    nowhere = np.full(len(even), -1, np.int64)
-    path = round_corners(
-        points, nowhere, lane=nowhere, limit=np.full(len(even), np.inf), radius=_WALK.min_radius, scale=scale
-    )
+    edge, lane = np.full(len(even), -1, np.int32), np.full(len(even), -1, np.int8)
+    path = round_corners(points, edge, lane=lane, radius=_WALK.min_radius, scale=scale)
     crossed = []
     for part, number in over:
         # rounded corners shorten the path a little: the crossing is found by its ends

@@ -68,6 +68,8 @@ class TrafficOptions:
 class TrafficSetup:
     """Input of a traffic simulation around one ego trajectory.
 
+    graph     : road graph of the scene
+    seed, options : of the road users
     plan      : junctions and their signals
     area      : surroundings of the ego over time
     trips     : moving road users
@@ -77,6 +79,10 @@ class TrafficSetup:
     scale     : scene metres per true metre
     """
 
+    scene: Scene
+    graph: RoadGraph
+    seed: int
+    options: TrafficOptions
     lanes: Lanes
     plan: JunctionPlan
     area: TrafficArea
@@ -102,11 +108,8 @@ def populate(
     Road users avoid the ego and signals are green when it arrives; see `drive_in_traffic` for an ego vehicle
     that reacts to traffic. Raises InputError for a scene whose features cannot be read.
     """
-    options = options or TrafficOptions()
-    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options, road=road)
-    return simulated_actors(
-        scene, graph, ego=ego, vehicle=vehicle, setup=setup, seed=seed, options=options, obeys_signals=False
-    )
+    setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options or TrafficOptions(), road=road)
+    return simulated_actors(setup, ego, vehicle=vehicle, obeys_signals=False)
 
 
 def traffic_setup(
@@ -145,68 +148,41 @@ def traffic_setup(
         lanes, area, pavement=_union(surfaces, ("sidewalk",), area=around, grow=0.0), obstacles=obstacles
     )
     trips += pedestrian_trips(lanes, area, walks=walks, seed=seed, density=options.pedestrians)
-    return TrafficSetup(lanes, plan, area, trips, obstacles, surfaces, around, scale)
+    return TrafficSetup(
+        scene, graph, seed, options, lanes, plan, area, trips, obstacles, surfaces, around, scale
+    )
 
 
 def simulated_actors(
-    scene: Scene,
-    graph: RoadGraph,
-    *,
-    ego: Trajectory,
-    vehicle: Vehicle,
-    setup: TrafficSetup,
-    seed: int,
-    options: TrafficOptions,
-    obeys_signals: bool,
+    setup: TrafficSetup, ego: Trajectory, *, vehicle: Vehicle, obeys_signals: bool
 ) -> Actors:
     """Moving and parked road users of a simulation around an ego trajectory.
 
     obeys_signals : whether the trajectory stops at red signals; otherwise they are green when the ego arrives
     """
-    trips, plan = setup.trips, setup.plan
-    box = (vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang)
     flow = simulate_trips(
-        trips,
-        graph,
-        plan=plan,
+        setup.trips,
+        setup.graph,
+        plan=setup.plan,
         ego=ego,
-        ego_box=box,
-        radius=options.radius * setup.scale,
+        ego_box=(vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang),
+        radius=setup.options.radius * setup.scale,
         obeys_signals=obeys_signals,
     )
-    return join_actors(
-        [
-            moving_actors(trips, flow, scene=scene, scale=setup.scale),
-            parked_vehicles(
-                scene,
-                ego,
-                vehicle=vehicle,
-                setup=setup,
-                swept=_swept(trips),
-                seed=seed,
-                share=options.parked,
-            ),
-        ],
-        first_feature=first_feature(scene),
-    )
+    moving = moving_actors(setup.trips, flow, scene=setup.scene, scale=setup.scale)
+    parked = parked_vehicles(setup, ego, vehicle=vehicle, swept=_swept(setup.trips))
+    return join_actors([moving, parked], first_feature=first_feature(setup.scene))
 
 
 def parked_vehicles(
-    scene: Scene,
-    ego: Trajectory,
-    *,
-    vehicle: Vehicle,
-    setup: TrafficSetup,
-    swept: Iterable[NDArray[np.object_]],
-    seed: int,
-    share: float,
+    setup: TrafficSetup, ego: Trajectory, *, vehicle: Vehicle, swept: Iterable[NDArray[np.object_]]
 ) -> Actors:
-    """Parked vehicles along kerbs and in parking lots, and bicycles on sidewalks.
+    """Parked vehicles along kerbs and in parking lots, and parked bicycles on sidewalks.
 
     swept : areas swept by moving road users, polygons in plan, in several arrays
-    share : share of the spaces that are occupied
     """
-    surfaces, around, lanes = setup.surfaces, setup.around, setup.lanes
+    scene, surfaces, around, lanes = setup.scene, setup.surfaces, setup.around, setup.lanes
+    seed, share = setup.seed, setup.options.parked
     lots = _polygons(_layer(scene, "landcover"), ("parking",), area=around)
     structures = _layer(scene, "structures")
     crossings = shapely.buffer(_polygons(surfaces, ("crossing",), area=around), 2.0)
@@ -299,7 +275,7 @@ def _polygons(
 def _union(
     layer: Layer | None, classes: tuple[str, ...], *, area: shapely.Geometry, grow: float
 ) -> shapely.Geometry | None:
-    """Union of the surfaces of some classes, buffered by ``grow`` metres; None where there are none."""
+    """Union of the surfaces of some classes, buffered by ``grow`` metres; None without such surfaces."""
     parts = _polygons(layer, classes, area=area)
     if not len(parts):
         return None

@@ -1,4 +1,4 @@
-"""Signal heads of a scene: the junction and the group of the plan that each serves, and what it shows."""
+"""Signal heads of a scene: junction and signal group of each, and its state over time."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class SignalHeads(Columns):
 
 @dataclass(frozen=True, slots=True)
 class SignalStates:
-    """What signal heads show over time.
+    """States of signal heads over time.
 
     heads   : the heads
     signals : of the junctions, as traffic obeys them
@@ -98,7 +98,7 @@ def signal_states(
     vehicle: Vehicle,
     fixed: Trajectory | None = None,
 ) -> SignalStates | None:
-    """What the signal heads of a scene show during a drive; None in a scene without heads or roads.
+    """States of a scene's signal heads during a drive; None in a scene without heads or roads.
 
     graph : road graph of the scene, if it is read already
     seed, side : of the signals and of the road, as for `lidar.traffic.junctions.junction_plan`

@@ -176,7 +176,7 @@ class TrafficSimulation:
         self._trips, self._graph, self._plan = trips, graph, plan
         self._ego, self._signals, self._radius, self._ego_row = ego, signals, radius, ego_row
         self._covered = graph.bridge | graph.tunnel
-        self._alone = len(trips) == 1 and ego_row >= 0  # nobody takes its ground
+        self._alone = len(trips) == 1 and ego_row >= 0  # no one else reserves cells
         self._routes: dict[tuple[int, ...], int] = {}
         self._appear = np.array([int(trip.appear_s / STEP_S) for trip in trips], np.int64)
 
@@ -237,14 +237,14 @@ class TrafficSimulation:
         return _Tables(station, level, path.scale, block, SweptCells.empty())
 
     def _around(self, row: int, tables: _Tables, *, state: NDArray[np.void]) -> _Tables:
-        """The tables of a trip with its cells in the next window; its ``state`` (1,) is made to fit them."""
+        """The tables of a trip with its cells in the next window; adapts its ``state`` (1,) to them."""
         if self._alone:
             return tables
         trip, own = self._trips[row], state[0]
         at = int(own["s"] / STEP) if own["active"] else trip.begin
         speed = _FASTER * float(tables.station["desired_speed"].max())
-        brake = min(trip.driver.deceleration, trip.driver.hard)
-        ahead = (max(LOOK_AHEAD[0] + LOOK_AHEAD[1] * speed, speed**2 / brake + 2 * speed) + 20.0) / STEP
+        slowing = min(trip.driver.deceleration, trip.driver.hard)
+        ahead = (max(LOOK_AHEAD[0] + LOOK_AHEAD[1] * speed, speed**2 / slowing + 2 * speed) + 20.0) / STEP
         to = max(at + speed * _STEPS * STEP_S / STEP, float(own["station"])) + ahead
         first, last, stop = tables.block[:, :3].T
         to = max(to, float(last[(stop <= to) & (last >= at)].max(initial=0)) + ahead)
@@ -271,7 +271,7 @@ class TrafficSimulation:
     def _numbered(
         self, rows: Ints, tables: Sequence[_Tables], *, known: EgoMotion
     ) -> tuple[Movers, EgoMotion, Ints]:
-        """The tables of road users with cells numbered from 0, and the numbered cells."""
+        """The tables of road users and the ego's motion with cells numbered from 0, and these cells."""
         trips = [self._trips[row] for row in rows.tolist()]
         columns = SweptCells.concatenate([SweptCells.empty(), *(part.sweep for part in tables)])
         used, number = np.unique(np.concatenate([columns.cell, known.event_cell]), return_inverse=True)
@@ -299,7 +299,7 @@ class TrafficSimulation:
 
 
 def _shift(state: NDArray[np.void], start: NDArray[np.void], *, sign: int) -> None:
-    """Make rows in states count from the starts of all tables (1), or of each road user's (-1)."""
+    """Count rows in states from the start of all tables (sign 1), or of each road user's (-1)."""
     for name in ("ahead", "reserved", "released"):
         state[name] += sign * start["cell_start"]
     state["block"] += sign * start["block_start"]

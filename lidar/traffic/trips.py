@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import shapely
 
+from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
 from lidar.motion.road_conditions import DRY, GRAVITY, RoadConditions
@@ -242,8 +243,12 @@ def _trip(
             continue
         end = edges[-1]
         leaves = bool(lanes.exit[end] or not area.near[end])
-        path = whole.take(np.arange(first, last))
-        course = TripCourse(path, speed_profile(path, driver, pace=pace))
+        speed = _desired_speed(
+            polylines.curvatures(whole.xyz)[first:last] * area.scale,
+            pace * lanes.graph.speed[whole.edge[first:last]],
+            driver=driver,
+        )
+        course = TripCourse(whole.take(np.arange(first, last)), speed)
         return Trip(shape, grow, course, driver, begin - first, span[0], leaves)
     return None
 
@@ -284,10 +289,13 @@ def _stations_on_carriageway(
     return int(before[-1]) + 1 if len(before) else 0, int(behind[0]) if len(behind) else len(path)
 
 
-def speed_profile(path: ActorPath, driver: Driver, *, pace: float) -> Float:
-    """Desired speed (n,) in m/s: speed limit times ``pace``, slower in bends and in time before them."""
-    bend = np.maximum(np.abs(path.curvature), 1e-6)
-    v = np.minimum(np.minimum(path.limit * pace, driver.max_speed), np.sqrt(driver.lateral / bend))
+def _desired_speed(curvature: Float, limit: Float, *, driver: Driver) -> Float:
+    """Desired speed (n,) in m/s below limits (n,): slower in bends and in time before them.
+
+    curvature : (n,) 1/m
+    """
+    bend = np.maximum(np.abs(curvature), 1e-6)
+    v = np.minimum(np.minimum(limit, driver.max_speed), np.sqrt(driver.lateral / bend))
     v = np.maximum(v, 1.0)
     ramp = 2 * driver.deceleration * 0.8 * STEP * np.arange(len(v))
     back = np.minimum.accumulate((v**2 + ramp)[::-1])[::-1] - ramp

@@ -395,7 +395,7 @@ def test_stages_are_given_earlier_clouds_as_they_are_without_stages(
 def test_regions_cover_the_places_of_earlier_clouds(scene, options, tmp_path):
     plan = plan_drive(scene, replace(options, traffic=None, stages=(NamedStage("watching", Watching()),)))
     recording = plan.recording(tmp_path / "a")
-    late = plan.jobs.where(lambda job: job.start_ns == 400_000_000)
+    late = [job for job in plan.jobs if job.start_ns == 400_000_000]
     [(_, wide)], [(_, box)] = recording_chunks(late, recording), chunks(late, plan.trajectory)
     x, y = plan.trajectory.at(np.linspace(200_000_000, 500_000_000, 9).astype(np.int64)).position[:, :2].T
     assert wide == pytest.approx((x.min(), y.min(), x.max(), y.max()), abs=0.01)

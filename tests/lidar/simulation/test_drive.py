@@ -28,7 +28,7 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset, prepare
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.attitude import quat_from_euler
-from lidar.motion.road_drive import plan_road_drive
+from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
@@ -257,9 +257,8 @@ def test_a_random_drive_starts_and_ends_at_speed_by_default(scene):
         options = replace(OPTIONS, duration=3.0, seed=seed)
         speeds = {}
         for from_rest in (False, True):
-            travel = plan_road_drive(
-                scene, "random", vehicle="car", seed=seed, duration=3.0, from_rest=from_rest
-            )
+            on_roads = RoadDriveOptions("car", seed=seed, duration=3.0, from_rest=from_rest)
+            travel = plan_road_drive(scene, "random", options=on_roads)
             trajectory = drive_with_signals(
                 travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=seed, bounds=scene.bounds,
                 duration=3.0, at_speed=travel.at_speed,

@@ -16,7 +16,7 @@ from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.layout import Paths
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
-from lidar.motion.road_drive import plan_road_drive
+from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
 from lidar.motion.vehicle import load_vehicle
 from lidar.sensors.camera.render import RenderOptions, render
 from lidar.sensors.laser.scan import scan
@@ -35,7 +35,8 @@ BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, pedestrians=40.0, parked=0.7,
 
 @pytest.fixture(scope="module")
 def ego(scene):
-    travel = plan_road_drive(scene, "random", vehicle="car", seed=2, duration=15.0)
+    options = RoadDriveOptions("car", seed=2, duration=15.0)
+    travel = plan_road_drive(scene, "random", options=options)
     return drive_with_signals(
         travel.path, load_vehicle("car"), graph=scene.road_graph(), seed=2, bounds=scene.bounds,
         duration=15.0, at_speed=travel.at_speed,

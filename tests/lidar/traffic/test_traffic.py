@@ -11,6 +11,7 @@ from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from geoscene.geometry.polylines import curvatures
 from lidar.geometry.poses import Trajectory
 from lidar.motion.motion import drive_path
 from lidar.motion.path import plan_path
@@ -297,7 +298,7 @@ def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
             assert shapely.covers(road, rectangles(xy, heading, length=trip.length, width=trip.width)).all()
             line = shapely.LineString(graph.geometry[trip.course.path.edge[trip.begin]][:, :2])
             ring = shapely.LinearRing([*line.coords, trip.course.path.xyz[trip.begin, :2]])
-            if abs(trip.course.path.curvature[trip.begin]) < 1e-3:
+            if abs(curvatures(trip.course.path.xyz)[trip.begin]) < 1e-3:
                 assert ring.is_ccw == (sign < 0)
 
 
