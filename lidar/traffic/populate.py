@@ -16,6 +16,8 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
+from geoscene.support.registry import unknown_name
+from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.vehicle import Vehicle
@@ -62,6 +64,8 @@ class TrafficOptions:
     def __post_init__(self) -> None:
         """Validate the values."""
         check_parameters(self)
+        if self.side not in ("right", "left"):
+            raise InputError(unknown_name("`side`", self.side, known=("right", "left")))
 
 
 @dataclass(frozen=True, slots=True)
