@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,17 +20,6 @@ _ARC_STEP = np.radians(2.0)
 _STEP = 10.0  # metres between points of a flight at which the ground is looked for
 _ALONG = np.cos(np.radians(15.0))  # minimum cosine of the angle between the course and a strip
 _LEAD_NS = 1_000_000_000  # nanoseconds before and after a strip for which scanners work
-
-
-@dataclass(frozen=True, slots=True)
-class Flight:
-    """A planned flight.
-
-    scanning_ns : (k, 2) int64 nanoseconds from and to which scanners work; None for always
-    """
-
-    trajectory: Trajectory
-    scanning_ns: NDArray[np.int64] | None = None
 
 
 def waypoint_flight(points: ArrayLike, *, ground: Ground | None = None, limit: float = np.inf) -> Route:

@@ -16,12 +16,11 @@ from geoscene.classes import Class
 from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.errors import InputError, RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import LONGEST_S, check_duration
 from lidar.motion.flight import (
-    Flight,
     dense_line,
     survey_flight,
     survey_lines,
@@ -84,8 +83,10 @@ def plan_flight(
     vehicle: Vehicle,
     sensors: Sequence[Scanner | Camera],
     options: FlightOptions,
-) -> Flight:
-    """The flight of an aircraft over a scene.
+) -> tuple[Trajectory, Ints | None]:
+    """The flight of an aircraft over a scene, and the times at which its scanners work.
+
+    These are (k, 2) int64 nanoseconds from and to which they work; None for always.
 
     spec : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used for a
            survey
@@ -108,14 +109,14 @@ def plan_flight(
         trajectory = trajectory.until(round(duration * 1e9))
     _refuse_collisions(trajectory, below, scene=scene)
     if not survey or options.turns:
-        return Flight(trajectory)
+        return trajectory, None
     scanning_ns = times_on_lines(trajectory, lines, max_offset=spacing / 2)
     if not len(scanning_ns):
         raise RouteError(
             f"the record of {trajectory.duration_ns / 1e9:.1f} s ends before the first line of the survey;"
             " record longer, or scan on the way there too (`turns`)"
         )
-    return Flight(trajectory, scanning_ns)
+    return trajectory, scanning_ns
 
 
 def flight_course(

@@ -24,7 +24,6 @@ from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import check_duration, check_start
-from lidar.motion.flight import Flight
 from lidar.motion.road_conditions import vehicle_on
 from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
 from lidar.motion.vehicle import Vehicle, load_vehicle
@@ -180,9 +179,8 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     road = options.road_conditions()
     vehicle = vehicle_on(load_vehicle(options.vehicle or rig.vehicle), road)
     motion = plan_motion(scene, options, vehicle=vehicle, sensors=sensors, progress=progress)
-    alone = motion if isinstance(motion, Trajectory) else motion.trajectory
-    check_duration(alone.duration_ns / 1e9, what="the route")
-    _refuse_elsewhere(scene, alone, sensors=sensors)
+    check_duration(motion.trajectory.duration_ns / 1e9, what="the route")
+    _refuse_elsewhere(scene, motion.trajectory, sensors=sensors)
     trajectory, actors = _with_traffic(scene, options, vehicle=vehicle, motion=motion, progress=progress)
     check_duration(trajectory.duration_ns / 1e9, what="the route in traffic")
     stages = options.recording_settings.stages
@@ -203,7 +201,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         trajectory=trajectory,
         actors=actors,
         signals=_signals(scene, options, vehicle=vehicle, motion=motion, sensors=sensors),
-        scanning_ns=motion.scanning_ns if isinstance(motion, Flight) else None,
+        scanning_ns=motion.scanning_ns,
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=jobs,
     )
@@ -273,11 +271,17 @@ def schedule(sensors: Sequence[Scanner | Camera], duration_ns: int) -> list[Sens
 
 
 @dataclass(frozen=True, slots=True)
-class RoadMotion:
-    """A planned route with its path, and the trajectory along it without other road users."""
+class PlannedMotion:
+    """Motion of the ego vehicle without other road users.
 
-    plan: RoadPlan
+    trajectory  : of the vehicle
+    road        : its route and path on roads; None for flights and repeated trajectories
+    scanning_ns : (k, 2) times from and until which scanners work; None for always
+    """
+
     trajectory: Trajectory
+    road: RoadPlan | None = None
+    scanning_ns: Ints | None = None
 
 
 def plan_motion(
@@ -287,8 +291,8 @@ def plan_motion(
     vehicle: Vehicle,
     sensors: Sequence[Scanner | Camera],
     progress: Progress = silent,
-) -> Trajectory | RoadMotion | Flight:
-    """Trajectory of the ego vehicle alone; on roads with its path, in flight with the times of scanning.
+) -> PlannedMotion:
+    """Motion of the ego vehicle alone.
 
     Raises RouteError for a route that it cannot take.
     """
@@ -297,7 +301,9 @@ def plan_motion(
         from lidar.motion.replay import read_replay  # noqa: PLC0415
 
         replayed = read_replay(route, scene.frame)
-        return replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
+        return PlannedMotion(
+            replayed if options.duration is None else replayed.until(round(options.duration * 1e9))
+        )
     if vehicle.kind != "air":
         options.check_on_roads(vehicle.name)
         on_roads = road_drive_options(options, scene)
@@ -315,11 +321,14 @@ def plan_motion(
         )
         if planned.duration is not None:  # what cannot pull up within a short time is recorded until then
             trajectory = trajectory.until(round(planned.duration * 1e9))
-        return RoadMotion(planned, trajectory)
+        return PlannedMotion(trajectory, planned)
     from lidar.simulation.flight_planning import plan_flight  # noqa: PLC0415
 
     progress("planning", 0, total=0)
-    return plan_flight(scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options))
+    trajectory, scanning_ns = plan_flight(
+        scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options)
+    )
+    return PlannedMotion(trajectory, scanning_ns=scanning_ns)
 
 
 def road_drive_options(options: DriveOptions, scene: Scene | RoadMap) -> RoadDriveOptions:
@@ -356,7 +365,7 @@ def _signals(
     options: DriveOptions,
     *,
     vehicle: Vehicle,
-    motion: Trajectory | RoadMotion | Flight,
+    motion: PlannedMotion,
     sensors: Sequence[Scanner | Camera],
 ) -> SignalStates | None:
     """States of signal heads by the plan that traffic obeys; None if no image shows them.
@@ -371,15 +380,14 @@ def _signals(
 
     if isinstance(traffic, TrafficFile):
         return None
-    road = isinstance(motion, RoadMotion)
-    fixed = None if road or (traffic is None and vehicle.kind == "air") else motion
+    obeys = motion.road is not None or (traffic is None and vehicle.kind == "air")
     return signal_states(
         scene,
-        motion.plan.graph if isinstance(motion, RoadMotion) else None,
+        None if motion.road is None else motion.road.graph,
         seed=options.seed,
         side=options.side_in(scene),
         vehicle=vehicle,
-        fixed=fixed.trajectory if isinstance(fixed, RoadMotion | Flight) else fixed,
+        fixed=None if obeys else motion.trajectory,
     )
 
 
@@ -388,11 +396,11 @@ def _with_traffic(
     options: DriveOptions,
     *,
     vehicle: Vehicle,
-    motion: Trajectory | RoadMotion | Flight,
+    motion: PlannedMotion,
     progress: Progress,
 ) -> tuple[Trajectory, Actors | None]:
     """Trajectory of the ego vehicle among other road users, and these; None without traffic."""
-    trajectory = motion if isinstance(motion, Trajectory) else motion.trajectory
+    trajectory = motion.trajectory
     if options.traffic is None:
         return trajectory, None
     from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (0.1 s)
@@ -401,22 +409,13 @@ def _with_traffic(
 
     progress("traffic", 0, total=0)
     traffic = replace(options.traffic, side=options.side_in(scene))
-    graph = motion.plan.graph if isinstance(motion, RoadMotion) else scene.road_graph()
+    graph = scene.road_graph() if motion.road is None else motion.road.graph
     seed, road = options.seed, options.road_conditions()
     if isinstance(traffic, TrafficFile):
         return trajectory, replay(scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic)
-    if isinstance(motion, RoadMotion):
+    if motion.road is not None:
         return drive_in_traffic(
-            scene,
-            graph,
-            path=motion.plan.path,
-            vehicle=vehicle,
-            first=trajectory,
-            seed=seed,
-            options=traffic,
-            duration=motion.plan.duration,
-            at_speed=motion.plan.at_speed,
-            road=road,
+            scene, motion.road, vehicle=vehicle, first=trajectory, seed=seed, options=traffic, road=road
         )
     return trajectory, populate(
         scene, graph, ego=trajectory, vehicle=vehicle, seed=seed, options=traffic, road=road

@@ -13,6 +13,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.motion.motion import ended_at_rest, motion_along, poses_along
 from lidar.motion.path import Path
 from lidar.motion.road_conditions import DRY, RoadConditions
+from lidar.motion.road_drive import RoadPlan
 from lidar.motion.speed_profile import motion_within
 from lidar.motion.vehicle import Vehicle
 from lidar.traffic.ego import ego_trip
@@ -77,53 +78,48 @@ def drive_with_signals(
 
 def drive_in_traffic(
     scene: Scene,
-    graph: RoadGraph,
+    plan: RoadPlan,
     *,
-    path: Path,
     vehicle: Vehicle,
     first: Trajectory,
     seed: int,
-    options: TrafficOptions | None = None,
-    duration: float | None = None,
-    at_speed: bool = False,
+    options: TrafficOptions,
     road: RoadConditions = DRY,
 ) -> tuple[Trajectory, Actors]:
-    """The trajectory of a vehicle along a path in simulated traffic, and the other road users.
+    """The trajectory of a vehicle along a planned path in simulated traffic, and the other road users.
 
-    first    : its trajectory without other road users, such as `drive_with_signals` gives
-    duration, at_speed : as for `drive_with_signals`
-    road     : conditions on which the others drive; ``vehicle`` is the ego as it is driven on them
+    first : its trajectory without other road users, such as `drive_with_signals` gives
+    road  : conditions on which the others drive; ``vehicle`` is the ego as it is driven on them
 
     The ego is simulated together with the others. Its motion is then smoothed to its limits of acceleration
     and jerk, never ahead of the simulated one, and the others are simulated again around it.
     Raises InputError for a scene whose features cannot be read.
     """
     from lidar.traffic.populate import (  # noqa: PLC0415  (not for drives without traffic)
-        TrafficOptions,
         simulated_actors,
         traffic_setup,
     )
 
-    options = options or TrafficOptions()
     ego, rounds = first, 0
     while True:
-        setup = traffic_setup(scene, graph, ego=ego, seed=seed, options=options, road=road)
-        before, radius = ego, options.radius * setup.scale
+        setup = traffic_setup(scene, plan.graph, ego=ego, seed=seed, options=options, road=road)
+        before = ego
         ego = _driven(
-            path,
+            plan.path,
             vehicle,
-            graph=graph,
+            graph=plan.graph,
             plan=setup.plan,
             trips=setup.trips,
             alone_ns=first.duration_ns,
-            duration=duration,
-            radius=radius,
-            at_speed=at_speed,
+            duration=plan.duration,
+            radius=options.radius * setup.scale,
+            at_speed=plan.at_speed,
             road=road,
         )
         rounds += 1
         if rounds == _ROUNDS or _apart(before, ego) < _SAME * setup.scale:
             return ego, simulated_actors(setup, ego, vehicle=vehicle, obeys_signals=True)
+        del setup  # its trips take the most memory of a drive
 
 
 def _driven(
