@@ -347,7 +347,7 @@ def test_traffic_of_another_place_is_refused(scene, graph, street, tmp_path):
         ("none.xml", "none.xml does not exist"),
         ("none.xml,speed=2", "parameter 'speed' is unknown"),
         ("none.xml,begin=soon", "soon"),
-        ("none.xml,parked=2", "parked = 2.0"),
+        ("none.xml,parked=2", "parked = 2 is not within 0 to 1"),
     ],
 )
 def test_the_command_line_refuses_invalid_traffic(words, said, scene, tmp_path, capsys):
