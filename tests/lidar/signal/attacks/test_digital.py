@@ -275,7 +275,7 @@ def test_a_patch_at_a_place_is_seen_from_its_front_only(tmp_path):
         ({"name": "patch", "file": "none.png"}, "file = 'none.png' cannot be read as a picture"),
         ({"name": "patch", "place": "here"}, "place = 'here' is not LAT,LON,HEIGHT"),
         ({"name": "perturb", "start": 5.0, "stop": 2.0}, "stop = 2 is not after start = 5"),
-        ({"name": "inject", "start": -1.0}, "start = -1 is not a finite number of 0 or more"),
+        ({"name": "inject", "start": -1.0}, "start = -1 is not at least 0 s"),
         ({"name": "gnss_spoof", "kind": "jump"}, "kind = 'jump' is none of step, ramp, smooth"),
     ],
 )
