@@ -278,7 +278,7 @@ def tradeoff(
         Folder to write tradeoff.json, tradeoff.html and pareto.png to.
     """
     from geoscene.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
-    from geoscene.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+    from geoscene.tradeoff.report import document, to_text, write_report  # noqa: PLC0415
 
     if options.elevation_tiles:
         raise InputError("`dem` tiles: not compared; give elevation files")
@@ -298,7 +298,7 @@ def tradeoff(
     if report.json:
         print_json(document(found))
     else:
-        print_tables(found)
+        print(to_text(found))
     if out is not None:
         write_report(found, out)
         if not report.json:

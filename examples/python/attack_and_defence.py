@@ -10,9 +10,8 @@ from pathlib import Path
 import geoscene
 import lidar
 from lidar.sensors.physics.origin import Origin
-from lidar.sensors.rig.catalog import columns
 from lidar.tools.defences.calibration import read_calibration
-from lidar.tools.defences.defend import defend, score_rows
+from lidar.tools.defences.defend import defend, score_table
 from lidar.tools.defences.registry import read_defences
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "attacked")
@@ -42,5 +41,5 @@ found = defend(
     out=out / "verdicts",
     overwrite=True,
 )
-print(columns(score_rows(found)))
+print(score_table(found).to_text())
 print(f"wrote {out / 'verdicts' / 'defend.json'}")

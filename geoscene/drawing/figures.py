@@ -1,4 +1,4 @@
-"""Figures as people read them: lengths, shares and sizes."""
+"""Figures as text with units: lengths, shares, differences of colours, sizes."""
 
 from __future__ import annotations
 
@@ -15,6 +15,12 @@ def share(value: float) -> str:
     """A share in percent, with its sign if negative."""
     digits = 3 if abs(value) >= 0.995 else 2
     return "0" if value == 0 else f"{100 * value:.{digits}g} %"
+
+
+def levels(value: float) -> str:
+    """A difference of colours, in levels of 255."""
+    text = f"{value:.3g}"
+    return f"{text} level{'' if text == '1' else 's'}"
 
 
 def size(value: float) -> str:

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import html
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from geoscene.drawing.charts import (
-    Axes,
-    ChartPoint,
-    html_page,
-    html_picture,
-    html_table,
-    print_lines,
-    print_table,
-    scatter,
-)
+from geoscene.drawing.charts import Axes, ChartPoint, scatter
 from geoscene.drawing.figures import metres, share, size
+from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.files import write_atomically, write_json
 from geoscene.tradeoff.engine import BuildRow, BuildTradeoff
 
@@ -27,34 +19,47 @@ TARGETS = (0.01, 0.1, 1.0)
 SAVING = 0.1
 """Share of the CPU time of the full scene that a recommended setting saves: less may be chance."""
 
-_HEAD = (
-    *("setting", "height rms", "99 %", "max", "other height", "other class", "volume", "footprints"),
-    *("CPU s", "memory", "bytes", "missing, note"),
+
+def _cpu_text(row: BuildRow) -> str:
+    """CPU seconds, with the range of repetitions."""
+    cpu = [cost.cpu_s for cost in row.costs]
+    spread = f" ({min(cpu):.3g} to {max(cpu):.3g})" if len(cpu) > 1 else ""
+    return f"{row.cost.cpu_s:.3g}{spread}"
+
+
+def _missing_text(row: BuildRow) -> str:
+    """Objects that are missing, and the note."""
+    lost = [f"{n:,} {name}" for name, n in row.missing.items()]
+    return "; ".join(filter(None, (f"without {', '.join(lost)}" if lost else "", row.note)))
+
+
+def _error_column(head: str, name: str, *, text: Callable[[float], str]) -> Column[BuildRow]:
+    return Column(head, lambda row: text(row.error[name]) if row.error else "")
+
+
+_COLUMNS: tuple[Column[BuildRow], ...] = (
+    Column("setting", lambda row: row.label),
+    _error_column("height rms", "height_rms_m", text=metres),
+    _error_column("99 %", "height_99_m", text=metres),
+    _error_column("max", "height_max_m", text=metres),
+    _error_column("other height", "cells", text=share),
+    _error_column("other class", "classes", text=share),
+    _error_column("volume", "volume", text=share),
+    _error_column("footprints", "area", text=share),
+    Column("CPU s", _cpu_text),
+    Column("memory", lambda row: size(row.cost.memory_bytes)),
+    Column("bytes", lambda row: size(row.cost.bytes)),
+    Column("missing, note", _missing_text),
 )
 
 
-def cells(row: BuildRow) -> list[str]:
-    """Texts of a row of the table."""
-    cpu = [cost.cpu_s for cost in row.costs]
-    spread = f" ({min(cpu):.3g} to {max(cpu):.3g})" if len(cpu) > 1 else ""
-    e = row.error
-    errors = [""] * 7
-    if e:
-        heights = [metres(e[name]) for name in ("height_rms_m", "height_99_m", "height_max_m")]
-        errors = [*heights, share(e["cells"]), share(e["classes"]), share(e["volume"]), share(e["area"])]
-    lost = [f"{n:,} {name}" for name, n in row.missing.items()]
-    return [
-        row.label,
-        *errors,
-        f"{row.cost.cpu_s:.3g}{spread}",
-        size(row.cost.memory_bytes),
-        size(row.cost.bytes),
-        "; ".join(filter(None, (f"without {', '.join(lost)}" if lost else "", row.note))),
-    ]
+def build_table(found: BuildTradeoff) -> ReportTable:
+    """The table of all builds."""
+    return table_of(_COLUMNS, found.rows, title=headline(found))
 
 
 def headline(found: BuildTradeoff) -> str:
-    """What was compared."""
+    """The place and the size of the cells that are compared."""
     return f"{found.name}: surface models of {metres(found.resolution)} cells against the full scene"
 
 
@@ -99,10 +104,9 @@ def _saving(row: BuildRow, full: BuildRow) -> str:
     )
 
 
-def print_tables(found: BuildTradeoff) -> None:
-    """Print the table and the recommendations."""
-    print_table(_HEAD, [cells(row) for row in found.rows], title=headline(found))
-    print_lines(recommendations(found))
+def to_text(found: BuildTradeoff) -> str:
+    """The table and the recommendations."""
+    return "\n\n".join([build_table(found).to_text(), "\n".join(recommendations(found))])
 
 
 def document(found: BuildTradeoff) -> dict[str, Any]:
@@ -143,12 +147,10 @@ def write_report(found: BuildTradeoff, out: Path) -> None:
     """Write ``tradeoff.json``, ``tradeoff.html`` and ``pareto.png`` into a folder."""
     out.mkdir(parents=True, exist_ok=True)
     picture = plot(found)
-    said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(found))
-    body = (
-        f"<p>{html.escape(headline(found))}</p><ul>{said}</ul>"
-        f"{html_table(_HEAD, [cells(row) for row in found.rows])}"
-        f"{html_picture(picture, alt='error against cost')}"
-    )
+    page = Page(f"Cost against accuracy: {found.name}")
+    page.points(recommendations(found))
+    page.table(build_table(found))
+    page.picture(picture, alt="error against cost")
     write_atomically(out / "pareto.png", picture)
-    write_atomically(out / "tradeoff.html", html_page(f"Cost against accuracy: {found.name}", body))
+    write_atomically(out / "tradeoff.html", page.encoded())
     write_json(out / "tradeoff.json", document(found))

@@ -230,7 +230,6 @@ def denoise(
     out
         Directory to write the clouds to that the only method leaves.
     """
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.denoise.denoise import denoise as denoised  # noqa: PLC0415
     from lidar.tools.denoise.filters import read_methods  # noqa: PLC0415
 
@@ -242,7 +241,7 @@ def denoise(
     if report.json:
         print_json(found.to_json())
     else:
-        print(columns(found.table()))
+        print(found.table().to_text())
     return 0
 
 

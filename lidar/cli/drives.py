@@ -260,9 +260,8 @@ def redteam(
     workers
         Processes; each records or judges one drive at a time.
     """
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.redteam import redteam as run_matrix  # noqa: PLC0415
-    from lidar.tools.redteam.report import detection_tables, success_rows  # noqa: PLC0415
+    from lidar.tools.redteam.report import detection_tables, success_table  # noqa: PLC0415
     from lidar.tools.redteam.run import failed_drives  # noqa: PLC0415
 
     note_new_folder(out)
@@ -271,9 +270,9 @@ def redteam(
     if report.json:
         print_json({"path": str(out), "drives": list(summary.drives), "failed": summary.failed})
     else:
-        print(columns(success_rows(summary.matrix)))
-        for title, table in detection_tables(summary.matrix):
-            print(f"\n{title}\n{columns(table)}")
+        print(success_table(summary.matrix).to_text())
+        for table in detection_tables(summary.matrix):
+            print(f"\n{table.to_text()}")
         print(f"\n{out}: {len(summary.drives)} drives; page: {out / 'redteam.html'}")
     for line in failed_drives(summary.failed):
         print(f"lidar: {line}", file=sys.stderr)

@@ -48,9 +48,12 @@ def evaluate(
     out
         Folder to make: figures, tables, aligned trajectory and a page.
     """
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.evaluation.objects import kind_of  # noqa: PLC0415
-    from lidar.tools.evaluation.report import report_folder, tables, write_trajectory_report  # noqa: PLC0415
+    from lidar.tools.evaluation.report import (  # noqa: PLC0415
+        report_folder,
+        trajectory_tables,
+        write_trajectory_report,
+    )
     from lidar.tools.evaluation.trajectory import evaluate_trajectory, method_of  # noqa: PLC0415
 
     if kind_of(estimate):
@@ -67,9 +70,8 @@ def evaluate(
         print_json(found.errors.to_json())
         return 0
     print(method_of(found.errors))
-    for title, head, rows in tables(found.errors):
-        print(f"\n{title}")
-        print(columns([head, *rows]))
+    for table in trajectory_tables(found.errors):
+        print(f"\n{table.to_text()}")
     if out is not None:
         print(f"\n{out}: evaluation.html, figures and tables")
     return 0
@@ -79,7 +81,6 @@ def _evaluate_objects(
     estimate: Path, against: Path, *, options: EvaluateOptions, out: Path | None, report: Report
 ) -> int:
     """Measure detections or tracks."""
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.evaluation.objects import evaluate_objects  # noqa: PLC0415
     from lidar.tools.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
 
@@ -96,9 +97,8 @@ def _evaluate_objects(
         print_json(found.to_json())
         return 0
     print(f"{found.kind}: {found.frames:,} frames")
-    for title, head, rows in found.tables():
-        print(f"\n{title}")
-        print(columns([head, *rows]))
+    for table in found.tables():
+        print(f"\n{table.to_text()}")
     if out is not None:
         print(f"\n{out}: evaluation.html and tables")
     return 0

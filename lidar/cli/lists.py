@@ -17,8 +17,8 @@ def stages(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
     from lidar.parameters import COLUMNS, parameter_cells  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.signal.registry import stage_rows  # noqa: PLC0415
 
     rows = stage_rows()
@@ -30,7 +30,7 @@ def stages(*, json: JsonFlag = False) -> int:
         meaning = f"{row['meaning']} Acts on: {', '.join(row['acts_on'])}."
         cells.append([row["name"], "", "", "", "", "", meaning])
         cells += [["", *line] for line in parameter_cells(row["parameters"])]
-    print(columns([["name", "parameter", *COLUMNS], *cells]))
+    print(align_columns([["name", "parameter", *COLUMNS], *cells]))
     print(
         "\nEvery stage also takes seed (of its random numbers; the drive's by default) and sensor (the only"
         "\none that it acts on): lidar drive SCENE --stage NAME:KEY=VALUE,KEY=VALUE"
@@ -48,7 +48,8 @@ def rigs(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON, with all their values.
     """
-    from lidar.sensors.rig.catalog import columns, rig_rows  # noqa: PLC0415
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import rig_rows  # noqa: PLC0415
 
     rows = rig_rows()
     if json:
@@ -58,7 +59,7 @@ def rigs(*, json: JsonFlag = False) -> int:
     for row in rows:
         scanners = " ".join(row["lidars"].values())
         cells.append([row["name"], row["vehicle"], scanners, str(len(row["cameras"])), row["source"]])
-    print(columns(cells))
+    print(align_columns(cells))
     print(
         "\nA rig of your own is a TOML file: lidar drive SCENE --rig FILE.toml (docs/reference/sensors.md)."
     )
@@ -73,7 +74,8 @@ def sensors(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON, with the source of every number.
     """
-    from lidar.sensors.rig.catalog import columns, sensor_rows  # noqa: PLC0415
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
+    from lidar.sensors.rig.catalog import sensor_rows  # noqa: PLC0415
 
     rows = sensor_rows()
     if json:
@@ -85,7 +87,7 @@ def sensors(*, json: JsonFlag = False) -> int:
         figures = [str(row["channels"]), f"{row['pulses_per_s']:,}", f"{row['rate_hz']:g}", reach]
         model = f"{row['maker']} {row['model']}"
         cells.append([row["name"], model, row["kind"], *figures, f"{row['wavelength_nm']:g}"])
-    print(columns(cells))
+    print(align_columns(cells))
     print(
         "\n--json adds the source of every number; a sensor of your own is a TOML file"
         "\n(docs/reference/sensors.md)."
@@ -102,13 +104,13 @@ def classes(*, json: JsonFlag = False) -> int:
         Print them as JSON.
     """
     from geoscene.classes import class_rows, materials  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
 
     rows, surfaces = class_rows(), {m.name: m.code for m in materials().values()}
     if json:
         print_json({"classes": rows, "materials": surfaces})
         return 0
-    print(columns([list(rows[0]), *([str(value) for value in row.values()] for row in rows)]))
+    print(align_columns([list(rows[0]), *([str(value) for value in row.values()] for row in rows)]))
     print("\nMaterials: " + ", ".join(f"{code} {name}" for name, code in surfaces.items()))
     return 0
 
@@ -121,8 +123,8 @@ def settings(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
     from lidar.parameters import COLUMNS, parameter_cells, parameter_rows  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.settings import levels, list_settings  # noqa: PLC0415
     from lidar.tools.odometry.settings import OdometrySettings  # noqa: PLC0415
 
@@ -141,13 +143,13 @@ def settings(*, json: JsonFlag = False) -> int:
         print_json({"settings": documents, "odometry": of_odometry})
         return 0
     cells = [[s.name, s.of, *s.values, s.unit, s.meaning] for s in rows]
-    print(columns([["name", "of", *levels(), "unit", "meaning"], *cells]))
+    print(align_columns([["name", "of", *levels(), "unit", "meaning"], *cells]))
     print(
         "\n--fidelity takes a level, --set NAME=VALUE changes one setting. Separate options: --exact"
         "\n(the full projection for every point), --deskew, --crs; of scenes: geoscene build --lod, --dem,"
         "\n--along.\n\nSettings of lidar odometry, by its own --set:\n"
     )
-    print(columns([["name", *COLUMNS], *parameter_cells(of_odometry)]))
+    print(align_columns([["name", *COLUMNS], *parameter_cells(of_odometry)]))
     return 0
 
 
@@ -191,7 +193,7 @@ def selftest(
     elif markdown:
         print(extremes.markdown(done))
     else:
-        extremes.print_table(done)
+        print(extremes.to_text(done))
     if broken:
         print(f"lidar: {broken} of {len(done)} bounds do not hold on this machine", file=sys.stderr)
     return FAILURE if broken else 0

@@ -54,7 +54,7 @@ def defend(
     from geoscene.scene import open_scene  # noqa: PLC0415
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
     from lidar.tools.defences.calibration import read_calibration  # noqa: PLC0415
-    from lidar.tools.defences.defend import calibrate, score_rows  # noqa: PLC0415
+    from lidar.tools.defences.defend import calibrate, score_table  # noqa: PLC0415
     from lidar.tools.defences.defend import defend as judged  # noqa: PLC0415
     from lidar.tools.defences.registry import read_defences  # noqa: PLC0415
     from lidar.tools.detection.registry import read_detector  # noqa: PLC0415
@@ -106,9 +106,7 @@ def defend(
     if report.json:
         print_json(found.document())
     else:
-        from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
-
-        print(columns(score_rows(found)))
+        print(score_table(found).to_text())
     return 0
 
 
@@ -144,7 +142,7 @@ def train(
     workers
         Processes that read the clouds. The model does not depend on it.
     """
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
     from lidar.tools.train import train as trained  # noqa: PLC0415
 
     if not datasets:
@@ -156,7 +154,7 @@ def train(
     if report.json:
         print_json(made.to_json())
     else:
-        print(columns(made.table()))
+        print(align_columns(made.table()))
         words = command_line("lidar", "defend", datasets[0], "--detector", out)
         print(f"{out}: {made.frames} frames; next: {words} ...")
     return 0
@@ -170,8 +168,8 @@ def defences(*, json: JsonFlag = False) -> int:
     json
         Print them as JSON.
     """
+    from geoscene.drawing.report import align_columns  # noqa: PLC0415
     from lidar.parameters import COLUMNS, parameter_cells  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import columns  # noqa: PLC0415
     from lidar.tools.defences.registry import defence_rows  # noqa: PLC0415
 
     rows = defence_rows()
@@ -184,7 +182,7 @@ def defences(*, json: JsonFlag = False) -> int:
         past = f" Earlier frames: {row['history']}." if row["history"] else ""
         cells.append([row["name"], "", "", "", "", "", f"{row['meaning']}{needs}{past}"])
         cells += [["", *line] for line in parameter_cells(row["parameters"])]
-    print(columns([["name", "parameter", *COLUMNS], *cells]))
+    print(align_columns([["name", "parameter", *COLUMNS], *cells]))
     print(
         "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE,KEY=VALUE judges recorded data"
         "\n(docs/reference/defences.md)."

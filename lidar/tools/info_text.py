@@ -7,8 +7,8 @@ from contextlib import suppress
 from dataclasses import fields
 from typing import Any
 
+from geoscene.drawing.report import align_columns
 from lidar.errors import InputError
-from lidar.sensors.rig.catalog import columns
 from lidar.signal.registry import STAGES
 
 _TOLD = ("kind", "amount", "shape")
@@ -20,10 +20,10 @@ def info_text(document: Mapping[str, Any]) -> str:
     rows = _dataset_rows(document) if document["kind"] == "dataset" else _folder_rows(document)
     lines = [str(document["path"]), *(f"  {title:<12} {text}" for title, text in rows if text)]
     if "sensors" in document:
-        lines += ["", columns(_sensor_table(document["sensors"])), *_sensor_notes(document["sensors"])]
+        lines += ["", align_columns(_sensor_table(document["sensors"])), *_sensor_notes(document["sensors"])]
     if classes := document.get("classes"):
-        lines += ["", columns(_class_table(classes))]
-    return "\n".join([*lines, "", columns(_size_table(document["size"]))])
+        lines += ["", align_columns(_class_table(classes))]
+    return "\n".join([*lines, "", align_columns(_size_table(document["size"]))])
 
 
 def _dataset_rows(d: Mapping[str, Any]) -> Iterator[tuple[str, str]]:

@@ -37,12 +37,11 @@ FAILING = (
 )
 
 
-def test_bounds_that_do_not_hold_and_errors_are_told(monkeypatch, capsys):
+def test_bounds_that_do_not_hold_and_errors_are_told(monkeypatch):
     monkeypatch.setattr(run, "CASES", FAILING)
     done = list(run.outcomes())
     assert [one.ok for one in done] == [False, False]
-    run.print_table(done)
-    printed = capsys.readouterr().out
+    printed = run.to_text(done)
     assert "FAILS" in printed
     assert "ValueError: no way in 1" in printed
     assert "numpy" in printed

@@ -55,11 +55,3 @@ def rig_rows() -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def columns(rows: list[list[str]]) -> str:
-    """Rows of cells as lines of text with aligned columns."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows
-    )

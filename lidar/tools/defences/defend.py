@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.drawing.report import Column, ReportTable, table_of
 from geoscene.scene import Scene, open_scene
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
@@ -177,18 +178,24 @@ def _judge(
     )
 
 
-def score_rows(found: Defended) -> list[list[str]]:
-    """A table of scores as texts, with a head."""
-    rows = [
-        ["defence", "of", "genuine", "attacked", "threshold", "false alarms", "detected", "AUC", "ms/frame"]
-    ]
-    for (name, level), one in found.scores.items():
-        ms = f"{1000 * found.seconds[name]:.1f}" if name in found.seconds else ""
-        shares = [_with_interval(values) for values in (one.fpr, one.tpr, one.auc)]
-        rows.append(
-            [name, level, f"{one.genuine:,}", f"{one.attacked:,}", f"{one.threshold:.3f}", *shares, ms]
-        )
-    return rows
+def score_table(found: Defended) -> ReportTable:
+    """The scores of each defence by frames and objects."""
+
+    def milliseconds(row: tuple[str, str, Score]) -> str:
+        return f"{1000 * found.seconds[row[0]]:.1f}" if row[0] in found.seconds else ""
+
+    columns: tuple[Column[tuple[str, str, Score]], ...] = (
+        Column("defence", lambda row: row[0]),
+        Column("of", lambda row: row[1]),
+        Column("genuine", lambda row: f"{row[2].genuine:,}"),
+        Column("attacked", lambda row: f"{row[2].attacked:,}"),
+        Column("threshold", lambda row: f"{row[2].threshold:.3f}"),
+        Column("false alarms", lambda row: _with_interval(row[2].fpr)),
+        Column("detected", lambda row: _with_interval(row[2].tpr)),
+        Column("AUC", lambda row: _with_interval(row[2].auc)),
+        Column("ms/frame", milliseconds),
+    )
+    return table_of(columns, [(name, level, one) for (name, level), one in found.scores.items()])
 
 
 def _with_interval(values: tuple[float, float, float]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.drawing.report import Column, ReportTable, table_of
 from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
@@ -60,20 +61,33 @@ class Denoised:
         }
         return {"dataset": str(self.path), "out": self.out and str(self.out), "methods": rows}
 
-    def table(self) -> list[list[str]]:
-        """Rows of a table, the head first."""
-        counts = ["frames", "returns", "removed", "weather"]
-        rows = [["method", "scanner", *counts, "precision", "recall", "F1", "surfaces lost"]]
-        for text, of in self.scores.items():
-            for name, t in of.items():
-                if name == "all" and len(of) == 2:  # the same as of the only scanner
-                    continue
-                counts = [f"{t.frames:,}", f"{t.returns:,}", f"{t.removed:,}"]
-                weather = f"{t.weather:,}" if t.weather >= 0 else "unknown"
-                shares = ["-" if isnan(x) else f"{x:.3f}" for x in (t.precision, t.recall, t.f1)]
-                lost = "-" if isnan(t.lost) else f"{t.lost:.2%}"
-                rows.append([text, name, *counts, weather, *shares, lost])
-        return rows
+    def table(self) -> ReportTable:
+        """The scores; those of all scanners are left out where there is one."""
+        rows = [
+            (method, scanner, tally)
+            for method, of in self.scores.items()
+            for scanner, tally in of.items()
+            if scanner != "all" or len(of) > 2
+        ]
+        return table_of(_COLUMNS, rows)
+
+
+_COLUMNS: tuple[Column[tuple[str, str, FilterTally]], ...] = (
+    Column("method", lambda row: row[0]),
+    Column("scanner", lambda row: row[1]),
+    Column("frames", lambda row: f"{row[2].frames:,}"),
+    Column("returns", lambda row: f"{row[2].returns:,}"),
+    Column("removed", lambda row: f"{row[2].removed:,}"),
+    Column("weather", lambda row: f"{row[2].weather:,}" if row[2].weather >= 0 else "unknown"),
+    Column("precision", lambda row: _fixed(row[2].precision)),
+    Column("recall", lambda row: _fixed(row[2].recall)),
+    Column("F1", lambda row: _fixed(row[2].f1)),
+    Column("surfaces lost", lambda row: "-" if isnan(row[2].lost) else f"{row[2].lost:.2%}"),
+)
+
+
+def _fixed(value: float) -> str:
+    return "-" if isnan(value) else f"{value:.3f}"
 
 
 def denoise(

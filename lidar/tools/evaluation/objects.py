@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from geoscene.drawing.report import Column, ReportTable, table_of
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.layouts.kitti import OBJECTS
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
@@ -20,6 +21,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.tools.evaluation.detect import RESULTS
 from lidar.tools.evaluation.kitti_detection import AveragePrecision, evaluate_kitti, labels_of, read_labels
 from lidar.tools.evaluation.nuscenes_detection import (
+    ClassScore,
     NuScenesScore,
     evaluate_nuscenes,
     read_results,
@@ -37,8 +39,6 @@ from lidar.tools.evaluation.tracking import (
 )
 
 _LABELS = re.compile(r"\d{6}\.txt")
-
-Rows = list[list[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +59,13 @@ class ObjectScores:
         """As ``evaluation.json``."""
         return {"schema": 1, **asdict(self)}
 
-    def tables(self) -> list[tuple[str, list[str], Rows]]:
-        """Title, head and rows of each table."""
+    def tables(self) -> list[ReportTable]:
+        """The tables of the scores."""
         if isinstance(self.scores, NuScenesScore):
             return _nuscenes_tables(self.scores)
         precisions = [one for one in self.scores if isinstance(one, AveragePrecision)]
         tracks = [one for one in self.scores if isinstance(one, TrackScore)]
-        return _kitti_tables(precisions) if precisions else _track_tables(tracks)
+        return _kitti_tables(precisions) if precisions else [table_of(_TRACKS, tracks, title="Tracks")]
 
 
 def kind_of(estimate: Path) -> str:
@@ -197,54 +197,72 @@ def _check_frames(path: Path, found: Mapping[int, ObjectTracks], *, count: int) 
         raise InputError(f"{path}: has frame {beyond} (from 0), but the drive has {count} frames")
 
 
-def _kitti_tables(scores: list[AveragePrecision]) -> list[tuple[str, list[str], Rows]]:
+def _kitti_tables(scores: Sequence[AveragePrecision]) -> list[ReportTable]:
     rows: dict[tuple[str, str, float], list[AveragePrecision]] = {}
     for one in scores:
         rows.setdefault((one.kind, one.measure, one.overlap), []).append(one)
-    lines = [
-        [
-            kind,
-            measure.upper(),
-            f"{limit:g}",
-            *(_percent(one.value) for one in own),
-            "/".join(f"{one.objects:,}" for one in own),
-        ]
-        for (kind, measure, limit), own in rows.items()
+    columns: list[Column[list[AveragePrecision]]] = [
+        Column("class", lambda row: row[0].kind),
+        Column("boxes", lambda row: row[0].measure.upper()),
+        Column("IoU", lambda row: f"{row[0].overlap:g}"),
+        *(_precision_column(k, one.difficulty) for k, one in enumerate(next(iter(rows.values())))),
+        Column("objects", lambda row: "/".join(f"{one.objects:,}" for one in row)),
     ]
-    head = ["class", "boxes", "IoU", *(one.difficulty for one in next(iter(rows.values()))), "objects"]
-    return [("Average precision at 40 recalls (KITTI), %", head, lines)]
+    return [table_of(columns, rows.values(), title="Average precision at 40 recalls (KITTI), %")]
 
 
-def _nuscenes_tables(score: NuScenesScore) -> list[tuple[str, list[str], Rows]]:
-    distances = list(score.classes[0].precision)
-    head = ["class", *(f"AP {d} m" for d in distances), "mean", "ATE", "ASE", "AOE", "AVE", "AAE", "objects"]
-    rows = [
-        [
-            one.kind,
-            *(_percent(100 * v) for v in one.precision.values()),
-            _percent(100 * one.mean),
-            *("–" if v is None else f"{v:.3f}" for v in one.errors.values()),
-            f"{one.objects:,}",
-        ]
-        for one in score.classes
-        if one.objects
+def _nuscenes_tables(score: NuScenesScore) -> list[ReportTable]:
+    classes = [one for one in score.classes if one.objects]
+    columns: list[Column[ClassScore]] = [
+        Column("class", lambda row: row.kind),
+        *(_distance_column(distance) for distance in score.classes[0].precision),
+        Column("mean", lambda row: _percent(100 * row.mean)),
+        *(_error_column(name, k) for k, name in enumerate(("ATE", "ASE", "AOE", "AVE", "AAE"))),
+        Column("objects", lambda row: f"{row.objects:,}"),
     ]
     whole = [
-        ["ten classes", _percent(100 * score.mean_ap), f"{score.nds:.3f}"],
-        ["classes in the data", _percent(100 * score.mean_ap_present), f"{score.nds_present:.3f}"],
+        ("ten classes", score.mean_ap, score.nds),
+        ("classes in the data", score.mean_ap_present, score.nds_present),
     ]
-    return [("nuScenes, %, m, rad and m/s", head, rows), ("Scores", ["of", "mAP, %", "NDS"], whole)]
+    of_all: list[Column[tuple[str, float, float]]] = [
+        Column("of", lambda row: row[0]),
+        Column("mAP, %", lambda row: _percent(100 * row[1])),
+        Column("NDS", lambda row: _fixed(row[2])),
+    ]
+    return [
+        table_of(columns, classes, title="nuScenes, %, m, rad and m/s"),
+        table_of(of_all, whole, title="Scores"),
+    ]
 
 
-def _track_tables(scores: list[TrackScore]) -> list[tuple[str, list[str], Rows]]:
-    head = ["class", "boxes", "MOTA", "MOTP", "IDF1", "switches", "missed", "wrong", "objects"]
-    rows = [
-        [one.kind, one.measure.upper(), *(f"{v:.3f}" for v in (one.mota, one.motp, one.idf1))]
-        + [f"{v:,}" for v in (one.switches, one.missed, one.wrong, one.objects)]
-        for one in scores
-    ]
-    return [("Tracks", head, rows)]
+def _precision_column(k: int, difficulty: str) -> Column[list[AveragePrecision]]:
+    return Column(difficulty, lambda row: _percent(row[k].value))
+
+
+def _distance_column(distance: str) -> Column[ClassScore]:
+    return Column(f"AP {distance} m", lambda row: _percent(100 * row.precision[distance]))
+
+
+def _error_column(name: str, k: int) -> Column[ClassScore]:
+    return Column(name, lambda row: _fixed(list(row.errors.values())[k]))
+
+
+_TRACKS: tuple[Column[TrackScore], ...] = (
+    Column("class", lambda row: row.kind),
+    Column("boxes", lambda row: row.measure.upper()),
+    Column("MOTA", lambda row: _fixed(row.mota)),
+    Column("MOTP", lambda row: _fixed(row.motp)),
+    Column("IDF1", lambda row: _fixed(row.idf1)),
+    Column("switches", lambda row: f"{row.switches:,}"),
+    Column("missed", lambda row: f"{row.missed:,}"),
+    Column("wrong", lambda row: f"{row.wrong:,}"),
+    Column("objects", lambda row: f"{row.objects:,}"),
+)
 
 
 def _percent(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f}"
+
+
+def _fixed(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from geoscene import __version__
-from geoscene.drawing.charts import html_page, html_picture, html_table
+from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from lidar.errors import InputError
@@ -20,7 +20,8 @@ from lidar.tools.evaluation.intervals import Statistics, Value
 from lidar.tools.evaluation.nuscenes_detection import NuScenesScore
 from lidar.tools.evaluation.objects import ObjectScores
 from lidar.tools.evaluation.pose_errors import absolute, by_axis
-from lidar.tools.evaluation.trajectory import Compared, TrajectoryErrors, method_of
+from lidar.tools.evaluation.trajectory import Compared, SegmentErrors, TrajectoryErrors, method_of
+from lidar.tools.maps.compare import SurfaceDistances
 
 DOCUMENT = "evaluation.json"
 
@@ -28,8 +29,6 @@ _NAMES = (
     r"evaluation\.(json|html)|[a-z_]+\.(csv|png|svg|tum)"
     r"|map\.(laz|compare\.(csv|png)|laz\.provenance\.json)"
 )
-
-Rows = list[list[str]]
 
 
 @contextmanager
@@ -67,15 +66,16 @@ def write_trajectory_report(compared: Compared, folder: Path, *, estimate: Path)
     )
     if pairs.truth.timed:
         pairs.estimate.write(folder / "aligned.tum")
-    body = [f"<p>{method_of(errors)}</p>"]
-    body += [f"<h2>{title}</h2>{html_table(head, rows)}" for title, head, rows in tables(errors)]
+    page = Page(f"{Path(errors.estimate).name} against {Path(errors.truth).name}")
+    page.paragraph(method_of(errors))
+    for table in trajectory_tables(errors):
+        page.table(table)
     for name, canvas in figures_of(compared, estimate).items():
         png = canvas.encoded(".png")
         write_atomically(folder / f"{name}.png", png)
         write_atomically(folder / f"{name}.svg", canvas.encoded(".svg"))
-        body.append(html_picture(png, alt=name))
-    title = f"{Path(errors.estimate).name} against {Path(errors.truth).name}"
-    write_atomically(folder / "evaluation.html", html_page(title, "".join(body)))
+        page.picture(png, alt=name)
+    write_atomically(folder / "evaluation.html", page.encoded())
     write_json(folder / DOCUMENT, {"generator": f"geoscene lidar {__version__}", **errors.to_json()})
 
 
@@ -87,49 +87,60 @@ def write_object_report(found: ObjectScores, folder: Path) -> None:
             folder / "scores.csv",
             {name: ["" if row[name] is None else row[name] for row in rows] for name in rows[0]},
         )
-    body = [f"<p>{found.kind}: {found.frames:,} frames</p>"]
-    body += [f"<h2>{title}</h2>{html_table(head, rows)}" for title, head, rows in found.tables()]
-    title = f"{Path(found.estimate).name} against {Path(found.truth).name}"
-    write_atomically(folder / "evaluation.html", html_page(title, "".join(body)))
+    page = Page(f"{Path(found.estimate).name} against {Path(found.truth).name}")
+    page.paragraph(f"{found.kind}: {found.frames:,} frames")
+    for table in found.tables():
+        page.table(table)
+    write_atomically(folder / "evaluation.html", page.encoded())
     write_json(folder / DOCUMENT, {"generator": f"geoscene lidar {__version__}", **found.to_json()})
 
 
-def tables(errors: TrajectoryErrors) -> list[tuple[str, list[str], Rows]]:
-    """Title, head and rows of each table."""
-    rows = [
-        ["translation, m", *_cells(errors.translation)],
-        ["rotation, degrees", *_cells(errors.rotation)],
-    ]
-    head = ["", "rmse", "mean", "median", "max", "poses"]
-    found = [(f"Absolute errors (alignment {errors.alignment.kind})", head, rows)]
-    relative = []
+def trajectory_tables(errors: TrajectoryErrors) -> list[ReportTable]:
+    """The tables of a trajectory's errors."""
+    whole = [("translation, m", errors.translation), ("rotation, degrees", errors.rotation)]
+    title = f"Absolute errors (alignment {errors.alignment.kind})"
+    found = [table_of(_statistics_columns("poses"), whole, title=title)]
+    parts = []
     for one in errors.relative:
-        words = f"{one.delta[:-1]} {'frames' if one.delta.endswith('f') else 'm'}"
-        relative.append([f"translation over {words}, m", *_cells(one.translation)])
-        relative.append([f"rotation over {words}, degrees", *_cells(one.rotation)])
-    if relative:
-        found.append(("Relative errors", [*head[:-1], "pairs"], relative))
+        span = f"{one.delta[:-1]} {'frames' if one.delta.endswith('f') else 'm'}"
+        parts.append((f"translation over {span}, m", one.translation))
+        parts.append((f"rotation over {span}, degrees", one.rotation))
+    if parts:
+        found.append(table_of(_statistics_columns("pairs"), parts, title="Relative errors"))
     if errors.segments:
-        rows = [
-            [
-                "all" if row.length is None else f"{row.length} m",
-                text_of(row.translation),
-                text_of(row.rotation),
-                f"{row.count:,}",
-            ]
-            for row in errors.segments
-        ]
         kind = "KITTI" if errors.kitti else "shorter than KITTI's"
-        found.append((f"Errors of segments ({kind})", ["length", "%", "degrees per 100 m", "segments"], rows))
+        found.append(table_of(_SEGMENTS, errors.segments, title=f"Errors of segments ({kind})"))
     if errors.map:
-        rows = [
-            [row.name, *(f"{1000 * v:.1f}" for v in (row.mean_m, row.median_m, row.p95_m)), f"{row.points:,}"]
-            for row in errors.map
-        ]
-        found.append(
-            ("Map to true surfaces, mm", ["class", "mean", "median", "95 percentile", "points"], rows)
-        )
+        found.append(table_of(_MAP, errors.map, title="Map to true surfaces, mm"))
     return found
+
+
+def _statistics_columns(count: str) -> list[Column[tuple[str, Statistics]]]:
+    """Columns of named statistics; ``count`` is the heading of their number."""
+    return [
+        Column("", lambda row: row[0]),
+        Column("rmse", lambda row: text_of(row[1].rmse)),
+        Column("mean", lambda row: text_of(row[1].mean)),
+        Column("median", lambda row: text_of(row[1].median)),
+        Column("max", lambda row: f"{row[1].max:.3g}"),
+        Column(count, lambda row: f"{row[1].count:,}"),
+    ]
+
+
+_SEGMENTS: tuple[Column[SegmentErrors], ...] = (
+    Column("length", lambda row: "all" if row.length is None else f"{row.length} m"),
+    Column("%", lambda row: text_of(row.translation)),
+    Column("degrees per 100 m", lambda row: text_of(row.rotation)),
+    Column("segments", lambda row: f"{row.count:,}"),
+)
+
+_MAP: tuple[Column[SurfaceDistances], ...] = (
+    Column("class", lambda row: row.name),
+    Column("mean", lambda row: f"{1000 * row.mean_m:.1f}"),
+    Column("median", lambda row: f"{1000 * row.median_m:.1f}"),
+    Column("95 percentile", lambda row: f"{1000 * row.p95_m:.1f}"),
+    Column("points", lambda row: f"{row.points:,}"),
+)
 
 
 def text_of(value: Value) -> str:
@@ -137,11 +148,3 @@ def text_of(value: Value) -> str:
     if value.low is None or value.high is None:
         return f"{value.value:.3g}"
     return f"{value.value:.3g} ({value.low:.3g} to {value.high:.3g})"
-
-
-def _cells(found: Statistics) -> Sequence[str]:
-    return [
-        *(text_of(v) for v in (found.rmse, found.mean, found.median)),
-        f"{found.max:.3g}",
-        f"{found.count:,}",
-    ]

@@ -1,4 +1,4 @@
-"""Runs the extremes on this machine and lays out what was measured."""
+"""Runs the extremes on this machine, and tables of the outcomes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.drawing.report import Column, table_of
 from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import unknown_name
 from lidar.errors import BackendError, InputError
@@ -21,7 +22,7 @@ from lidar.tools.selftest.cases import CASES, GROUPS
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What was measured in a case.
+    """The outcome of a case.
 
     count    : number of samples
     measured : in the case's unit; NaN if the case ended in an error
@@ -57,7 +58,7 @@ def outcomes(
 
 
 def outcome(case: ExtremeCase, count: int) -> Outcome:
-    """What is measured in a case in ``count`` samples."""
+    """The outcome of a case with ``count`` samples."""
     start = time.perf_counter()
     try:
         measured, error = case.measure(count), ""
@@ -100,35 +101,21 @@ def figure(value: float) -> str:
     return f"{value:.3g}" if 10 <= abs(value) < 1e6 else f"{value:.2g}"
 
 
-def cells(done: Outcome) -> tuple[str, ...]:
-    """Case, samples, bound, measured and verdict as text."""
-    case = done.case
-    measured = done.error or f"{figure(done.measured)} {case.unit}"
-    return (
-        case.name,
-        f"{done.count:,} {case.of}",
-        f"{figure(case.bound)} {case.unit}",
-        measured,
-        "ok" if done.ok else "FAILS",
-    )
+_COLUMNS: tuple[Column[Outcome], ...] = (
+    Column("case", lambda done: done.case.name),
+    Column("samples", lambda done: f"{done.count:,} {done.case.of}"),
+    Column("bound", lambda done: f"{figure(done.case.bound)} {done.case.unit}"),
+    Column("measured", lambda done: done.error or f"{figure(done.measured)} {done.case.unit}"),
+    Column("", lambda done: "ok" if done.ok else "FAILS"),
+)
 
 
-def print_table(done: Sequence[Outcome]) -> None:
-    """Print the outcomes and the machine on standard output."""
-    from rich.console import Console  # noqa: PLC0415 - slow to import
-    from rich.markup import escape  # noqa: PLC0415
-    from rich.table import Table  # noqa: PLC0415
-
-    table = Table("case", "samples", "bound", "measured", "")
-    for row, one in enumerate(done):
-        words = cells(one)
-        style = "" if one.ok else "bold red"
-        ends = row + 1 == len(done) or done[row + 1].case.group != one.case.group
-        table.add_row(*map(escape, words), style=style, end_section=ends)
-    console = Console(soft_wrap=False)
-    console.print(table)
-    for name, value in machine().items():
-        console.print(f"{name}: {value}", highlight=False, markup=False)
+def to_text(done: Sequence[Outcome]) -> str:
+    """The outcomes, a table for each group, and the machine."""
+    groups = dict.fromkeys(one.case.group for one in done)
+    tables = [table_of(_COLUMNS, (one for one in done if one.case.group == group)) for group in groups]
+    host = "\n".join(f"{name}: {value}" for name, value in machine().items())
+    return "\n\n".join([*(table.to_text() for table in tables), host])
 
 
 def markdown(done: Sequence[Outcome]) -> str:
@@ -139,7 +126,7 @@ def markdown(done: Sequence[Outcome]) -> str:
         lines += ["|---|---:|---:|---:|---|"]
         for one in done:
             if one.case.group == group:
-                *row, verdict = cells(one)
+                *row, verdict = (column.text(one) for column in _COLUMNS)
                 row[3] += "" if verdict == "ok" else " (FAILS)"
                 lines.append("| " + " | ".join([*row, one.case.limit]) + " |")
     return "\n".join(lines)

@@ -245,13 +245,14 @@ def test_settings_stand_side_by_side_and_attacks_are_ordered(written: Callable[.
             figures.append(Figures(Run(drives[1], attack, conditions, "plain"), changed, []))
     found = evaluate(figures, [weak, strong], measure=Measure())
     assert list(dict.fromkeys(row.attack for row in found.success)) == ["strong", "weak"]
-    tables = {title: (texts, shares) for title, texts, shares in setting_tables(found)}
-    texts, shares = tables["Success by setting"]
-    assert texts[0] == ["attack", "clear", "fog=100m"]
-    assert [line[0] for line in texts[1:]] == ["strong", "weak"]
-    assert shares == [[1.0, 1.0], [0.0, 1.0]]
-    assert tables["Frames with an alarm without attack"][1] == [[0.0, 1.0]]
-    assert tables["Attacked frames with an alarm: weak"][1] == [[1.0, 1.0]]
+    tables = {table.title: table for table in setting_tables(found)}
+    success = tables["Success by setting"]
+    assert success.head == ("attack", "clear", "fog=100m")
+    assert [line[0] for line in success.rows] == ["strong", "weak"]
+    shares = {title: [line[1:] for line in table.shades] for title, table in tables.items()}
+    assert shares["Success by setting"] == [(1.0, 1.0), (0.0, 1.0)]
+    assert shares["Frames with an alarm without attack"] == [(0.0, 1.0)]
+    assert shares["Attacked frames with an alarm: weak"] == [(1.0, 1.0)]
 
 
 def test_areas_of_one_block_have_no_interval(written: Callable[..., Path]) -> None:
