@@ -550,8 +550,7 @@ class AccuracyOptions:
     accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT],LEVELS")] = ""
     """Pick the fewest rays with which every sensor errs less than this: 1cm for 99.9 % of the ranges and
     depths, 5mm@99 for 99 % of them, 3levels for colours of cameras (rms, of 255), 1cm,3levels for both. What
-    counts is the upper end of the 95 % interval for the next drive, by a measurement made once for a scene,
-    rig and settings."""
+    counts is the upper end of the 95 % interval, by a sample of the drive's frames."""
 
     budget: Annotated[str, Parameter(metavar="Nx-realtime")] = ""
     """Pick the most rays with which the workers simulate the drive at this speed: 2x-realtime is two
@@ -560,9 +559,6 @@ class AccuracyOptions:
     spot_check: bool = False
     """Compare a sample of the recorded frames with the exact reference (float64, up to 999 rays a pulse)
     afterwards; always done for an accuracy or a budget."""
-
-    profile_cache: Path | None = None
-    """Folder of the measurements that accuracy and budget pick by; ~/.cache/geoscene/profiles by default."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
@@ -580,6 +576,12 @@ class AccuracyOptions:
     def checks(self) -> bool:
         """Whether a sample of frames is to be checked."""
         return self.picks or self.spot_check
+
+    @property
+    def request(self) -> dict[str, str]:
+        """Accuracy and budget that are given, as text."""
+        texts = {"accuracy": self.accuracy.strip(), "budget": self.budget.strip()}
+        return {name: text for name, text in texts.items() if text}
 
 
 MAP = Group("Map instead of a scene", sort_key=2)
@@ -641,9 +643,8 @@ class TradeoffOptions:
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
     """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample,
     edge_rays, blur, shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach,
-    forests, trees, furniture, barriers, relief, scene, traffic; georeferencing, files (formats), voxel (of
-    maps) and frame (projections); all by default. Cheap ones are also tried together. lidar settings
-    explains them."""
+    forests, trees, furniture, barriers, relief, scene, traffic; georeferencing; all by default. Cheap ones
+    are also tried together. lidar settings explains them."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
     """Names of the scanners and cameras to compare; all by default."""

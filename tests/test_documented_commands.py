@@ -16,9 +16,9 @@ import pytest
 from helpers import ROOT
 from helpers.clouds import write_survey
 from helpers.overture import overture_row, write_overture
-from helpers.profiles import measure_little
 from helpers.programs import run_process, run_program
 from helpers.rasters import write_slope
+from helpers.samples import measure_little
 
 import geoscene.cli
 import geoscene.sources
@@ -27,10 +27,10 @@ import lidar.cli
 import lidar.sensors.rig.specs
 import lidar.simulation.drive
 import lidar.simulation.frames
-import lidar.tools.tradeoff.accuracy
+import lidar.tools.tradeoff.compare
 import lidar.tools.tradeoff.costs
-import lidar.tools.tradeoff.engine
-import lidar.tools.tradeoff.profile
+import lidar.tools.tradeoff.ladders
+import lidar.tools.tradeoff.search
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
@@ -161,7 +161,7 @@ def folder(inputs, tmp_path, monkeypatch):
     def first(recording, jobs, **more):
         record_all(recording, jobs[:20], **more)
 
-    compare = lidar.tools.tradeoff.engine.tradeoff
+    compare = lidar.tools.tradeoff.compare.compare_settings
 
     def small(scene, options, *, compared, **more):
         compared = replace(compared, frames=2, pulses=100, pixels=256, reference_rays=7)
@@ -173,19 +173,23 @@ def folder(inputs, tmp_path, monkeypatch):
         "tradeoff",
         lambda *args, **more: builds(*args, **more | {"settings": ("lod",)}),
     )
-    plan, peaks = lidar.tools.tradeoff.accuracy.plan_drive, lidar.tools.tradeoff.costs.peaks
+    plan, peaks = lidar.tools.tradeoff.search.plan_drive, lidar.tools.tradeoff.costs.peaks
     camera = lidar.sensors.rig.specs._camera
     monkeypatch.setattr(
-        lidar.tools.tradeoff.accuracy,
+        lidar.tools.tradeoff.search,
         "plan_drive",
         lambda scene, options, **more: plan(scene, replace(options, duration=0.2), **more),
     )
-    monkeypatch.setattr(lidar.tools.tradeoff.profile, "RAYS", (1, 7, 19, 127))
+    monkeypatch.setattr(lidar.tools.tradeoff.ladders, "RAYS", (1, 7, 19, 127))
     # each takes a process: one stands for all
-    monkeypatch.setattr(lidar.tools.tradeoff.costs, "peaks", lambda tasks: peaks(tasks[:1]) * len(tasks))
+    monkeypatch.setattr(
+        lidar.tools.tradeoff.costs,
+        "peaks",
+        lambda *of, variants: peaks(*of, variants=variants[:1]) * len(variants),
+    )
     monkeypatch.setattr(lidar.sensors.rig.specs, "_camera", lambda table: coarse(camera(table), 4))
-    measure_little(monkeypatch, folder=tmp_path / "profiles")
-    monkeypatch.setattr(lidar.tools.tradeoff.engine, "tradeoff", small)
+    measure_little(monkeypatch)
+    monkeypatch.setattr(lidar.tools.tradeoff.compare, "compare_settings", small)
     monkeypatch.setattr(lidar.simulation.drive, "drive", short)
     monkeypatch.setattr(lidar.simulation.drive, "record_all", first)
     return folder

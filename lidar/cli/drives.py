@@ -108,7 +108,7 @@ def drive(
             begun = None if report.overwrite else folder
             pick = pick_settings(opened, options, wanted=wanted, out=begun, progress=progress)
         if pick and not report.json:
-            print(pick.to_text(options.workers), flush=True)
+            print(pick.to_text(), flush=True)
         with bar() as progress, shows as shown_live:
             done = driven(
                 opened,
@@ -138,7 +138,7 @@ def drive(
         **({"effects": summary.effects} if summary.effects else {}),
     }
     if pick or done.reached:
-        document["accuracy"] = done.accuracy(options.workers)
+        document["accuracy"] = done.accuracy()
     if report.json:
         print_json(document)
     else:
@@ -314,8 +314,8 @@ def tradeoff(
     """
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
-    from lidar.tools.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
-    from lidar.tools.tradeoff.report import document, print_tables, write_report  # noqa: PLC0415
+    from lidar.tools.tradeoff.compare import compare_settings  # noqa: PLC0415
+    from lidar.tools.tradeoff.report import document, to_text, write_report  # noqa: PLC0415
     from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
 
     options = options or DriveOptions()
@@ -334,11 +334,11 @@ def tradeoff(
         found_scene = open_scene_or_map(scene, needing, place=place, clouds=clouds, progress=progress).scene
         scenes = [found_scene, *map(open_scene, others)]
         first, *rest = [opened.enter_context(using(s, known=LidarError)) for s in scenes]
-        found = measured(first, options, compared=compared, others=rest, progress=progress)
+        found = compare_settings(first, options, compared=compared, others=rest, progress=progress)
     if out is not None:
         write_report(found, out)
     if report.json:
         print_json(document(found))
     else:
-        print_tables(found)
+        print(to_text(found))
     return 0

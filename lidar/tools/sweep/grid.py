@@ -144,8 +144,6 @@ def _drive(
         options, wanted = _parse(words)
         _check(options)
         options = _with_absolute_paths(options)
-        if wanted.profile_cache:
-            wanted = replace(wanted, profile_cache=wanted.profile_cache.absolute())
         place = Path(scene) if url_of(scene) else Path(scene).absolute()
         source = maps.get(scene) or (map_of_file(place) if place.is_file() else None)
     return GridDrive(name, source.osm[0] if source else place, texts, options, wanted, source)

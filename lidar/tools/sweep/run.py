@@ -28,7 +28,7 @@ from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError, LidarError
 from lidar.options import DriveOptions
 from lidar.tools.sweep.grid import GridDrive, read_grid
-from lidar.tools.tradeoff.accuracy import Pick, driven, pick_settings
+from lidar.tools.tradeoff.accuracy import driven, pick_settings
 
 log = logging.getLogger(__name__)
 
@@ -151,11 +151,9 @@ def record_drives(
                     continue
                 ready = replace(planned, scene=scene, map=None)
                 earlier = None if overwrite or table.rows[row].state != "done" else table.rows[row]
-                task = _Task(row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier)
-                try:
-                    tasks.append(_with_pick(task, progress=progress))
-                except (GeosceneError, LidarError, OSError) as error:
-                    table.set(row, DriveRow(planned.name, "failed", _one_line(error)))
+                tasks.append(
+                    _Task(row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier)
+                )
             progress("drives", 0, total=len(tasks))
             for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
                 table.set(row, result)
@@ -210,19 +208,6 @@ class _Task:
     threads: int
     overwrite: bool
     earlier: DriveRow | None = None
-    pick: Pick | None = None
-
-
-def _with_pick(task: _Task, *, progress: Progress) -> _Task:
-    """The task with what is picked for its drive, here, as one profile serves many drives."""
-    planned = task.drive
-    if not planned.wanted.picks:
-        return task
-    options = replace(planned.options, workers=task.threads)
-    out = None if task.overwrite else task.folder / planned.name
-    with using(open_scene(planned.scene), known=LidarError) as scene:
-        pick = pick_settings(scene, options, wanted=planned.wanted, out=out, progress=progress)
-    return replace(task, pick=pick and replace(pick, planned=None))
 
 
 def _results(
@@ -249,20 +234,14 @@ def _results(
 
 def _record_drive(task: _Task) -> tuple[int, DriveRow]:
     """Record a drive; its row of the table. Run by workers."""
-    name, out = task.drive.name, task.folder / task.drive.name
+    name, out, wanted = task.drive.name, task.folder / task.drive.name, task.drive.wanted
     options = replace(task.drive.options, workers=task.threads)
     try:
         with using(open_scene(task.drive.scene), known=LidarError) as scene:
             if task.earlier is not None and _is_unchanged(task, scene, options=options):
                 return task.row, task.earlier
-            checked = driven(
-                scene,
-                out,
-                options=options,
-                wanted=task.drive.wanted,
-                pick=task.pick,
-                overwrite=task.overwrite,
-            )
+            pick = pick_settings(scene, options, wanted=wanted, out=None if task.overwrite else out)
+            checked = driven(scene, out, options=options, wanted=wanted, pick=pick, overwrite=task.overwrite)
     except (GeosceneError, LidarError, OSError) as error:
         return task.row, DriveRow(name, "failed", _one_line(error))
     except Exception as error:  # one drive's defect must not end the others
@@ -278,7 +257,7 @@ def _record_drive(task: _Task) -> tuple[int, DriveRow]:
         metres=round(done.length, 3),
         digest=file_digest(Paths(out).journal),
         files=_digest_of_folder(out),
-        picked=task.pick.label if task.pick else "",
+        picked=pick.label if pick else "",
         reached=checked.reached.reached.to_text("are") if checked.reached else "",
     )
 

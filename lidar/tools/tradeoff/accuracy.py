@@ -1,8 +1,7 @@
-"""Drives to an accuracy or within a budget of time: numbers of rays are picked by a stored profile."""
+"""Drives to an accuracy or within a budget of time: numbers of rays are picked, and errors are checked."""
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,113 +14,48 @@ from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_bud
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation import drive as pipeline
-from lidar.simulation import frame_loop
-from lidar.simulation.plan import DrivePlan, plan_drive, sensors_of
-from lidar.tools.tradeoff.choice import Choice, Kind, Wanted, choice, speed, workers_text
+from lidar.simulation.plan import DrivePlan, sensors_of
+from lidar.tools.tradeoff.errors import ErrorEstimate
+from lidar.tools.tradeoff.pick import PERCENT, Pick
 from lidar.tools.tradeoff.sensor_errors import SensorErrors, kinds_of, stated
 
 if TYPE_CHECKING:
-    from lidar.tools.tradeoff.profile import Profile
-    from lidar.tools.tradeoff.spot import SpotCheck
+    from lidar.tools.tradeoff.ladders import Kind
 
-_PERCENT = 99.9
-"""Percent of the returns whose error is stated where no accuracy says another."""
-
-
-@dataclass(frozen=True, slots=True)
-class Planned:
-    """The plan of a drive within a budget of time.
-
-    seconds : that planning took
-    cpu_s   : CPU seconds of these
-    loading : CPU seconds to load tiles along it, as expected
-    """
-
-    plan: DrivePlan
-    seconds: float
-    cpu_s: float
-    loading: float
-
-    @property
-    def overhead(self) -> float:
-        """Seconds per simulated second beside recording, if no other program takes time."""
-        return (self.cpu_s + self.loading) / (self.plan.trajectory.duration_ns / 1e9)
+_CHECKED = 10
+"""Frames of each sensor that are checked after a drive."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pick:
-    """Numbers of rays that were picked for a drive.
+class SpotCheck:
+    """Errors that a drive has reached in a sample of its frames.
 
-    asked    : accuracy and budget, as text
-    settings : that were picked, by name
-    expected : errors of the next drive in the scene, or of this one if the profile is of it
-    chosen   : from the profile; None where an earlier run had picked
-    profile  : by which it was picked; None likewise
-    planned  : the drive with these settings, if there is a budget; None likewise
+    reached : errors of the kinds that are stated
+    errors  : all figures of each sensor, with intervals by resampling frames
+    frames  : number of frames, by sensor
     """
 
-    asked: dict[str, str]
-    settings: dict[str, int]
-    expected: SensorErrors
-    chosen: Choice | None = None
-    profile: Profile | None = None
-    planned: Planned | None = None
+    reached: SensorErrors
+    errors: dict[str, dict[str, ErrorEstimate]]
+    frames: dict[str, int]
+
+    def to_text(self) -> str:
+        """The errors, in one line."""
+        count = max(self.frames.values(), default=0)
+        return f"spot check of {count} frames: {self.reached.to_text('are')}"
 
     def to_json(self) -> dict[str, Any]:
-        """The entry ``accuracy`` of ``dataset.json``, without figures of this machine."""
-        return {"asked": self.asked, "picked": self.settings} | self.expected.to_json("expected")
-
-    @property
-    def label(self) -> str:
-        """The settings, as in ``rays=7``; empty if none was to be picked."""
-        return " ".join(f"{name}={value}" for name, value in self.settings.items())
-
-    def to_text(self, workers: int) -> str:
-        """What was picked and what to expect of it."""
-        words = self.label or "nothing, as no setting changes depths"
-        text = f"picked {words}: {self.expected.to_text('should be')}"
-        if self.chosen is None or self.profile is None:
-            return f"{text}; as picked before for this dataset"
-        whose = "the next drive" if self.profile.drives > 1 else "this drive"
-        cost = self.chosen.cpu_s
-        text = (
-            f"{text} (95 % intervals for {whose}); it takes {cost.value:.3g} CPU s per simulated second,"
-            f" which is {speed(cost, workers):.2g} x real time with {workers_text(workers)}"
-        )
-        if self.planned is None:
-            return text
-        return (
-            f"{text}; with planning ({self.planned.cpu_s:.2g} CPU s) and loading ({self.planned.loading:.2g})"
-            f" {self._whole_speed(workers):.2g} x real time"
-        )
-
-    def _whole_speed(self, workers: int) -> float:
-        """Simulated seconds per second, with planning and loading."""
-        assert self.chosen is not None  # noqa: S101 - only then there is a speed
-        overhead = self.planned.overhead if self.planned else 0.0
-        return 1 / (1 / speed(self.chosen.cpu_s, workers) + overhead)
-
-    def costs(self, workers: int) -> dict[str, Any]:
-        """What depends on the machine; empty where an earlier run had picked."""
-        if self.chosen is None or self.profile is None:
-            return {}
-        planned = self.planned and {
-            "planning_cpu_s": round(self.planned.cpu_s, 3),
-            "expected_loading_cpu_s": round(self.planned.loading, 3),
+        """All figures."""
+        every = {
+            name: {"frames": self.frames[name]} | {figure: error.to_json() for figure, error in of.items()}
+            for name, of in self.errors.items()
         }
-        return {
-            "expected_cpu_s": self.chosen.cpu_s.to_json(),
-            "expected_speed": round(self._whole_speed(workers), 3),
-            **(planned or {}),
-            "profile": str(self.profile.path),
-            "profile_made": self.profile.made,
-            "profile_drives": self.profile.drives,
-        }
+        return self.reached.to_json("reached") | {"spot_check": every}
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedDrive:
-    """A finished drive, what was picked for it, and the errors that it reached.
+    """A finished drive with the settings that were picked for it and the errors that it reached.
 
     wanted  : accuracy and budget
     pick    : None if nothing was to be picked
@@ -133,9 +67,9 @@ class CheckedDrive:
     pick: Pick | None
     reached: SpotCheck | None
 
-    def accuracy(self, workers: int) -> dict[str, Any]:
-        """What was picked, expected and reached, with the costs on this machine."""
-        document = self.pick.to_json() | self.pick.costs(workers) if self.pick else {}
+    def accuracy(self) -> dict[str, Any]:
+        """Settings, expected and reached errors, and costs on this machine."""
+        document = self.pick.to_json() | self.pick.costs() if self.pick else {}
         if self.pick and self.speed:
             document["speed"] = round(self.speed, 3)
         return document | (self.reached.to_json() if self.reached else {})
@@ -150,11 +84,11 @@ class CheckedDrive:
     @property
     def planning(self) -> float:
         """Seconds in which the drive was planned."""
-        ahead = self.pick.planned.seconds if self.pick and self.pick.planned else 0.0
+        ahead = self.pick.cost.planning[0] if self.pick and self.pick.cost else 0.0
         return ahead + self.summary.planning
 
     def to_text(self) -> str:
-        """What was reached, in one line; empty without a check."""
+        """The errors that were reached, in one line; empty without a check."""
         if self.reached is None:
             return ""
         pace = f"; planned and recorded at {self.speed:.2g} x real time" if self.speed else ""
@@ -185,65 +119,50 @@ def pick_settings(
     out: Path | None = None,
     progress: Progress = silent,
 ) -> Pick | None:
-    """The pick for a drive: of the dataset that is resumed, or by the profile; None if none is wanted.
+    """The pick for a drive, or None if none is wanted: of the dataset that is resumed, or by a sample.
 
     out : of a drive that may have begun
 
-    Raises InputError (also as RouteError, RigError) if nothing reaches what is wanted, and for settings that
-    contradict it.
+    Raises InputError (also as RouteError, RigError) if no settings reach the accuracy or budget, and for
+    settings that contradict it.
     """
     if not wanted.picks:
         return None
     free = _free(options, wanted)
     if before := _picked_before(out, wanted) if out else None:
         return before
-    from lidar.tools.tradeoff.profile import profile_of  # noqa: PLC0415  (0.1 s)
+    from lidar.tools.tradeoff.search import pick_by_sample  # noqa: PLC0415  (0.1 s)
 
-    profile = profile_of(scene, options, folder=wanted.profile_cache, progress=progress)
-    asked = read_accuracy(wanted.accuracy) if wanted.accuracy else None
-    settings = options.recording_settings
-    given = {
-        "rays": settings.scanner.rays,
-        "supersample": settings.camera.supersample,
-        "blur": settings.camera.blur,
-    }
-    by = Wanted(asked, workers=options.workers, given=given, free=free)
-    planned = None
-    if wanted.budget:
-        planned = _plan(scene, options, profile=profile, progress=progress)
-        by = replace(by, budget=wanted.budget, pace=pace_of(planned, wanted.budget))
-    chosen = choice(profile, by)
-    percent = asked.percent if asked else _PERCENT
-    expected = stated(chosen.errors, percent=percent, kinds=kinds_of(asked))
-    return Pick(_request(wanted), chosen.settings, expected, chosen, profile, planned)
+    return pick_by_sample(scene, options, wanted=wanted, free=free, progress=progress)
 
 
-def _plan(scene: Scene, options: DriveOptions, *, profile: Profile, progress: Progress) -> Planned:
-    """The plan of a drive, and what it and loading cost."""
-    began, cpu_began = time.perf_counter(), time.process_time()
-    plan = plan_drive(scene, options, progress=progress)
-    seconds, cpu_s = time.perf_counter() - began, time.process_time() - cpu_began
-    chunks = sum(1 for _ in frame_loop.chunks(plan.jobs, plan.trajectory))
-    return Planned(plan, seconds, cpu_s=cpu_s, loading=chunks * profile.load_s.high)
+def spot_check(
+    plan: DrivePlan, *, percent: float, kinds: tuple[str, ...], progress: Progress = silent
+) -> SpotCheck:
+    """Errors of a sample of frames of a drive's sensors, without random effects and stages.
 
+    percent : of the returns or pixels with a depth for which errors are stated
+    kinds   : of errors that are stated; sensors that have none of these are not checked
+    """
+    from lidar.tools.tradeoff.sample import DriveSample, sensors_with  # noqa: PLC0415  (0.1 s)
 
-def pace_of(planned: Planned, budget: str) -> float:
-    """Simulated seconds that are to be recorded per second, so that a budget holds for all."""
-    left = 1 / read_budget(budget) - planned.overhead
-    if left <= 0:
-        duration = planned.plan.trajectory.duration_ns / 1e9
-        raise InputError(
-            f"`budget` {budget}: allows {duration / read_budget(budget):.2g} s for a drive of"
-            f" {duration:.3g} s, and planning took {planned.cpu_s:.2g} CPU s and loading takes"
-            f" {planned.loading:.2g}; give more time"
-        )
-    return 1 / left
+    own = plan.options.recording_settings
+    sensors = sensors_with(plan.sensors, kinds=kinds)
+    errors: dict[str, dict[str, ErrorEstimate]] = {}
+    frames: dict[str, int] = {}
+    for kind, settings in ((Scanner, own.scanner), (Camera, own.camera)):
+        of_kind = [sensor for sensor in sensors if isinstance(sensor, kind)]
+        sample = DriveSample(plan, of_kind, settings=[settings], other=True, progress=progress)
+        sample.grow(_CHECKED)
+        errors |= sample.figures(0)
+        frames |= sample.counts
+    return SpotCheck(stated(errors, percent=percent, kinds=kinds), errors, frames)
 
 
 def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
     """Kinds of sensors for which settings may be picked.
 
-    Raises InputError for settings that contradict what is wanted, and for errors that no sensor has.
+    Raises InputError for settings that contradict the accuracy, and for errors that no sensor has.
     """
     sensors = sensors_of(load_rig(options.rig), options)
     images = {image for s in sensors if isinstance(s, Camera) for image in s.spec.images}
@@ -270,6 +189,10 @@ def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
     has: dict[Kind, bool] = {"scanners": scanning, "cameras": "rgb" in images}
     here = [kind for kind, there in has.items() if there]
     picks = {"scanners": asked is None or bool(asked.metres), "cameras": asked is None or bool(asked.levels)}
+    if asked is None and not here:
+        raise InputError(
+            f"`rig` {options.rig}: has no scanner and no camera of colours, whose rays are picked"
+        )
     free = tuple(kind for kind in here if picks[kind] and not held[kind])
     taken = [held[kind][0] for kind in here if picks[kind] and held[kind]]
     if taken and (asked or not free):
@@ -290,20 +213,18 @@ def driven(
     progress: Progress = silent,
     live: pipeline.Live | None = None,
 ) -> CheckedDrive:
-    """Drive as `lidar.simulation.drive.drive` does, with what was picked, and check a sample of the frames.
+    """Drive as `lidar.simulation.drive.drive` does, with the picked settings, and check a sample of frames.
 
-    The recipe holds what was picked, so that a drive is resumed with it, also on another machine.
+    The recipe holds the picked settings, so that a drive is resumed with it, also on another machine.
 
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
     found: list[SpotCheck] = []
     notes = pick.to_json() if pick else {}
-    percent = pick.expected.percent if pick else _PERCENT
+    percent = pick.expected.percent if pick else PERCENT
     kinds = kinds_of(read_accuracy(wanted.accuracy) if wanted.accuracy else None)
 
     def check(plan: DrivePlan) -> dict[str, Any]:
-        from lidar.tools.tradeoff.spot import spot_check  # noqa: PLC0415  (0.1 s)
-
         found.append(spot_check(plan, percent=percent, kinds=kinds, progress=progress))
         return {"accuracy": notes | found[0].to_json()}
 
@@ -311,7 +232,7 @@ def driven(
     if pick:
         more = tuple((name, str(value)) for name, value in pick.settings.items())
         options = replace(options, settings=(*options.settings, *more))
-        plan = replace(pick.planned.plan, options=options) if pick.planned else None
+        plan = replace(pick.plan, options=options) if pick.plan else None
     summary = pipeline.drive(
         scene,
         out,
@@ -326,17 +247,12 @@ def driven(
     return CheckedDrive(summary, wanted, pick, found[0] if found else None)
 
 
-def _request(wanted: AccuracyOptions) -> dict[str, str]:
-    texts = {"accuracy": wanted.accuracy.strip(), "budget": wanted.budget.strip()}
-    return {name: text for name, text in texts.items() if text}
-
-
 def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
-    """What was picked for a dataset that was begun for the same accuracy and budget."""
+    """The pick for a dataset that was begun for the same accuracy and budget."""
     if not Paths(out).manifest.exists():
         return None
     notes = open_dataset(out).manifest.get("accuracy", {})
-    if notes.get("asked") != _request(wanted):
+    if notes.get("asked") != wanted.request:
         return None
     try:
         settings = {str(name): int(value) for name, value in notes["picked"].items()}

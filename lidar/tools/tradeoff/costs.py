@@ -2,31 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import multiprocessing
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from geoscene.support.memory import peak_memory
 from geoscene.support.progress import Progress
+from lidar.dataset.formats.table import cloud_table, records
+from lidar.dataset.png import depth_to_counts, encode_png, feature_to_image
+from lidar.sensors.camera.render import CameraImage
+from lidar.sensors.laser.scan import report
 from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.tools.tradeoff.bench import FAST, Bench, swept
 from lidar.tools.tradeoff.errors import ErrorEstimate, median
-from lidar.tools.tradeoff.memory import Task, peaks
-from lidar.tools.tradeoff.simulate import FAST, Bench
-from lidar.tools.tradeoff.variants import S, SettingVariant
-from lidar.world.world import World
+from lidar.tools.tradeoff.images import image
+from lidar.tools.tradeoff.variants import SettingVariant
+
+Variant = SettingVariant[Any]
 
 
 def costs(
     bench: Bench,
     sensor: Scanner | Camera,
     *,
-    variants: Sequence[SettingVariant[S]],
-    frame_cost: Callable[[int, World, SettingVariant[S]], tuple[float, int]],
+    variants: Sequence[Variant],
     repetitions: int,
     progress: Progress,
 ) -> list[dict[str, ErrorEstimate]]:
-    """CPU seconds and bytes per simulated second and peak memory of variants.
-
-    frame_cost : CPU seconds and bytes of a whole frame
+    """CPU seconds and bytes per simulated second and peak memory of variants, measured on whole frames.
 
     Repetitions are interleaved: each times one frame with every variant before the next one begins.
     """
@@ -39,20 +49,12 @@ def costs(
             progress(
                 f"timing {sensor.name}", max(k, 0) * len(variants) + i, total=repetitions * len(variants)
             )
-            world = bench.world(
-                sensor,
-                frame,
-                backend=FAST,
-                scene=variant.scene,
-                traffic=variant.traffic,
-                settings=variant.world,
-            )
-            spent, size = frame_cost(frame, world, variant)
+            spent, size = frame_cost(bench, sensor, variant=variant, frame=frame)
             if k >= 0:
                 seconds[i].append(spent * rate)
                 sizes[i].append(size * rate)
     progress(f"memory of {sensor.name}", 0, total=0)
-    memory = peaks([_task(bench, sensor, variant=variant) for variant in variants])
+    memory = peaks(bench, sensor, variants=variants)
     seed = bench.plan.options.seed
     return [
         {
@@ -64,22 +66,51 @@ def costs(
     ]
 
 
-def _task(bench: Bench, sensor: Scanner | Camera, *, variant: SettingVariant[S]) -> Task:
-    plan = bench.plan
-    frame = bench.frames[sensor.name][0]
-    start = sensor.frame_start_ns(frame)
-    xy = plan.trajectory.at(np.array([start, start + sensor.period_ns])).position[:, :2]
-    (x0, y0), (x1, y1) = xy.min(axis=0).tolist(), xy.max(axis=0).tolist()
-    return Task(
-        bench.scenes[variant.scene].path,
+def frame_cost(bench: Bench, sensor: Scanner | Camera, *, variant: Variant, frame: int) -> tuple[float, int]:
+    """CPU seconds of a whole frame as a drive simulates it, and the bytes of its points or images."""
+    world = bench.world(
         sensor,
-        variant.used,
-        plan.trajectory,
-        plan.actors if variant.traffic else None,
         frame,
-        region=(x0, y0, x1, y1),
-        margin=plan.max_range,
-        world=variant.world,
-        resolution=variant.resolution,
-        sun=bench.sun(start),
+        backend=FAST,
+        scene=variant.scene,
+        traffic=variant.traffic,
+        settings=variant.world,
     )
+    began = time.process_time()
+    if isinstance(sensor, Camera):
+        shot = bench.shot(sensor, frame)
+        size = _encode(image(shot, world=world, settings=variant.used, resolution=variant.resolution), sensor)
+    else:
+        sweep = swept(bench.plan, sensor, frame=frame, world=world, settings=variant.used)
+        size = int(records(cloud_table(report(*sweep))).nbytes)
+    return time.process_time() - began, size
+
+
+def _encode(frame: CameraImage, camera: Camera) -> int:
+    """Bytes of the images of a frame as PNG, as a drive writes them; optical flow is left out."""
+    images: dict[str, NDArray[np.uint8] | NDArray[np.uint16] | None] = {
+        "rgb": frame.rgb,
+        "depth": depth_to_counts(frame.depth),
+        "semantic": frame.klass,
+        "instance": feature_to_image(frame.feature),
+    }
+    written = (images.get(kind) for kind in camera.spec.images)
+    return sum(len(encode_png(pixels)) for pixels in written if pixels is not None)
+
+
+def peaks(bench: Bench, sensor: Scanner | Camera, *, variants: Sequence[Variant]) -> list[int]:
+    """Bytes by which a frame of each variant, with its world, raises the peak memory of a new process."""
+    first = bench.frames[sensor.name][:1]
+    bench = replace(bench, frames={sensor.name: first}, _worlds={})
+    method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"
+    context = multiprocessing.get_context(method)
+    if method == "forkserver":
+        context.set_forkserver_preload([__name__])  # imported once, not by each process
+    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as pool:
+        return list(pool.map(partial(_growth, bench=bench, sensor=sensor), variants))
+
+
+def _growth(variant: Variant, *, bench: Bench, sensor: Scanner | Camera) -> int:
+    before = peak_memory()
+    frame_cost(bench, sensor, variant=variant, frame=bench.frames[sensor.name][0])
+    return peak_memory() - before

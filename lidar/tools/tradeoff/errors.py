@@ -31,10 +31,14 @@ class PulseReturns(Columns):
     klass: NDArray[np.uint8]
     xyz: Float
 
+    def equals(self, other: PulseReturns) -> bool:
+        """Whether keys and points are the same."""
+        return np.array_equal(self.key, other.key) and np.array_equal(self.xyz, other.xyz)
+
 
 @dataclass(frozen=True, slots=True)
 class ErrorEstimate:
-    """A figure with a 95 % interval: of itself, or for the next drive (see `next_drive`)."""
+    """A figure with a 95 % interval."""
 
     value: float
     low: float
@@ -232,22 +236,6 @@ def resample(
             low, high = np.nanpercentile([one[name] for one in again], [2.5, 97.5])
             found[name] = ErrorEstimate(value, float(low), float(high))
     return found
-
-
-def next_drive(values: Sequence[float], *, least: float) -> ErrorEstimate:
-    """The typical error of drives, at least two, and the 95 % prediction interval for that of one more.
-
-    Errors of drives spread by factors, and their logarithms about as a normal distribution does: the interval
-    is Student's for one future observation of it (Hahn, G. J., Additional Factors for Calculating Prediction
-    Intervals for Samples from a Normal Distribution, J. Am. Stat. Assoc. 65, 1970). Errors below ``least``
-    count as that.
-    """
-    from scipy.special import stdtrit  # noqa: PLC0415  (0.2 s)
-
-    logs = np.log(np.maximum(values, least))
-    n, middle = len(logs), float(np.mean(logs))
-    reach = float(stdtrit(n - 1, 0.975)) * float(np.std(logs, ddof=1)) * (1 + 1 / n) ** 0.5
-    return ErrorEstimate(*np.exp([middle, middle - reach, middle + reach]).tolist())
 
 
 def median(values: Sequence[float], *, seed: int) -> ErrorEstimate:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,6 @@ from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.dataset.png import depth_to_counts, encode_png, feature_to_image
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.render import CameraImage, render
 from lidar.sensors.camera.settings import CameraSettings
@@ -65,14 +63,6 @@ class Pixels(Columns):
             self.klass.repeat(factor, axis=1).repeat(factor, axis=2),
         )
 
-    def reduced(self, factor: int) -> Pixels:
-        """Means of colours over squares of pixels; depth and class of the pixel nearest to their centres."""
-        n, b = self.depth.shape[:2]
-        squares = self.rgb.reshape(n, b // factor, factor, b // factor, factor, 3)
-        rgb = np.rint(squares.mean(axis=(2, 4))).astype(np.uint8)
-        middle = slice(factor // 2, None, factor)
-        return Pixels(rgb, self.depth[:, middle, middle], self.klass[:, middle, middle])
-
 
 def coarse(camera: CameraSpec, resolution: int) -> CameraSpec:
     """The same camera with one pixel for each square of ``resolution`` pixels' side."""
@@ -104,13 +94,6 @@ def blocks_of_frame(camera: CameraSpec, count: int, *, frame: int, seed: int) ->
     order = np.argsort((start + column * _STEPS[0] + row * _STEPS[1]) % 1.0, kind="stable")
     chosen = np.sort(order[:count])
     return (BLOCK * np.column_stack([column[chosen], row[chosen]])).astype(np.int64)
-
-
-def strip(shot: Shot, *, world: World, settings: CameraSettings, top: int, height: int) -> CameraImage:
-    """The rows of a frame from ``top`` on."""
-    spec = shot.camera.spec
-    window = replace(spec, height=height, cy=spec.cy - top)
-    return _render(shot, window, world=world, settings=settings, top=top)
 
 
 def pixels(
@@ -165,24 +148,3 @@ def image_error(found: Pixels, exact: Pixels) -> ImageError:
         changed=int(np.count_nonzero(found.klass != exact.klass)),
         pixels=both.size,
     )
-
-
-def encode_images(frame: CameraImage, camera: Camera) -> int:
-    """Bytes of the images of a frame as PNG, as a drive writes them; optical flow is left out."""
-    images: dict[str, NDArray[np.uint8] | NDArray[np.uint16] | None] = {
-        "rgb": frame.rgb,
-        "depth": depth_to_counts(frame.depth),
-        "semantic": frame.klass,
-        "instance": feature_to_image(frame.feature),
-    }
-    written = (images.get(kind) for kind in camera.spec.images)
-    return sum(len(encode_png(pixels)) for pixels in written if pixels is not None)
-
-
-def image_cost(
-    shot: Shot, *, world: World, settings: CameraSettings, resolution: int = 1
-) -> tuple[float, int]:
-    """CPU seconds of rendering and encoding a whole frame, and the bytes of its images."""
-    began = time.process_time()
-    size = encode_images(image(shot, world=world, settings=settings, resolution=resolution), shot.camera)
-    return time.process_time() - began, size

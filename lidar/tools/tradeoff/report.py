@@ -1,37 +1,28 @@
-"""The report of a comparison: terminal table, Pareto plot, HTML page and JSON."""
+"""The report of a comparison of settings: terminal tables, plots, HTML page and JSON."""
 
 from __future__ import annotations
 
-import html
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from geoscene.drawing.charts import (
-    Axes,
-    ChartPoint,
-    html_page,
-    html_picture,
-    html_table,
-    print_lines,
-    print_table,
-    scatter,
-)
+from geoscene.drawing.charts import Axes, ChartPoint, scatter
 from geoscene.drawing.figures import metres, share, size
+from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.files import write_atomically, write_json
-from lidar.tools.tradeoff.comparison import Kind, Listing, SensorComparison, VariantRow
-from lidar.tools.tradeoff.engine import DriveTradeoff
-from lidar.tools.tradeoff.errors import ErrorEstimate
-from lidar.tools.tradeoff.words import (
-    candidates,
+from lidar.tools.tradeoff.compare import DriveTradeoff
+from lidar.tools.tradeoff.comparison import (
+    Kind,
+    SensorComparison,
+    VariantRow,
     pareto,
-    reached,
+    ranked_error,
     recommendations,
-    residual_text,
+    reference_text,
     size_of,
-    tail_text,
 )
+from lidar.tools.tradeoff.errors import ErrorEstimate
 
 _RANKED: dict[Kind, str] = {
     "scanner": "range error at 99.9 %",
@@ -40,106 +31,77 @@ _RANKED: dict[Kind, str] = {
 
 NOISE = (
     "Random effects and the sensor's own imperfections are off in both: the error of a setting is not noise."
-    " 'alone' is the reference with only this setting changed."
+    " Alone: only this setting differs from the reference. Combined, the other errors: only this setting"
+    " differs from what you asked for."
 )
 
-
-def heads(kind: Kind) -> tuple[str, ...]:
-    """Headings of the table of a kind of sensor."""
-    errors = {
-        "scanner": (
-            *("range rms", "99 %", "99.9 % (95 % interval)", "max", "missed", "extra", "class"),
-            *("Chamfer", "Hausdorff 99.9 %"),
-        ),
-        "camera": (
-            *("RGB rms (95 % interval)", "99.9 %", "max", "depth rms", "99.9 %", "max", "with/without"),
-            "class",
-        ),
-    }
-    alone = {"scanner": "alone 99.9 %", "camera": "alone RGB rms"}
-    return ("setting", *errors[kind], alone[kind], "CPU s/s", "memory", "bytes/s", "note")
-
-
-def cells(row: VariantRow, comparison: SensorComparison) -> list[str]:
-    """Texts of a row of the table."""
-    e, c, kind = row.error, row.cost, comparison.kind
-    tail = e[comparison.tail]
-    interval = f"{size_of(tail.value, kind)} ({size_of(tail.low, kind)} to {size_of(tail.high, kind)})"
-    errors = {
-        "scanner": lambda: [
-            *(metres(e[name].value) for name in ("range_rms_m", "range_99_m")),
-            interval,
-            metres(e["range_max_m"].value),
-            *(share(e[name].value) for name in ("missed", "extra", "class_changes")),
-            *(metres(e[name].value) for name in ("chamfer_m", "hausdorff_99.9_m")),
-        ],
-        "camera": lambda: [
-            interval,
-            *(f"{e[name].value:.0f}" for name in ("rgb_99.9", "rgb_max")),
-            *(metres(e[name].value) for name in ("depth_rms_m", "depth_99.9_m", "depth_max_m")),
-            *(share(e[name].value) for name in ("depth_missing", "class_changes")),
-        ],
-    }
-    return [
-        row.label,
-        *errors[kind](),
-        size_of(row.alone[comparison.tail].value, kind) if row.alone else "",
-        _with_interval(c["cpu_s"]),
-        size(c["memory_bytes"].value),
-        size(c["bytes"].value),
-        row.note,
-    ]
-
-
-HEADINGS = {
-    "rms_m": "rms",
-    "99.9_m": "99.9 %",
-    "max_m": "max",
-    "back_max_m": "back, max",
-    "bound_m": "bound",
-    "height_max_m": "height, max",
-    "scale_ppm": "scale",
-    "per_point_bytes": "bytes/point",
-    "share": "points",
-    "bytes": "size",
-    "write_s": "write",
-    "read_s": "read",
-    "thin_s": "thin",
+_SCANNER_ERRORS: dict[str, tuple[str, Callable[[float], str]]] = {
+    "range rms": ("range_rms_m", metres),
+    "99 %": ("range_99_m", metres),
+    "99.9 % (95 % interval)": ("range_99.9_m", metres),
+    "max": ("range_max_m", metres),
+    "missed": ("missed", share),
+    "extra": ("extra", share),
+    "class": ("class_changes", share),
+    "Chamfer": ("chamfer_m", metres),
+    "Hausdorff 99.9 %": ("hausdorff_99.9_m", metres),
 }
-"""Headings of figures of listings, by name."""
+
+_CAMERA_ERRORS: dict[str, tuple[str, Callable[[float], str]]] = {
+    "RGB rms (95 % interval)": ("rgb_rms", lambda value: size_of(value, "camera")),
+    "99.9 %": ("rgb_99.9", lambda value: f"{value:.0f}"),
+    "max": ("rgb_max", lambda value: f"{value:.0f}"),
+    "depth rms": ("depth_rms_m", metres),
+    "depth 99.9 %": ("depth_99.9_m", metres),
+    "depth max": ("depth_max_m", metres),
+    "with/without": ("depth_missing", share),
+    "class": ("class_changes", share),
+}
 
 
-def figure(name: str, value: float) -> str:
-    """A figure of a listing in the unit that its name ends in."""
-    unit = name.rpartition("_")[2]
-    texts: dict[str, Callable[[float], str]] = {
-        "m": metres,
-        "ppm": lambda v: f"{v:+.3g} ppm",
-        "bytes": lambda v: size(v) if v >= 1000 else f"{v:.3g} B",
-        "share": share,
-        "s": lambda v: f"{v:.2g} s",
-    }
-    return texts[unit](value)
+def columns_of(comparison: SensorComparison) -> list[Column[VariantRow]]:
+    """Columns of the table of a sensor."""
+    kind, tail = comparison.kind, comparison.tail
 
+    def alone(row: VariantRow) -> str:
+        return size_of(row.alone[tail].value, kind) if row.alone else ""
 
-def table_of(listing: Listing) -> tuple[list[str], list[list[str]]]:
-    """Headings and rows of a listing; figures that a row lacks are empty."""
-    names = [name for name in HEADINGS if any(name in r.figures for r in listing.records)]
-    rows = [
-        [r.label, *(figure(n, r.figures[n]) if n in r.figures else "" for n in names), r.note]
-        for r in listing.records
+    return [
+        Column("setting", lambda row: row.label),
+        *(
+            _error_column(head, name, text=text, interval=name == tail)
+            for head, (name, text) in (_SCANNER_ERRORS if kind == "scanner" else _CAMERA_ERRORS).items()
+        ),
+        Column("alone 99.9 %" if kind == "scanner" else "alone RGB rms", alone),
+        Column("CPU s/s", lambda row: _with_interval(row.cost["cpu_s"], text=lambda v: f"{v:.3g}")),
+        Column("memory", lambda row: size(row.cost["memory_bytes"].value)),
+        Column("bytes/s", lambda row: size(row.cost["bytes"].value)),
+        Column("note", lambda row: row.note),
     ]
-    return [listing.name, *(HEADINGS[n] for n in names), "note"], rows
 
 
-def _with_interval(cost: ErrorEstimate) -> str:
-    return f"{cost.value:.3g} ({cost.low:.3g} to {cost.high:.3g})"
+def _error_column(
+    head: str, name: str, *, text: Callable[[float], str], interval: bool
+) -> Column[VariantRow]:
+    """The column of a figure of combined errors, with its interval where settings are ranked by it."""
+    if interval:
+        return Column(head, lambda row: _with_interval(row.error[name], text=text))
+    return Column(head, lambda row: text(row.error[name].value))
+
+
+def _with_interval(figure: ErrorEstimate, *, text: Callable[[float], str]) -> str:
+    return f"{text(figure.value)} ({text(figure.low)} to {text(figure.high)})"
 
 
 def headline(comparison: SensorComparison) -> str:
-    """What was compared."""
-    what = "pulses" if comparison.kind == "scanner" else "pixels"
-    return f"{comparison.sensor}: {comparison.samples:,} {what} of {comparison.frames} frames"
+    """The sensor and the size of the sample."""
+    samples = "pulses" if comparison.kind == "scanner" else "pixels"
+    return f"{comparison.sensor}: {comparison.samples:,} {samples} of {comparison.frames} frames"
+
+
+def sensor_table(comparison: SensorComparison) -> ReportTable:
+    """The table of a sensor."""
+    return table_of(columns_of(comparison), comparison.rows, title=headline(comparison))
 
 
 def georeferencing_text(found: DriveTradeoff) -> str:
@@ -152,16 +114,13 @@ def georeferencing_text(found: DriveTradeoff) -> str:
     return f"Georeferencing: the affine map is within {metres(worst)} of the full projection (`exact`)."
 
 
-def print_tables(found: DriveTradeoff) -> None:
-    """Print the tables and recommendations."""
+def to_text(found: DriveTradeoff) -> str:
+    """Tables and recommendations."""
+    parts = []
     for comparison in found.comparisons:
-        rows = [cells(row, comparison) for row in comparison.rows]
-        print_table(heads(comparison.kind), rows, title=headline(comparison))
-        print_lines([residual_text(comparison), tail_text(comparison), *recommendations(comparison)])
-    for listing in found.listings:
-        print_table(*table_of(listing), title=listing.title)
-        print_lines([listing.note])
-    print_lines([georeferencing_text(found), NOISE])
+        parts.append(sensor_table(comparison).to_text())
+        parts.append("\n".join([reference_text(comparison), *recommendations(comparison)]))
+    return "\n\n".join(filter(None, [*parts, georeferencing_text(found), NOISE]))
 
 
 def document(found: DriveTradeoff) -> dict[str, Any]:
@@ -177,15 +136,6 @@ def document(found: DriveTradeoff) -> dict[str, Any]:
         "duration_s": plan.trajectory.duration_ns / 1e9,
         "sensors": [_sensor_json(c) for c in found.comparisons],
         "georeferencing": found.georeferencing,
-        "tables": [
-            {
-                "name": listing.name,
-                "title": listing.title,
-                "note": listing.note,
-                "rows": [{"row": r.label, **r.figures, "note": r.note} for r in listing.records],
-            }
-            for listing in found.listings
-        ],
         "note": NOISE,
     }
 
@@ -213,35 +163,43 @@ def _sensor_json(comparison: SensorComparison) -> dict[str, Any]:
     }
 
 
-def _json_of(figures: dict[str, ErrorEstimate]) -> dict[str, Any]:
+def _json_of(figures: Mapping[str, ErrorEstimate]) -> dict[str, Any]:
     return {name: figure.to_json() for name, figure in figures.items()}
 
 
 def write_report(found: DriveTradeoff, out: Path) -> None:
     """Write ``tradeoff.json``, ``tradeoff.html`` and a plot for each sensor into a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    plots = []
+    scene = found.plan.scene
+    page = Page(f"Speed against accuracy: {scene.manifest['name'] or scene.location}")
     for comparison in found.comparisons:
-        plots.append(pareto_plot(comparison))
-        write_atomically(out / f"pareto_{comparison.sensor.split()[0]}.png", plots[-1])
-    write_atomically(out / "tradeoff.html", _page(found, plots))
+        picture = pareto_plot(comparison)
+        page.paragraph(reference_text(comparison))
+        page.points(recommendations(comparison))
+        page.table(sensor_table(comparison))
+        page.picture(picture, alt="error against cost")
+        write_atomically(out / f"pareto_{comparison.sensor.split()[0]}.png", picture)
+    page.paragraph(georeferencing_text(found))
+    page.paragraph(NOISE)
+    write_atomically(out / "tradeoff.html", page.encoded())
     write_json(out / "tradeoff.json", document(found))
 
 
 def pareto_plot(comparison: SensorComparison) -> bytes:
     """A PNG: error against CPU time.
 
-    Settings that miss or add too many returns are not drawn, see `words.reached`.
+    Settings that miss or add too many returns are not drawn, see `comparison.ranked_error`.
     """
     kind, best = comparison.kind, pareto(comparison)
-    points, hidden = [], 0
-    for row in candidates(comparison):
-        hidden += not math.isfinite(reached(comparison, row))
+    choices = [row for row in comparison.rows if row.choice]
+    drawn = [row for row in choices if math.isfinite(ranked_error(comparison, row))]
+    points = []
+    for row in drawn:
         cost, error = row.cost["cpu_s"], row.error[comparison.tail]
-        if math.isfinite(reached(comparison, row)):
-            name = row.label.partition(" (")[0]
-            cpu, away = (cost.low, cost.high), (error.low, error.high)
-            points.append(ChartPoint(name, cost.value, error.value, row in best, cpu, away))
+        name = row.label.partition(" (")[0]
+        cpu, interval = (cost.low, cost.high), (error.low, error.high)
+        points.append(ChartPoint(name, cost.value, error.value, row in best, cpu, interval))
+    hidden = len(choices) - len(drawn)
     left_out = f"; {hidden} settings that miss or add returns are not drawn" if hidden else ""
     axes = Axes(
         headline(comparison) + left_out,
@@ -250,23 +208,3 @@ def pareto_plot(comparison: SensorComparison) -> bytes:
         lambda value: size_of(value, kind),
     )
     return scatter(points, axes)
-
-
-def _page(found: DriveTradeoff, plots: Sequence[bytes]) -> bytes:
-    """A self-contained HTML page."""
-    parts = []
-    for comparison, plot in zip(found.comparisons, plots, strict=True):
-        said = "".join(f"<li>{html.escape(text)}</li>" for text in recommendations(comparison))
-        rows = [cells(row, comparison) for row in comparison.rows]
-        parts.append(
-            f"<h2>{html.escape(headline(comparison))}</h2><p>{html.escape(residual_text(comparison))}"
-            f" {html.escape(tail_text(comparison))}</p>"
-            f"<ul>{said}</ul>{html_table(heads(comparison.kind), rows)}"
-            f"{html_picture(plot, alt='error against cost')}"
-        )
-    for listing in found.listings:
-        title, note = html.escape(listing.title), html.escape(listing.note)
-        parts.append(f"<h2>{title}</h2><p>{note}</p>{html_table(*table_of(listing))}")
-    parts += [f"<p>{html.escape(text)}</p>" for text in (georeferencing_text(found), NOISE)]
-    scene = found.plan.scene
-    return html_page(f"Speed against accuracy: {scene.manifest['name'] or scene.location}", "".join(parts))

@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from geoscene.drawing.figures import metres, share
+from geoscene.drawing.figures import levels, metres, share
 from lidar.options import AccuracyTarget
+from lidar.tools.tradeoff.comparison import LOST
 from lidar.tools.tradeoff.errors import ErrorEstimate
-from lidar.tools.tradeoff.words import LOST, levels
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class SensorErrors:
     ranges  : of scanners, metres
     depths  : of cameras, metres
     colours : of cameras, levels of 255, rms
-    lost    : of scanners, missed and extra returns over all, where they are more than `words.LOST`
+    lost    : of scanners, missed and extra returns over all, where they are more than `comparison.LOST`
     """
 
     percent: float

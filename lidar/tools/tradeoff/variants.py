@@ -1,4 +1,4 @@
-"""Settings to compare: the user's with some of them changed, and the reference."""
+"""Settings to compare: the user's, these with some of them changed, and the reference."""
 
 from __future__ import annotations
 
@@ -51,23 +51,16 @@ WORLD_VALUES: dict[str, tuple[Any, ...]] = {
 }
 """Values of the world's settings that are compared, by setting."""
 
-KINDS = ("forests", "trees", "furniture", "barriers")
-"""Settings that leave kinds of objects out of the world."""
-
 OF_EMBREE = frozenset({"precision", "retrace", "origin"})
 """Settings that act on Embree's float32 rays only: alone, they are cast by Embree."""
 
 MODELS = frozenset({"mirrors", "foliage", "haze", "relief"})
 """Settings that change what is modelled: the difference that they make is no error."""
 
-CHEAPER: tuple[tuple[tuple[str, Any], ...], ...] = (
-    (("precision", "float32"),),
-    (("reach", 50.0),),
-    (("forests", False),),
-)
+CHEAPER: tuple[tuple[str, Any], ...] = (("precision", "float32"), ("reach", 50.0), ("forests", False))
 """Changes that combinations make to a scanner's number of rays, one after the other."""
 
-CHEAPER_IMAGES: tuple[tuple[tuple[str, Any], ...], ...] = ((("resolution", 2),), (("shadows", False),))
+CHEAPER_IMAGES: tuple[tuple[str, Any], ...] = (("resolution", 2), ("shadows", False))
 """Changes that combinations make to a camera's number of rays, one after the other."""
 
 SAMPLES = 16
@@ -122,9 +115,9 @@ class SettingVariant(Generic[S]):
 
 @dataclass(frozen=True, slots=True)
 class Basis(Generic[S]):
-    """What variants are made of.
+    """Settings of which variants are made.
 
-    used  : the user's settings, without random effects
+    used  : the user's, without random effects
     exact : the reference's
     world : the user's settings of the world
     built : relief of the scene, of `geoscene.relief.RELIEFS`
@@ -134,6 +127,11 @@ class Basis(Generic[S]):
     exact: S
     world: WorldSettings = WHOLE
     built: str = "off"
+
+    @property
+    def values(self) -> dict[str, tuple[Any, ...]]:
+        """Values of the sensor's settings that are compared, by setting; the first setting counts rays."""
+        return SCANNER_VALUES if isinstance(self.used, ScannerSettings) else CAMERA_VALUES
 
     def variant(
         self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
@@ -166,9 +164,10 @@ class Basis(Generic[S]):
             values = [value for value in values if value in RELIEFS[: RELIEFS.index(self.built) + 1]]
         return [value for value in values if value != self.value(name)]
 
-    def described(self, values: Mapping[str, Any]) -> str:
+    @property
+    def label(self) -> str:
         """The user's values: of the sensor's settings all, of the world's those that leave something out."""
-        shown = [n for n in values if hasattr(self.used, n)]
+        shown = [n for n in self.values if hasattr(self.used, n)]
         shown += [n for n in WORLD_VALUES if getattr(self.world, n) != getattr(WHOLE, n)]
         return ", ".join(f"{name}={value_text(self.value(name))}" for name in shown)
 
@@ -185,7 +184,7 @@ def _change(settings: _Any, values: Mapping[str, Any]) -> _Any:
 def noiseless(settings: ScannerSettings) -> ScannerSettings:
     """The settings without random effects and without the sensor's own imperfections.
 
-    What decides which surfaces are seen stays: incidence law, extinction, threshold, mirrors and foliage.
+    Settings that decide which surfaces are seen stay: incidence law, extinction, threshold, mirrors, foliage.
     """
     return replace(
         settings,
@@ -205,9 +204,17 @@ def noiseless(settings: ScannerSettings) -> ScannerSettings:
     )
 
 
-def reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
+def scanner_reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
     """The reference of settings: a pose for every firing and a dense footprint; cast it in float64."""
     return replace(noiseless(settings), poses="firing", precision="exact", retrace=True, rays=rays)
+
+
+def camera_reference(settings: CameraSettings, *, exposed: bool) -> CameraSettings:
+    """The reference of settings, with shadows and detail; ``exposed`` if the exposure lasts some time."""
+    exact = replace(settings, camera_noise=False, precision="exact", retrace=True, shadows=True, detail=True)
+    return (
+        replace(exact, supersample=BLURRED, blur=MOMENTS) if exposed else replace(exact, supersample=SAMPLES)
+    )
 
 
 def next_step(rays: int) -> int:
@@ -215,80 +222,21 @@ def next_step(rays: int) -> int:
     return min(rays + rays // 2 + rays % 2, MOST_RAYS)
 
 
-def scanner_basis(
-    settings: ScannerSettings, *, rays: int, world: WorldSettings = WHOLE, built: str = "off"
-) -> Basis[ScannerSettings]:
-    """The basis of variants of a scanner; ``rays`` are the reference's, ``built`` is the scene's relief."""
-    return Basis(noiseless(settings), reference(settings, rays=rays), world, built)
-
-
-def scanner_variants(
-    basis: Basis[ScannerSettings],
-    *,
-    compared: Sequence[str] = (),
-    scenes: Sequence[str] = (),
-    traffic: bool = False,
-) -> list[SettingVariant[ScannerSettings]]:
-    """The user's settings, these with one of them changed, and combinations of cheap ones.
-
-    compared : names of settings; all by default
-    scenes   : labels of the scenes after the first
-    traffic  : whether there are other road users, to be left out in one variant
-    """
-    rows = _variants(
-        basis, SCANNER_VALUES, compared=compared, scenes=scenes, traffic=traffic, cheaper=CHEAPER
-    )
-    return [row for row in rows if row.used.rays < basis.exact.rays or not row.changes]
-
-
-def camera_basis(
-    settings: CameraSettings, *, exposed: bool, world: WorldSettings = WHOLE, built: str = "off"
-) -> Basis[CameraSettings]:
-    """The basis of variants of a camera.
-
-    exposed : whether its exposure lasts some time
-    built   : relief of the scene
-    """
-    used = replace(settings, camera_noise=False)
-    exact = replace(used, precision="exact", retrace=True, shadows=True, detail=True)
-    if exposed:
-        return Basis(used, replace(exact, supersample=BLURRED, blur=MOMENTS), world, built)
-    return Basis(used, replace(exact, supersample=SAMPLES), world, built)
-
-
 def coarser(settings: CameraSettings) -> CameraSettings:
     """A reference with about half as many rays per pixel, which shows whether it has converged."""
     return replace(settings, supersample=round(settings.supersample / 2**0.5))
 
 
-def camera_variants(
-    basis: Basis[CameraSettings],
-    *,
-    compared: Sequence[str] = (),
-    scenes: Sequence[str] = (),
-    traffic: bool = False,
-) -> list[SettingVariant[CameraSettings]]:
-    """As `scanner_variants`, of a camera."""
-    return _variants(
-        basis,
-        CAMERA_VALUES,
-        compared=compared,
-        scenes=scenes,
-        traffic=traffic,
-        cheaper=CHEAPER_IMAGES,
-    )
-
-
-def _variants(
-    basis: Basis[S],
-    values: Mapping[str, Sequence[Any]],
-    *,
-    compared: Sequence[str],
-    scenes: Sequence[str],
-    traffic: bool,
-    cheaper: Sequence[Sequence[tuple[str, Any]]],
+def variants_of(
+    basis: Basis[S], *, compared: Sequence[str] = (), scenes: Sequence[str] = (), traffic: bool = False
 ) -> list[SettingVariant[S]]:
-    """Variants of settings of a sensor, whose first one counts its rays, and of the world."""
+    """The user's settings, these with one setting changed, and combinations of cheap ones.
+
+    compared : names of settings; all by default
+    scenes   : labels of the scenes after the first
+    traffic  : whether there are other road users, to be left out in one variant
+    """
+    values = basis.values
     chosen = {n: v for n, v in {**values, **WORLD_VALUES}.items() if not compared or n in compared}
     rows = [basis.variant()]
     rows += [
@@ -300,18 +248,23 @@ def _variants(
         rows += [basis.variant([("scene", text)], scene=k + 1) for k, text in enumerate(scenes)]
     if traffic and (not compared or "traffic" in compared):
         rows.append(basis.variant([("traffic", False)], traffic=False))
-    first = next(iter(values))
-    steps = [
-        [(name, value) for name, value in step if name in chosen and value != basis.value(name)]
-        for step in cheaper
-    ]
+    first = next(iter(values))  # counts rays
+    cheaper = CHEAPER if isinstance(basis.used, ScannerSettings) else CHEAPER_IMAGES
     for value in chosen.get(first, ()):
-        changes = [] if value == basis.value(first) else [(first, value)]
-        for step in filter(None, steps):
-            changes = changes + step
-            if len(changes) > 1:
-                rows.append(basis.variant(changes))
-    return rows
+        changes: list[tuple[str, Any]] = [] if value == basis.value(first) else [(first, value)]
+        for name, cheap in cheaper:
+            if name in chosen and cheap != basis.value(name):
+                changes = [*changes, (name, cheap)]
+                if len(changes) > 1:
+                    rows.append(basis.variant(changes))
+    return [row for row in rows if _fewer_rays(row.used, basis.exact) or not row.changes]
+
+
+def _fewer_rays(one: S, exact: S) -> bool:
+    """Whether settings of a scanner have fewer rays than the reference; true of cameras."""
+    if isinstance(one, ScannerSettings) and isinstance(exact, ScannerSettings):
+        return one.rays < exact.rays
+    return True
 
 
 def without_each(basis: Basis[S], variant: SettingVariant[S]) -> Iterator[tuple[str, SettingVariant[S]]]:

@@ -1,32 +1,31 @@
-"""Drives to an accuracy or within a budget: texts, choice, stored profiles, recipes, spot checks."""
+"""Drives to an accuracy or within a budget: texts, search, recipes, spot checks."""
 
 import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from helpers.profiles import measure_little
 from helpers.programs import run_program
+from helpers.samples import measure_little
 from helpers.scenes import same_files
 
+from geoscene.support.progress import silent
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
 from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
 from lidar.simulation.drive import DriveSummary, drive
 from lidar.simulation.plan import plan_drive
 from lidar.tools.sweep import sweep
-from lidar.tools.tradeoff import accuracy, profile
-from lidar.tools.tradeoff.accuracy import CheckedDrive, Planned, driven, pace_of, pick_settings
-from lidar.tools.tradeoff.choice import Wanted, choice, worst
-from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, next_drive, resample
-from lidar.tools.tradeoff.profile import Candidate, Profile, profile_of
-from lidar.tools.tradeoff.profile_errors import drive_estimates
-from lidar.tools.tradeoff.sampling import SampledError, range_figures, sampled_error
+from lidar.tools.tradeoff import ladders, search
+from lidar.tools.tradeoff.accuracy import CheckedDrive, SpotCheck, driven, pick_settings
+from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, resample
+from lidar.tools.tradeoff.ladders import Ladder, settings_of_rows
+from lidar.tools.tradeoff.sample import DriveSample, SampledError, range_figures, sampled_error
+from lidar.tools.tradeoff.search import DriveCost, find_accurate, find_affordable, pace_of
 from lidar.tools.tradeoff.sensor_errors import SensorErrors, stated
-from lidar.tools.tradeoff.spot import SpotCheck
-from lidar.traffic.populate import TrafficOptions
 
 DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=("pcd",))
 
@@ -94,130 +93,176 @@ def around(error, *, least=0.5, most=2.0):
     return ErrorEstimate(error, least * error, most * error)
 
 
-def candidate(rays, cpu, *errors):
-    """A candidate of scanners with these errors, which reach twice as far up; ten times less at 99 %."""
+class FakeSample:
+    """Errors of rows whose intervals halve when the sample grows beyond a number of frames."""
+
+    complete = False
+    counts = {"sensor": 0}  # noqa: RUF012
+
+    def __init__(self, rows, *, narrow_from=10**9):
+        self.settings, self.frames, self.narrow_from = rows, 0, narrow_from
+
+    def grow(self, frames):
+        self.frames = frames
+
+    def figures(self, row):
+        factor = 1.0 if self.frames < self.narrow_from else 0.5
+        return {
+            sensor: {name: replace(e, high=max(e.value, factor * e.high)) for name, e in figures.items()}
+            for sensor, figures in self.settings[row].items()
+        }
+
+
+class FakeSearch:
+    """A search with given errors and costs."""
+
+    plan = SimpleNamespace(options=DRIVE)
+
+    def __init__(self, ladders, *, rows, cpu, **more):
+        self.ladders = ladders
+        self.samples = {kind: FakeSample(of, **more) for kind, of in rows.items()}
+        self.cpu = cpu
+
+    def sample(self, kind):
+        return self.samples[kind]
+
+    def cost(self, rows):
+        cpu = sum(self.cpu[kind][row] for kind, row in rows.items())
+        return DriveCost(around(cpu, least=0.9, most=1.1), 0.1)
+
+
+SCANNER = SimpleNamespace(spec=SimpleNamespace(images=("rgb", "depth")))
+RAYS = Ladder("scanners", (SCANNER,), ("rays",), ((1,), (7,), (19,)))
+PIXELS = Ladder("cameras", (SCANNER,), ("supersample",), ((1,), (2,), (3,)))
+
+
+def scanner_row(*errors):
+    """Figures of scanners with these errors at 99.9 %, twice as much at the upper end; a tenth at 99 %."""
     figures = [{"range_99_m": around(e / 10), "range_99.9_m": around(e)} for e in errors]
-    cost = around(cpu, least=0.9, most=1.1)
-    return Candidate({"rays": rays}, {f"scanner_{k}": of for k, of in enumerate(figures)}, cost)
+    return {f"scanner_{k}": of for k, of in enumerate(figures)}
 
 
-def camera_candidate(rays, cpu, levels):
-    """A candidate of a camera of colours and depths, whose depths err by 2 mm, up to 4 mm."""
-    figures = {"rgb_rms": around(levels), "depth_99.9_m": around(0.002)}
-    return Candidate({"supersample": rays}, {"eye": figures}, around(cpu, least=0.9, most=1.1))
+def camera_row(levels):
+    """Figures of a camera of colours and depths, whose depths err by 2 mm, up to 4 mm."""
+    return {"eye": {"rgb_rms": around(levels), "depth_99.9_m": around(0.002)}}
 
 
-PROFILE = Profile(
-    Path("profile.json"),
-    (candidate(1, 0.1, 0.1, 0.2), candidate(7, 0.4, 0.02, 0.04), candidate(19, 0.9, 0.004, 0.009)),
-    (),
-    drives=12,
-    load_s=ErrorEstimate(0.1, 0.1, 0.1),
-)
-CAMERAS = (camera_candidate(1, 0.3, 4.0), camera_candidate(2, 0.7, 1.0), camera_candidate(3, 2.0, 0.5))
-BOTH = replace(PROFILE, cameras=CAMERAS)
+ROWS = {
+    "scanners": [scanner_row(0.1, 0.2), scanner_row(0.02, 0.04), scanner_row(0.004, 0.009)],
+    "cameras": [camera_row(4.0), camera_row(1.0), camera_row(0.5)],
+}
+CPU = {"scanners": (0.1, 0.4, 0.9), "cameras": (0.3, 0.7, 2.0)}
 
 
-def wanted(accuracy="", budget="", **more):
-    return Wanted(
-        read_accuracy(accuracy) if accuracy else None,
-        pace=read_budget(budget) if budget else 0.0,
-        budget=budget,
-        **more,
-    )
+def search_of(*ladders, **more):
+    return FakeSearch({ladder.kind: ladder for ladder in ladders}, rows=ROWS, cpu=CPU, **more)
 
 
-@pytest.mark.parametrize(
-    ("accuracy", "budget", "rays"),
-    [
-        ("0.5m", "", 1),
-        ("40cm", "", 1),  # the upper end of the worse scanner
-        ("39cm", "", 7),
-        ("8cm", "", 7),
-        ("5cm", "", 19),  # 7 rays have 4 cm, up to 8 cm
-        ("1cm@99", "", 7),
-        ("", "9x-realtime", 1),
-        ("", "2.2x-realtime", 7),
-        ("", "2.3x-realtime", 1),  # the upper end of the cost
-        ("", "0.1x-realtime", 19),
-        ("40cm", "0.1x-realtime", 1),
-        ("8cm", "2x-realtime", 7),
-    ],
-)
-def test_the_first_that_is_enough_or_the_last_that_is_affordable_is_chosen(accuracy, budget, rays):
-    assert choice(PROFILE, wanted(accuracy, budget)).settings == {"rays": rays}
+def accurate(text, *ladders, **more):
+    search = search_of(*ladders, **more)
+    return settings_of_rows(search.ladders, find_accurate(search, read_accuracy(text)))
+
+
+def affordable(budget, *ladders, workers=1):
+    search = search_of(*ladders)
+    rows = find_affordable(search, budget=budget, pace=read_budget(budget), workers=workers)
+    return settings_of_rows(search.ladders, rows)
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "budget", "settings"),
+    ("text", "rays"),
     [
-        ("3levels", "", {"supersample": 2}),
-        ("8levels", "", {"supersample": 1}),
-        ("1.9levels", "", {"supersample": 3}),
-        ("8cm", "", {"rays": 7}),
-        ("8cm,3levels", "", {"rays": 7, "supersample": 2}),
-        ("", "2x-realtime", {"rays": 1, "supersample": 1}),
-        ("", "1.2x-realtime", {"rays": 7, "supersample": 1}),  # the cheaper step is taken first
-        ("", "0.7x-realtime", {"rays": 7, "supersample": 2}),
-        ("", "0.1x-realtime", {"rays": 19, "supersample": 3}),
+        ("0.5m", 1),
+        ("40cm", 1),  # the upper end of the worse scanner
+        ("39cm", 7),
+        ("8cm", 7),
+        ("5cm", 19),  # 7 rays have 4 cm, up to 8 cm
+        ("1cm@99", 7),
     ],
 )
-def test_rigs_with_scanners_and_cameras_have_both_picked(accuracy, budget, settings):
-    assert choice(BOTH, wanted(accuracy, budget)).settings == settings
+def test_the_first_row_whose_upper_end_is_within_the_accuracy_is_picked(text, rays):
+    assert accurate(text, RAYS) == {"rays": rays}
 
 
-def test_what_is_given_is_neither_picked_nor_forgotten():
-    one = choice(BOTH, wanted("8cm", given={"supersample": 2}))
-    assert (one.settings, one.cpu_s.value) == ({"rays": 7}, pytest.approx(1.1))
-    fixed = choice(BOTH, wanted("", "0.1x-realtime", free=("scanners",), given={"supersample": 2}))
-    assert fixed.settings == {"rays": 19}
+def test_a_sample_grows_until_it_answers():
+    assert accurate("1cm", RAYS, narrow_from=6) == {"rays": 19}  # 9 mm, at first up to 18 mm
+    growing = search_of(RAYS)
+    with pytest.raises(InputError, match=r"rays=19 comes nearest with 9 mm .4.5 mm to 1.8 cm.: give 1.8 cm"):
+        find_accurate(growing, read_accuracy("1cm"))
+    assert growing.samples["scanners"].frames == search.SAMPLES[-1]
+    hopeless = search_of(RAYS)
+    with pytest.raises(InputError, match="no number of rays is sure to reach 1 mm"):
+        find_accurate(hopeless, read_accuracy("1mm"))
+    assert hopeless.samples["scanners"].frames == search.SAMPLES[0]
+
+
+@pytest.mark.parametrize(
+    ("budget", "rays"),
+    [("9x-realtime", 1), ("2.2x-realtime", 7), ("2.3x-realtime", 1), ("0.1x-realtime", 19)],
+)
+def test_the_last_row_whose_upper_end_is_within_the_budget_is_picked(budget, rays):
+    assert affordable(budget, RAYS) == {"rays": rays}
+
+
+@pytest.mark.parametrize(
+    ("text", "settings"),
+    [
+        ("3levels", {"rays": 1, "supersample": 2}),
+        ("8levels", {"rays": 1, "supersample": 1}),
+        ("1.9levels", {"rays": 1, "supersample": 3}),
+        ("8cm,3levels", {"rays": 7, "supersample": 2}),
+    ],
+)
+def test_rigs_with_scanners_and_cameras_have_both_picked(text, settings):
+    assert accurate(text, RAYS, PIXELS) == settings
+
+
+@pytest.mark.parametrize(
+    ("budget", "settings"),
+    [
+        ("2x-realtime", {"rays": 1, "supersample": 1}),
+        ("1.2x-realtime", {"rays": 7, "supersample": 1}),  # the cheaper step is taken first
+        ("0.7x-realtime", {"rays": 7, "supersample": 2}),
+        ("0.1x-realtime", {"rays": 19, "supersample": 3}),
+    ],
+)
+def test_the_cheaper_step_is_taken_first(budget, settings):
+    assert affordable(budget, RAYS, PIXELS) == settings
+
+
+def test_settings_that_are_given_are_not_picked():
+    fixed = replace(PIXELS, names=(), rows=((),))
+    assert accurate("8cm", RAYS, fixed) == {"rays": 7}
+    assert affordable("0.1x-realtime", RAYS, fixed) == {"rays": 19}
 
 
 def test_depths_need_no_setting_and_are_refused_beyond_what_files_hold():
-    eye = replace(BOTH, scanners=())
-    assert choice(eye, wanted("1cm")).settings == {}
+    assert accurate("1cm", replace(PIXELS, names=(), rows=((),))) == {}
     with pytest.raises(
-        InputError, match=r"no image of depths is sure .* that of eye comes nearest .*give 4 mm or more"
+        InputError, match=r"no image is sure .* of the depths; it comes nearest .*: give 4 mm"
     ):
-        choice(eye, wanted("3mm"))
+        accurate("3mm", replace(PIXELS, names=(), rows=((),)))
 
 
-@pytest.mark.parametrize(
-    ("accuracy", "budget", "line"),
-    [
-        ("1cm", "", r"rays=19 comes nearest with 9 mm \(4.5 mm to 1.8 cm\): give 1.8 cm or more"),
-        ("", "10x-realtime", "even rays=1 is simulated at 9.1 x real time with 1 worker"),
-        (
-            "5cm",
-            "2x-realtime",
-            "takes rays=19, simulated at 1 x real time.*allows rays=7, with errors of 4 cm",
-        ),
-    ],
-)
-def test_what_none_reaches_is_one_line_with_the_nearest(accuracy, budget, line):
-    with pytest.raises(InputError, match=line):
-        choice(PROFILE, wanted(accuracy, budget))
-
-
-def test_colours_that_none_reaches_are_one_line_with_the_nearest():
+def test_budgets_and_colours_that_none_reaches_are_one_line_with_the_nearest():
+    with pytest.raises(InputError, match=r"even rays=1 is simulated at 9\.1 x real time with 1 worker"):
+        affordable("10x-realtime", RAYS)
     with pytest.raises(
         InputError, match=r"supersample=3 comes nearest with 0.5 levels .*: give 1 level or more"
     ):
-        choice(BOTH, wanted("0.9levels"))
+        accurate("0.9levels", PIXELS)
 
 
 def test_more_workers_afford_more(monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 4)
-    every = [choice(PROFILE, wanted(budget="2x-realtime", workers=w)).settings["rays"] for w in (1, 2, 9)]
-    assert every == [7, 19, 19]
+    assert [affordable("2x-realtime", RAYS, workers=w)["rays"] for w in (1, 2, 9)] == [7, 19, 19]
 
 
-def test_errors_that_are_given_as_the_nearest_are_enough():
-    best = 0.0123456
-    profile = replace(PROFILE, scanners=(candidate(1, 0.1, best / 2),))
+def test_errors_that_are_given_as_the_nearest_are_enough(monkeypatch):
+    monkeypatch.setitem(ROWS, "scanners", [scanner_row(0.00617)] * 3)
     with pytest.raises(InputError, match=r"give 1.3 cm or more"):
-        choice(profile, wanted("1cm"))
-    assert choice(profile, wanted("1.3cm")).settings == {"rays": 1}
+        accurate("1cm", RAYS)
+    assert accurate("1.3cm", RAYS) == {"rays": 1}
 
 
 def returns(rows, ranges):
@@ -265,126 +310,53 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
         assert one.low <= one.value <= one.high
 
 
-def frame_of(error):
-    return SampledError(np.full(50, error), np.ones(50), missed=0.0, extra=0.0, returns=50.0)
-
-
-def test_intervals_are_of_the_next_drive_or_of_the_frames_of_one():
-    errors = (0.01, 0.02, 0.03, 0.1)
-    frames = [(k, frame_of(error)) for k, error in enumerate(errors) for _ in range(8)]
-    of_next = drive_estimates(frames, figures=range_figures)["range_50_m"]
-    of_one = drive_estimates([(0, frame) for _, frame in frames], figures=range_figures)["range_50_m"]
-    assert of_next == next_drive(errors, least=1e-6)
-    assert of_next.value == pytest.approx(np.exp(np.log(errors).mean()))
-    assert of_one.high <= 0.1 < of_next.high
-
-
-def test_drives_without_returns_tell_nothing():
-    empty = SampledError(np.empty(0), np.empty(0), missed=0.0, extra=0.0, returns=0.0)
-    frames = [(k, frame_of(error)) for k, error in enumerate((0.01, 0.02, 0.03))]
-    assert drive_estimates([*frames, (3, empty)], figures=range_figures) == drive_estimates(
-        frames, figures=range_figures
-    )
-    assert not drive_estimates([(0, empty)], figures=range_figures)
-
-
-@pytest.mark.parametrize("drives", [4, 12])
-def test_the_next_drive_is_within_its_interval_as_often_as_promised(drives):
-    rng = np.random.default_rng(7)
-    errors = rng.lognormal(-4, 0.8, (4000, drives + 1))
-    intervals = [next_drive(row[:-1], least=1e-9) for row in errors]
-    above = np.mean([row[-1] > one.high for row, one in zip(errors, intervals, strict=True)])
-    below = np.mean([row[-1] < one.low for row, one in zip(errors, intervals, strict=True)])
-    assert above == pytest.approx(0.025, abs=0.007)  # 3 standard errors
-    assert below == pytest.approx(0.025, abs=0.007)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def quick():
-    """Smaller samples, so that a profile takes a second."""
+    """Smaller samples, so that a search takes a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(profile, "RAYS", (1, 7, 61))
-        patch.setattr(profile, "SUPERSAMPLES", (1, 3))
+        patch.setattr(ladders, "RAYS", (1, 7, 61))
+        patch.setattr(ladders, "SUPERSAMPLES", (1, 3))
         measure_little(patch)
         yield
 
 
 @pytest.fixture(scope="module")
-def cache(scene, tmp_path_factory):
-    """A folder with the profile of the demo scene."""
-    folder = tmp_path_factory.mktemp("profiles")
-    assert profile_of(scene, DRIVE, folder=folder).made
-    return folder
+def sampled(scene):
+    """Errors of 1, 7 and 61 rays on the drive."""
+    plan = plan_drive(scene, DRIVE)
+    rays = [replace(DRIVE.recording_settings.scanner, rays=count) for count in (1, 7, 61)]
+    found = DriveSample(plan, plan.sensors, settings=rays, progress=silent)
+    found.grow(3)
+    return found
 
 
-@pytest.fixture
-def measured_before(monkeypatch):
-    """Let a profile that is measured again fail the test."""
-
-    def again(*_args, **_options):
-        raise AssertionError("measured again")
-
-    monkeypatch.setattr(profile, "_measure", again)
-
-
-def accurate(scene, out, *, options=DRIVE, by):
+def drive_to(scene, out, *, options=DRIVE, by):
     pick = pick_settings(scene, options, wanted=by, out=out)
     return driven(scene, out, options=options, wanted=by, pick=pick)
 
 
-def between(cache, scene):
-    """An accuracy that takes 7 rays, by the profile."""
-    one, seven, _ = profile_of(scene, DRIVE, folder=cache).scanners
-    low, high = (worst(c, "range_99_m").high for c in (seven, one))
-    assert low < high
-    return f"{500 * (low + high):.6f}mm@99"
+@pytest.fixture(scope="module")
+def between(sampled):
+    """An accuracy that takes 7 rays."""
+    seven, one = (sampled.figures(row)["lidar_top"]["range_99_m"].high for row in (1, 0))
+    assert seven < one
+    return f"{500 * (seven + one):.6f}mm@99"
 
 
-def test_more_rays_err_less_and_cost_more(scene, cache):
-    one, _, most = profile_of(scene, DRIVE, folder=cache).scanners
+def test_more_rays_err_less_and_a_sample_grows_to_the_whole_drive(scene, sampled):
     for figure in ("range_99_m", "range_99.9_m"):
-        assert most.errors["lidar_top"][figure].value < one.errors["lidar_top"][figure].value
-    assert one.cpu_s.value < most.cpu_s.value
+        one, _, most = (sampled.figures(row)["lidar_top"][figure].value for row in range(3))
+        assert most < one
+    assert (sampled.counts, sampled.complete) == ({"lidar_top": 3}, False)
+    plan = plan_drive(scene, DRIVE)
+    whole = DriveSample(plan, plan.sensors, settings=[DRIVE.recording_settings.scanner], progress=silent)
+    whole.grow(9)
+    assert (whole.counts, whole.complete) == ({"lidar_top": 5}, True)
 
 
-@pytest.mark.usefixtures("measured_before")
-def test_a_profile_is_kept_for_other_routes_and_made_for_other_settings(scene, cache):
-    for change in ({"seed": 9}, {"duration": 2.0, "from_rest": True}, {"workers": 1}):
-        assert not profile_of(scene, replace(DRIVE, **change), folder=cache).made
-    for change in (
-        {"rig": "drone", "vehicle": "car"},
-        {"fidelity": "survey"},
-        {"settings": (("reach", "50"),)},
-    ):
-        with pytest.raises(AssertionError, match="measured again"):
-            profile_of(scene, replace(DRIVE, **change), folder=cache)
-
-
-@pytest.mark.usefixtures("measured_before")
-def test_flights_and_scenes_along_routes_have_profiles_of_their_own_drive(scene, cache, monkeypatch):
-    plans = []
-    monkeypatch.setattr(profile, "plan_drive", lambda _scene, options, **_more: plans.append(options))
-    limits = {"area": "POLYGON ((0 0, 50 0, 50 50, 0 0))"}, {"route": "LINESTRING (0 0, 50 0)"}
-    part, along = (replace(scene, manifest=scene.manifest | limit) for limit in limits)
-    flight = DriveOptions(survey="all", altitude=50.0, rig="drone", duration=2.0)
-    for where, options in ((part, DRIVE), (along, DRIVE), (scene, flight)):
-        with pytest.raises(AssertionError, match="measured again"):
-            profile_of(where, options, folder=cache)
-    assert [(p.duration, p.survey) for p in plans] == [(0.5, ""), (0.5, ""), (2.0, "all")]
-
-
-def test_errors_are_measured_the_same_again_and_damaged_profiles_are_replaced(scene, cache, tmp_path):
-    first = profile_of(scene, DRIVE, folder=cache)
-    (tmp_path / first.path.name).write_text("{")
-    again = profile_of(scene, DRIVE, folder=tmp_path)
-    assert again.made
-    assert [c.errors for c in again.scanners] == [c.errors for c in first.scanners]
-
-
-@pytest.mark.usefixtures("measured_before")
-def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, cache, tmp_path):
-    by = AccuracyOptions(between(cache, scene), profile_cache=cache)
-    done = accurate(scene, tmp_path / "a", by=by)
+def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, between, tmp_path):
+    by = AccuracyOptions(between)
+    done = drive_to(scene, tmp_path / "a", by=by)
     manifest = open_dataset(tmp_path / "a").manifest
     notes = manifest["accuracy"]
     assert notes["asked"] == {"accuracy": by.accuracy}
@@ -394,33 +366,27 @@ def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, cache, 
     assert expected["low"] <= expected["value"] <= expected["high"] <= read_accuracy(by.accuracy).metres
     assert 0 < reached["low"] <= reached["value"] <= reached["high"]
     assert notes["spot_check"]["lidar_top"]["frames"] == 5
-    assert "rays=7" in done.pick.to_text(2)
-    assert done.accuracy(2)["expected_cpu_s"]["value"] > 0
+    assert "rays=7" in done.pick.to_text()
+    assert done.accuracy()["expected_cpu_s"]["value"] > 0
     assert "cpu" not in json.dumps(notes)
     drive(scene, tmp_path / "set", options=replace(DRIVE, settings=(("rays", "7"),)))
     assert Paths(tmp_path / "a").journal.read_bytes() == Paths(tmp_path / "set").journal.read_bytes()
-
-
-@pytest.mark.usefixtures("measured_before")
-def test_a_drive_is_resumed_with_what_was_picked_and_has_the_same_bytes(scene, cache, tmp_path):
-    by = AccuracyOptions(between(cache, scene), profile_cache=cache)
-    accurate(scene, tmp_path / "a", by=by)
-    accurate(scene, tmp_path / "b", options=replace(DRIVE, workers=1), by=by)
-    same_files(tmp_path / "a", tmp_path / "b")
-    manifest = json.loads(Paths(tmp_path / "b").manifest.read_text())
+    manifest = json.loads(Paths(tmp_path / "a").manifest.read_text())
     for key in ("reached_error_m", "spot_check"):
         del manifest["accuracy"][key]
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
     Paths(tmp_path / "b").manifest.write_text(json.dumps(manifest | {"frames_done": 0}))
     next((tmp_path / "b").glob("*/pcd/*")).unlink()
-    elsewhere = replace(by, profile_cache=tmp_path / "none")
-    done = accurate(scene, tmp_path / "b", by=elsewhere)
-    assert (done.summary.resumed, done.pick.settings) == (4, {"rays": 7})
-    assert "as picked before" in done.pick.to_text(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(search, "pick_by_sample", None)  # an earlier run has picked
+        again = drive_to(scene, tmp_path / "b", by=by)
+    assert (again.summary.resumed, again.pick.settings) == (4, {"rays": 7})
+    assert "as picked before" in again.pick.to_text()
     same_files(tmp_path / "a", tmp_path / "b")
 
 
-def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, cache, tmp_path):
-    words = ["drive", scene.path, "--route", "random", "--duration", "0.5", "--profile-cache", cache]
+def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, tmp_path):
+    words = ["drive", scene.path, "--route", "random", "--duration", "0.5"]
     for more, line in (
         (["--accuracy", "1cm", "--set", "rays=3"], "--set rays=3: --accuracy picks it"),
         (["--budget", "1x-realtime", "--set", "stretch=on"], "--set stretch=on: --budget picks rays"),
@@ -466,11 +432,14 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
     rig = tmp_path / "eye.toml"
     rig.write_text(EYE.replace("IMAGES", '["rgb", "depth"]'))
     options = replace(DRIVE, rig=str(rig))
-    one, three = profile_of(scene, options, folder=tmp_path).cameras
-    low, high = (worst(c, "rgb_rms").high for c in (three, one))
+    plan = plan_drive(scene, options)
+    images = [replace(options.recording_settings.camera, supersample=side) for side in (3, 1)]
+    sampled = DriveSample(plan, plan.sensors, settings=images, progress=silent)
+    sampled.grow(3)
+    low, high = (sampled.figures(row)["front"]["rgb_rms"].high for row in (0, 1))
     assert 0 < low < high
-    by = AccuracyOptions(f"1cm,{(low + high) / 2:.3f}levels", profile_cache=tmp_path)
-    done = accurate(scene, tmp_path / "d", options=options, by=by)
+    by = AccuracyOptions(f"1cm,{(low + high) / 2:.3f}levels")
+    done = drive_to(scene, tmp_path / "d", options=options, by=by)
     manifest = open_dataset(tmp_path / "d").manifest
     notes = manifest["accuracy"]
     assert notes["picked"] == {"supersample": 3}
@@ -479,22 +448,20 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
         assert 0 < notes[f"{kind}_error_levels"]["front"]["value"] < (low + high) / 2
         assert 0 < notes[f"{kind}_depth_error_m"]["front"]["value"] <= 0.0021
     assert "levels) for front" in done.to_text()
-    depths = AccuracyOptions("5mm", profile_cache=tmp_path)
-    assert pick_settings(scene, options, wanted=depths).settings == {}
+    assert pick_settings(scene, options, wanted=AccuracyOptions("5mm")).settings == {}
     with pytest.raises(InputError, match="`settings` supersample=2: `accuracy` picks it"):
         pick_settings(scene, replace(options, settings=(("supersample", "2"),)), wanted=by)
 
 
-@pytest.mark.usefixtures("measured_before")
-def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_path):
+def test_the_program_says_what_it_picks_and_what_was_reached(scene, tmp_path):
     words = ["drive", scene.path, "--route", "random", "--duration", "0.5", "--rig", "vlp16", "--seed", "3"]
-    words += ["--format", "pcd", "--profile-cache", cache]
+    words += ["--format", "pcd"]
     ended = run_program("lidar", *words, "--budget", "0.01x-realtime", "-o", tmp_path / "d")
     assert ended.returncode == 0, ended.stderr
     first, _, last = ended.stdout.splitlines()
     assert first.startswith("picked rays=61: 99.9 % of the range errors should be below ")
-    assert "with planning (" in first
     assert "x real time with" in first
+    assert first.endswith("included")
     assert last.startswith("spot check of 5 frames: 99.9 % of the range errors are below ")
     ended = run_program("lidar", *words, "--spot-check", "--json", "-o", tmp_path / "e")
     assert json.loads(ended.stdout)["accuracy"]["reached_error_m"]["lidar_top"]["value"] > 0
@@ -503,8 +470,8 @@ def test_the_program_says_what_it_picks_and_what_was_reached(scene, cache, tmp_p
 
 
 def test_a_missed_accuracy_or_budget_is_named():
-    errors = PROFILE.scanners[0].errors
-    reached = SpotCheck(99.9, ("ranges",), errors, dict.fromkeys(errors, 5))
+    errors = ROWS["scanners"][0]
+    reached = SpotCheck(stated(errors, percent=99.9, kinds=("ranges",)), errors, dict.fromkeys(errors, 5))
     summary = DriveSummary(
         Path("d"), 5, 0, {}, 0, duration=3.0, length=9.0, wall=9.0, planning=0.5, recording=1.5, stages={}
     )
@@ -521,13 +488,10 @@ def test_a_missed_accuracy_or_budget_is_named():
     assert replace(done, summary=replace(summary, resumed=2)).speed is None
 
 
-@pytest.mark.usefixtures("measured_before")
-def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path, monkeypatch):
-    coarse = AccuracyOptions(between(cache, scene)).accuracy
+def test_drives_of_a_sweep_have_picks_of_their_own(scene, between, tmp_path, monkeypatch):
     (tmp_path / "grid.toml").write_text(
         f'[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.5\nformat = ["pcd"]\nseed = 3\n'
-        f'profile-cache = "{cache}"\n'
-        f'[grid]\nscene = ["{scene.path}"]\naccuracy = ["{coarse}", "100m@50", "1um"]\n'
+        f'[grid]\nscene = ["{scene.path}"]\naccuracy = ["{between}", "100m@50", "1um"]\n'
     )
     with monkeypatch.context() as patch:  # other processes check samples of full size
         patch.setattr("lidar.tools.sweep.run.run_tasks", lambda work, tasks, **_: map(work, tasks))
@@ -538,36 +502,27 @@ def test_drives_of_a_sweep_have_picks_of_their_own(scene, cache, tmp_path, monke
     assert all("range errors are below" in row.reached for row in summary.rows[:2])
     picks = [open_dataset(summary.path / row.name).manifest["accuracy"]["picked"] for row in summary.rows[:2]]
     assert picks == [{"rays": 7}, {"rays": 1}]
-    shutil.rmtree(summary.path / summary.rows[1].name / "lidar_top")
-    again = sweep(tmp_path / "grid.toml", tmp_path / "out", workers=2)
-    assert [row.digest for row in again.rows] == [row.digest for row in summary.rows]
 
 
-def test_a_budget_leaves_time_for_planning_and_loading(scene, cache):
-    options = replace(DRIVE, traffic=TrafficOptions())
-    plan = plan_drive(scene, options)
-    planned = Planned(plan, seconds=9.0, cpu_s=0.2, loading=0.05)  # of 0.5 s: half as much again as the drive
-    assert planned.overhead == pytest.approx(0.5)
-    assert pace_of(planned, "1x-realtime") == pytest.approx(2.0)
+def test_a_budget_leaves_time_for_planning_and_loading():
+    more = {"duration": 0.5, "planning": 0.2, "loading": 0.05}  # half as much again as the drive
+    assert pace_of("1x-realtime", **more) == pytest.approx(2.0)
     with pytest.raises(InputError, match=r"allows 0.25 s for a drive of 0.5 s, and planning took 0.2 CPU s"):
-        pace_of(planned, "2x-realtime")
-    by = AccuracyOptions(budget="0.01x-realtime", profile_cache=cache)
-    pick = pick_settings(scene, DRIVE, wanted=by)
-    assert pick.planned.plan.options == DRIVE
-    assert pick.costs(1)["expected_speed"] < pick.costs(1)["expected_cpu_s"]["value"] ** -1
+        pace_of("2x-realtime", **more)
 
 
-def test_a_drive_within_a_budget_is_planned_once(scene, cache, tmp_path, monkeypatch):
+def test_a_drive_within_a_budget_is_planned_once(scene, tmp_path, monkeypatch):
     plans = []
 
     def counted(*args, **more):
         plans.append(args)
         return plan_drive(*args, **more)
 
-    monkeypatch.setattr(accuracy, "plan_drive", counted)
+    monkeypatch.setattr(search, "plan_drive", counted)
     monkeypatch.setattr("lidar.simulation.drive.plan_drive", counted)
-    by = AccuracyOptions(budget="0.001x-realtime", profile_cache=cache)
+    by = AccuracyOptions(budget="0.001x-realtime")
     pick = pick_settings(scene, DRIVE, wanted=by)
+    assert pick.cost.speed < pick.cost.threads / pick.cost.cpu_s.value
     done = driven(scene, tmp_path / "d", options=DRIVE, wanted=by, pick=pick)
     assert len(plans) == 1
     assert done.speed < done.summary.duration / done.summary.recording

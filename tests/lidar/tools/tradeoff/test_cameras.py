@@ -8,14 +8,12 @@ import pytest
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.camera.settings import PLAIN
 from lidar.simulation.plan import plan_drive
-from lidar.tools.tradeoff.engine import tradeoff
+from lidar.tools.tradeoff.bench import FAST, bench_of
+from lidar.tools.tradeoff.compare import compare_settings
+from lidar.tools.tradeoff.comparison import recommendation
 from lidar.tools.tradeoff.errors import IMAGE_STATISTICS, estimates
 from lidar.tools.tradeoff.images import Pixels, blocks_of_frame, image, image_error, pixels
-from lidar.tools.tradeoff.notes import Notes
 from lidar.tools.tradeoff.report import document, write_report
-from lidar.tools.tradeoff.simulate import FAST, bench_of
-from lidar.tools.tradeoff.variants import camera_basis, camera_variants
-from lidar.tools.tradeoff.words import recommendation
 
 RIG = """
 name = "front"
@@ -42,7 +40,7 @@ def drive(tmp_path_factory):
 @pytest.fixture(scope="module")
 def found(scene, drive):
     names = ("supersample", "shadows", "blur", "resolution", "barriers")
-    return tradeoff(scene, drive, compared=TradeoffOptions(names, frames=2, pixels=512))
+    return compare_settings(scene, drive, compared=TradeoffOptions(names, frames=2, pixels=512))
 
 
 def picture(rgb, depth, klass):
@@ -67,12 +65,6 @@ def test_differences_of_colour_depth_and_class():
     assert (figures["depth_missing"], figures["class_changes"]) == (0.25, 0.25)
     same = estimates([image_error(exact, exact)], seed=0, statistics=IMAGE_STATISTICS)
     assert all(figure.value == 0 for figure in same.values())
-
-
-def test_enlarged_images_reduce_to_themselves():
-    small = picture([10, 20, 30, 40], [1, 2, 3, 4], [1, 2, 3, 4])
-    assert small.enlarged(2).reduced(2).equals(small)
-    assert small.reduced(2).rgb.tolist() == [[[[25, 25, 25]]]]
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
@@ -109,30 +101,6 @@ def test_blocks_are_spread_so_that_small_effects_are_met(scene, drive):
             assert inside.min() >= 1
 
 
-def test_settings_without_effect_on_a_sample_are_no_choice(scene, drive):
-    bench = bench_of(plan_drive(scene, drive), frames=2)
-    (camera,) = bench.plan.sensors
-    variants = camera_variants(
-        camera_basis(PLAIN, exposed=False), compared=("supersample", "shadows", "resolution")
-    )
-    notes = Notes(bench, camera, variants=variants)
-    by_label = {variant.label: k for k, variant in enumerate(variants)}
-    alone, both = by_label["shadows=off"], by_label["resolution=2 shadows=off"]
-    for same in (True, False):
-        notes.add(both, "resolution=2", same=False)
-        notes.add(both, "shadows=off", same=same)
-        notes.add(by_label["resolution=4"], "resolution=4", same=same)
-    notes.add(alone, "shadows=off", same=True)
-    assert notes.of(alone) == "no effect on what was sampled, with the other settings as asked"
-    assert not notes.choice(alone)
-    assert notes.choice(both)
-    assert notes.choice(by_label["resolution=4"])
-    once = Notes(bench, camera, variants=variants)
-    once.add(both, "shadows=off", same=True)
-    assert once.of(both) == "no effect on what was sampled: shadows=off"
-    assert not once.choice(both)
-
-
 def test_errors_of_a_camera_on_a_drive(found):
     (one,) = found.comparisons
     assert (one.kind, one.samples, one.frames) == ("camera", 512, 2)
@@ -143,11 +111,11 @@ def test_errors_of_a_camera_on_a_drive(found):
     assert one.uncertainty < rms["supersample=2"]
     assert asked.error["depth_max_m"].value == pytest.approx(0, abs=1e-3)
     assert rows["resolution=2"].error["depth_max_m"].value > 0
-    assert "against means" in rows["resolution=2"].note
-    assert "takes no time" in rows["blur=1"].note
+    assert rows["blur=1"].note == "no effect on what was sampled: blur=1"
+    assert (rows["blur=1"].choice, rows["resolution=2"].choice) == (False, True)
     assert rows["resolution=2"].cost["bytes"].value < asked.cost["bytes"].value
     assert "resolution=2 shadows=off" in rows
-    assert "levels rms" in recommendation(one, 10.0)
+    assert "For 10 levels rms" in recommendation(one, 10.0)
 
 
 def test_the_report_of_a_camera_is_written(found, tmp_path):

@@ -2,19 +2,21 @@
 
 import json
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 import pytest
 
-from geoscene.drawing.figures import metres
+from geoscene.drawing.figures import levels, metres
 from geoscene.support.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.simulation.plan import plan_drive
-from lidar.tools.tradeoff.comparison import SensorComparison, VariantRow
-from lidar.tools.tradeoff.costs import costs
-from lidar.tools.tradeoff.engine import scene_label, tradeoff
+from lidar.tools.tradeoff.bench import bench_of, chosen_pulses, spread_frames
+from lidar.tools.tradeoff.compare import compare_settings, scene_label
+from lidar.tools.tradeoff.comparison import SensorComparison, VariantRow, pareto, recommendation
+from lidar.tools.tradeoff.costs import costs, frame_cost
 from lidar.tools.tradeoff.errors import (
     STATISTICS,
     ErrorEstimate,
@@ -24,9 +26,7 @@ from lidar.tools.tradeoff.errors import (
     median,
 )
 from lidar.tools.tradeoff.report import document, write_report
-from lidar.tools.tradeoff.simulate import bench_of, chosen_pulses, spread_frames
-from lidar.tools.tradeoff.variants import next_step, noiseless, reference, scanner_basis, scanner_variants
-from lidar.tools.tradeoff.words import levels, pareto, recommendation
+from lidar.tools.tradeoff.variants import Basis, next_step, noiseless, scanner_reference, variants_of
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
 
@@ -36,7 +36,7 @@ FEW = TradeoffOptions(("rays", "poses", "georeferencing"), frames=3, pulses=900,
 
 @pytest.fixture(scope="module")
 def found(scene):
-    return tradeoff(scene, DRIVE, compared=FEW)
+    return compare_settings(scene, DRIVE, compared=FEW)
 
 
 def returns(key, distance, klass=None):
@@ -97,38 +97,30 @@ def test_intervals_hold_the_value_and_repeat_by_seed():
 
 
 def test_the_reference_is_the_exact_end_without_random_effects():
-    exact = reference(LEVELS["survey"], rays=217)
-    assert (exact.rays, exact.poses, exact.mirrors, exact.foliage, exact.link) == (
-        217,
-        "firing",
-        True,
-        True,
-        True,
-    )
-    assert (exact.range_noise, exact.angle_noise, exact.detection, exact.quantise) == (
-        "none",
-        False,
-        False,
-        False,
-    )
+    exact = scanner_reference(LEVELS["survey"], rays=217)
+    kept = (exact.rays, exact.poses, exact.mirrors, exact.foliage, exact.link)
+    assert kept == (217, "firing", True, True, True)
+    off = (exact.range_noise, exact.angle_noise, exact.detection, exact.quantise)
+    assert off == ("none", False, False, False)
     assert noiseless(PLAIN) == PLAIN
     assert [next_step(r) for r in (7, 217, 665, 900)] == [11, 326, 998, 999]
 
 
+def basis(*, world=WHOLE):
+    return Basis(noiseless(PLAIN), scanner_reference(PLAIN, rays=31), world)
+
+
 def labels(*compared, world=WHOLE, **more):
-    return [
-        r.label
-        for r in scanner_variants(scanner_basis(PLAIN, rays=31, world=world), compared=compared, **more)
-    ]
+    return [r.label for r in variants_of(basis(world=world), compared=compared, **more)]
 
 
 def test_variants_change_one_setting_each():
-    rows = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("rays", "poses"))
+    rows = variants_of(basis(), compared=("rays", "poses"))
     assert [r.label for r in rows] == ["", "rays=7", "rays=19", "poses=column", "poses=frame"]
     assert rows[0].used == PLAIN
     assert rows[1].used == replace(PLAIN, rays=7)
     assert rows[3].alone == replace(PLAIN, rays=31, poses="column")
-    (asked, other) = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("scene",), scenes=["lod=1"])
+    (asked, other) = variants_of(basis(), compared=("scene",), scenes=["lod=1"])
     assert (other.label, other.scene, other.choice, asked.choice) == ("scene=lod=1", 1, False, True)
     assert labels("traffic", traffic=True) == ["", "traffic=off"]
 
@@ -180,7 +172,7 @@ def test_georeferencing_is_within_its_promise(found):
 
 
 def test_errors_repeat_by_seed(scene, found):
-    again = tradeoff(scene, DRIVE, compared=FEW)
+    again = compare_settings(scene, DRIVE, compared=FEW)
     assert [r.error for r in again.comparisons[0].rows] == [r.error for r in found.comparisons[0].rows]
 
 
@@ -201,10 +193,10 @@ def test_the_cheapest_sufficient_setting_is_recommended():
     rows = (row("as asked (rays=1)", 0.2, 1.0), row("rays=7", 0.3, 4.0), row("rays=19", 0.02, 9.0))
     several = comparison(*rows, row("rays=61", 0.005, 30.0), residual=0.002)
     assert [r.label for r in pareto(several)] == ["as asked (rays=1)", "rays=19", "rays=61"]
-    assert "cheapest setting is rays=19; it costs 9 CPU s" in recommendation(several, 0.1)
+    assert "cheapest setting is rays=19: 2 cm" in recommendation(several, 0.1)
     assert "cheapest setting is rays=61" in recommendation(several, 0.01)
     none = recommendation(several, 0.001)
-    assert "no setting that was compared is sure to be enough; rays=61 comes nearest with 5 mm" in none
+    assert "no setting that was compared is sure to be enough; nearest is rays=61: 5 mm" in none
     loose = comparison(row("rays=61", 0.0005, 30.0), residual=0.002)
     assert "certain to 2 mm only" in recommendation(loose, 0.001)
 
@@ -215,8 +207,8 @@ def test_recommendations_count_the_upper_end_of_the_interval():
     several = comparison(unsure, row("rays=19", 0.009, 9.0))
     said = recommendation(several, 0.01)
     assert "cheapest setting is rays=19" in said
-    assert "errs by 9 mm, by 9 mm at the upper end of the 95 % interval" in said
-    assert "comes nearest with 9 mm" in recommendation(several, 0.001)
+    assert "9 mm, 9 mm at the upper end of the 95 % interval" in said
+    assert "nearest is rays=19: 9 mm" in recommendation(several, 0.001)
 
 
 def test_levels_have_a_singular():
@@ -225,7 +217,7 @@ def test_levels_have_a_singular():
 
 def test_settings_that_lose_returns_are_not_recommended():
     rows = (row("as asked (rays=1)", 0.02, 2.0), row("reach=25", 0.02, 1.0, lost=0.1))
-    assert "cheapest setting is the one as asked (rays=1)" in recommendation(comparison(*rows), 0.1)
+    assert "cheapest setting is as asked (rays=1)" in recommendation(comparison(*rows), 0.1)
     assert "all miss or add more than 0.1 %" in recommendation(comparison(rows[1]), 0.1)
 
 
@@ -248,7 +240,7 @@ def test_scenes_are_named_by_what_differs(scene, scene_utm):
 def test_bad_input_is_one_clear_line(scene, scene_utm):
     def refused(*names, match, **more):
         with pytest.raises(InputError, match=match):
-            tradeoff(scene, DRIVE, compared=TradeoffOptions(names, **more))
+            compare_settings(scene, DRIVE, compared=TradeoffOptions(names, **more))
 
     refused("leaves", match=r"`compare` 'leaves' is unknown \(known are rays")
     refused("rays", "shadows", match="`compare` shadows: a setting of cameras, and none is compared")
@@ -256,7 +248,7 @@ def test_bad_input_is_one_clear_line(scene, scene_utm):
     refused("traffic", match="`compare` traffic: the drive has none")
     refused(sensors=("roof",), match="`sensors` roof: not in rig vlp16; there are lidar_top")
     with pytest.raises(InputError, match="another frame"):
-        tradeoff(scene, DRIVE, compared=FEW, others=[scene_utm])
+        compare_settings(scene, DRIVE, compared=FEW, others=[scene_utm])
     with pytest.raises(InputError, match="`frames` 1: give 2 to 1000"):
         TradeoffOptions(frames=1)
 
@@ -265,26 +257,25 @@ def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
     compared = TradeoffOptions(
         ("forests", "trees", "barriers", "furniture"), frames=2, pulses=200, reference_rays=7
     )
-    (one,) = tradeoff(scene, DRIVE, compared=compared).comparisons
-    notes = {r.label: r.note for r in one.rows}
-    assert notes["forests=off"] == "no effect here: there are none within reach"
-    assert notes["trees=off"] == "no effect on what was sampled, with the other settings as asked"
-    assert notes["furniture=off"] == ""
-    without = {r.label: r.error for r in one.rows}["furniture=off"]
-    assert without["range_max_m"].value > one.rows[0].error["range_max_m"].value
+    (one,) = compare_settings(scene, DRIVE, compared=compared).comparisons
+    rows = {r.label: r for r in one.rows}
+    assert rows["forests=off"].note == "no effect on what was sampled: forests=off"
+    assert rows["furniture=off"].note == ""
+    assert (rows["forests=off"].choice, rows["furniture=off"].choice) == (False, True)
+    assert rows["furniture=off"].error["range_max_m"].value > one.rows[0].error["range_max_m"].value
 
 
-def test_rows_of_the_world_are_timed_in_their_own_world(scene):
+def test_rows_of_the_world_are_timed_in_their_own_world(scene, monkeypatch):
     bench = bench_of(plan_drive(scene, DRIVE), frames=2)
     (scanner,) = bench.plan.sensors
-    variants = scanner_variants(scanner_basis(PLAIN, rays=31), compared=("reach",))[:2]
-    found = costs(
-        bench,
-        scanner,
-        variants=variants,
-        frame_cost=lambda _, world, variant: (min(world.settings.reach, 999.0), variant.used.rays),
-        repetitions=3,
-        progress=silent,
-    )
-    assert [f["cpu_s"].value * scanner.period_ns / 1e9 for f in found] == pytest.approx([999.0, 25.0])
-    assert all(f["memory_bytes"].value > 2**20 for f in found)
+    variants = variants_of(basis(), compared=("reach",))[:2]
+    used = []
+
+    def counted(bench, sensor, *, variant, frame):
+        used.append(variant.world.reach)
+        return frame_cost(bench, sensor, variant=variant, frame=frame)
+
+    monkeypatch.setattr("lidar.tools.tradeoff.costs.frame_cost", counted)
+    found = costs(bench, scanner, variants=variants, repetitions=3, progress=silent)
+    assert used == [inf, *[inf, 25.0] * 3]
+    assert all(f["cpu_s"].value > 0 and f["memory_bytes"].value > 2**20 for f in found)

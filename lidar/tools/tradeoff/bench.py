@@ -1,29 +1,24 @@
-"""Frames of a drive as a variant simulates them, in worlds that ray casting of either kind shares."""
+"""Frames of a planned drive, simulated with other settings, and the worlds that they share."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import timedelta
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.scene import Scene
-from geoscene.typing import Float, Ints
-from lidar.dataset.formats.table import cloud_table, records
+from geoscene.typing import Float
 from lidar.sensors.camera.sun import sun_direction
-from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.laser.scan import DetectedEchoes, Sweep, cast, detect, deviates_of, report
+from lidar.sensors.laser.scan import DetectedEchoes, Sweep, cast, detect, deviates_of
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan
 from lidar.simulation.signals import lamps_at
 from lidar.tools.tradeoff.errors import PulseReturns
 from lidar.tools.tradeoff.images import Shot
-from lidar.tools.tradeoff.variants import noiseless
 from lidar.world.actors import actor_shapes, actor_transforms
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
@@ -35,11 +30,11 @@ EXACT, FAST = "float64", "auto"
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What is simulated: frames of a planned drive.
+    """Frames of a planned drive.
 
     plan   : the drive
-    scenes : the plan's scene, and others of the same frame
-    frames : numbers of the sampled frames, of each sensor by its name
+    scenes : the plan's scene, and others of the same place and CRS frame
+    frames : numbers of the frames, by name of the sensor
     """
 
     plan: DrivePlan
@@ -48,7 +43,7 @@ class Bench:
     _worlds: dict[tuple[int, str, bool, WorldSettings], World] = field(default_factory=dict, repr=False)
 
     def close(self, *, backend: str) -> None:
-        """Let go of the worlds of a backend, which are loaded again when needed."""
+        """Release the worlds of a backend, which are loaded again when needed."""
         for key in [key for key in self._worlds if key[1] == backend]:
             del self._worlds[key]
 
@@ -62,7 +57,7 @@ class Bench:
         traffic: bool = True,
         settings: WorldSettings = WHOLE,
     ) -> World:
-        """A world during a frame, with all that a ray of the sampled frames can reach."""
+        """The world during a frame, as far as rays of the bench's frames reach."""
         actors = self.plan.actors if traffic else None
         key = scene, backend, actors is not None, settings
         if key not in self._worlds:
@@ -102,15 +97,24 @@ class Bench:
         return sun_direction(plan.scene.frame, when, at=(x, y))
 
     def _region(self) -> Region:
-        """The box that the vehicle covers during the sampled frames."""
-        boxes = []
-        for sensor in self.plan.sensors:
-            for frame in self.frames[sensor.name]:
-                start = sensor.frame_start_ns(frame)
-                times = np.linspace(start, start + sensor.period_ns, 5).astype(np.int64)
-                boxes.append(self.plan.trajectory.at(times).position[:, :2])
-        xy = np.concatenate(boxes)
+        """Bounding box of the vehicle's positions during the frames, scene metres."""
+        sensors = {sensor.name: sensor for sensor in self.plan.sensors}
+        spans = []
+        for name, frames in self.frames.items():
+            for frame in frames:
+                start = sensors[name].frame_start_ns(frame)
+                spans.append(np.linspace(start, start + sensors[name].period_ns, 5).astype(np.int64))
+        xy = self.plan.trajectory.at(np.concatenate(spans)).position[:, :2]
         return (float(xy[:, 0].min()), float(xy[:, 1].min()), float(xy[:, 0].max()), float(xy[:, 1].max()))
+
+
+def bench_of(plan: DrivePlan, others: Sequence[Scene] = (), *, frames: int) -> Bench:
+    """Some frames of each sensor, spread over a drive, in its scene and others."""
+    return Bench(
+        plan,
+        (plan.scene, *others),
+        {s.name: spread_frames(plan.frames[s.name], frames) for s in plan.sensors},
+    )
 
 
 def spread_frames(count: int, frames: int) -> tuple[int, ...]:
@@ -135,7 +139,7 @@ def swept(
     pulses: NDArray[np.int64] | None = None,
     threads: int = 1,
 ) -> tuple[Sweep, DetectedEchoes]:
-    """Pulses of a frame and what the scanner detects."""
+    """Pulses of a frame and the echoes that the scanner detects."""
     sweep = cast(
         scanner.sensor,
         scanner.spec.mount,
@@ -174,61 +178,3 @@ def returns_of(
     first = np.searchsorted(rows, rows)  # rows are sorted by pulse and range
     key = 256 * pulses[rows] + np.arange(len(rows)) - first
     return PulseReturns(key, found.range, found.echoes.klass, placed)
-
-
-@dataclass(frozen=True, slots=True)
-class SimulatedFrame:
-    """A frame of a scanner without noise, with one ray per pulse; n returns.
-
-    cloud   : as the sensor reports it, float32
-    time_ns : (n,) int64, of the drive
-    exact   : (n, 3) float64, sensor frame
-    placed  : (n, 3) the same points in the scene
-    start   : (n, 3) scene points from which ranges are measured
-    range   : (n,) metres from there
-    """
-
-    cloud: Cloud
-    time_ns: Ints
-    exact: Float
-    placed: Float
-    start: Float
-    range: Float
-
-
-def measured_frame(bench: Bench, scanner: Scanner, *, frame: int, every: int = 1) -> SimulatedFrame:
-    """Every n-th pulse of a frame."""
-    plan = bench.plan
-    settings = replace(noiseless(plan.options.recording_settings.scanner), rays=1)
-    pulses = np.arange(0, len(firings(scanner.sensor, frame)), every)
-    world = bench.world(scanner, frame, backend=FAST)
-    sweep, found = swept(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
-    fired, rows = sweep.firings, found.echoes.pulse
-    away = found.range - scanner.sensor.pattern.range_offset
-    origin, time_ns = fired.origin[rows], fired.time_ns[rows]
-    exact = origin + away[:, None] * fired.direction[rows]
-    mount = scanner.spec.mount
-    placed, start = (
-        plan.trajectory.place(xyz, time_ns, translation=mount.translation, rotation=mount.rotation)
-        for xyz in (exact, origin)
-    )
-    return SimulatedFrame(report(sweep, found), time_ns, exact, placed, start, away)
-
-
-def frame_cost(
-    plan: DrivePlan, scanner: Scanner, *, frame: int, world: World, settings: ScannerSettings
-) -> tuple[float, int]:
-    """CPU seconds of a whole frame as a drive simulates it, and the bytes of its point table."""
-    began = time.process_time()
-    table = cloud_table(report(*swept(plan, scanner, frame=frame, world=world, settings=settings)))
-    return time.process_time() - began, int(records(table).nbytes)
-
-
-def sample_frames(plan: DrivePlan, frames: int) -> dict[str, tuple[int, ...]]:
-    """Frames spread over a drive, by sensor."""
-    return {s.name: spread_frames(plan.frames[s.name], frames) for s in plan.sensors}
-
-
-def bench_of(plan: DrivePlan, others: Sequence[Scene] = (), *, frames: int) -> Bench:
-    """The bench of a plan."""
-    return Bench(plan, (plan.scene, *others), sample_frames(plan, frames))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,20 +15,16 @@ from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan, plan_drive, schedule
-from lidar.tools.tradeoff.cameras import compared_camera
-from lidar.tools.tradeoff.comparison import Listing, SensorComparison
+from lidar.tools.tradeoff.bench import EXACT, FAST, Bench, bench_of, returns_of
+from lidar.tools.tradeoff.comparison import SensorComparison
 from lidar.tools.tradeoff.errors import percentile
-from lidar.tools.tradeoff.files import formats_listing
-from lidar.tools.tradeoff.projections import frames_listing
-from lidar.tools.tradeoff.scanners import compared_scanner
-from lidar.tools.tradeoff.simulate import EXACT, Bench, bench_of, measured_frame
-from lidar.tools.tradeoff.variants import CAMERA_VALUES, SCANNER_VALUES, WORLD_VALUES
-from lidar.tools.tradeoff.voxels import voxels_listing
+from lidar.tools.tradeoff.sensors import compare_sensor
+from lidar.tools.tradeoff.variants import CAMERA_VALUES, SCANNER_VALUES, WORLD_VALUES, noiseless
 
 _OF_SENSORS = (*WORLD_VALUES, "scene", "traffic")
-_OF_DRIVE = ("georeferencing", "files", "voxel", "frame")
-COMPARED = tuple(dict.fromkeys((*SCANNER_VALUES, *CAMERA_VALUES, *_OF_SENSORS, *_OF_DRIVE)))
+COMPARED = tuple(dict.fromkeys((*SCANNER_VALUES, *CAMERA_VALUES, *_OF_SENSORS, "georeferencing")))
 """Names that `TradeoffOptions.compare` may hold."""
 
 
@@ -37,16 +33,14 @@ class DriveTradeoff:
     """Comparisons of all sensors of a rig on a drive.
 
     georeferencing : metres between the affine map and the full projection; empty where not compared
-    listings       : tables of formats and maps of each scanner, and of frames
     """
 
     plan: DrivePlan
     comparisons: tuple[SensorComparison, ...]
     georeferencing: dict[str, float]
-    listings: tuple[Listing, ...]
 
 
-def tradeoff(
+def compare_settings(
     scene: Scene,
     options: DriveOptions,
     *,
@@ -72,30 +66,11 @@ def tradeoff(
     scenes = [scene_label(scene, other) for other in others]
     found = []
     for sensor in plan.sensors:
-        if _compares(sensor, compared.compare):
-            if isinstance(sensor, Scanner):
-                found.append(
-                    compared_scanner(bench, sensor, compared=compared, scenes=scenes, progress=progress)
-                )
-            else:
-                found.append(
-                    compared_camera(bench, sensor, compared=compared, scenes=scenes, progress=progress)
-                )
+        if not compared.compare or set(compared.compare) & set(_settings_of(sensor)):
+            found.append(compare_sensor(bench, sensor, compared=compared, scenes=scenes, progress=progress))
             bench.close(backend=EXACT)
-    wanted = compared.compare or COMPARED
-    geo = _georeferencing(bench) if "georeferencing" in wanted else {}
-    return DriveTradeoff(plan, tuple(found), geo, tuple(_listings(bench, wanted, progress=progress)))
-
-
-def _listings(bench: Bench, wanted: Sequence[str], *, progress: Progress) -> Iterator[Listing]:
-    scanners = [s for s in bench.plan.sensors if isinstance(s, Scanner)]
-    for scanner in scanners:
-        if "files" in wanted:
-            yield formats_listing(bench, scanner, progress=progress)
-        if "voxel" in wanted:
-            yield voxels_listing(bench, scanner, progress=progress)
-    if scanners and "frame" in wanted:
-        yield frames_listing(bench, scanners[0])
+    geo = _georeferencing(bench) if "georeferencing" in (compared.compare or COMPARED) else {}
+    return DriveTradeoff(plan, tuple(found), geo)
 
 
 def _with_sensors(plan: DrivePlan, names: Sequence[str]) -> DrivePlan:
@@ -114,10 +89,6 @@ def _settings_of(sensor: Scanner | Camera) -> Sequence[str]:
     return (*(SCANNER_VALUES if isinstance(sensor, Scanner) else CAMERA_VALUES), *_OF_SENSORS)
 
 
-def _compares(sensor: Scanner | Camera, names: Sequence[str]) -> bool:
-    return not names or bool(set(names) & set(_settings_of(sensor)))
-
-
 def _check_applicable(plan: DrivePlan, names: Sequence[str], *, others: Sequence[Scene]) -> None:
     """Raise InputError for names of comparisons that this drive does not have."""
     known = {name for sensor in plan.sensors for name in _settings_of(sensor)}
@@ -125,7 +96,7 @@ def _check_applicable(plan: DrivePlan, names: Sequence[str], *, others: Sequence
     for name in names:
         if name in CAMERA_VALUES and name not in known:
             raise InputError(f"`compare` {name}: a setting of cameras, and none is compared")
-        if (name in SCANNER_VALUES and name not in known) or (name in _OF_DRIVE and not scanning):
+        if (name in SCANNER_VALUES and name not in known) or (name == "georeferencing" and not scanning):
             raise InputError(f"`compare` {name}: needs a scanner, and none is compared")
     if "scene" in names and not others:
         raise InputError("`compare` scene: no other scene is given with `others`")
@@ -142,16 +113,19 @@ def _georeferencing(bench: Bench) -> dict[str, float]:
     if scanner is None:
         return {}
     affine, full = (Georeference(plan.scene.frame, plan.geo.crs, exact=exact) for exact in (False, True))
+    settings = replace(noiseless(plan.options.recording_settings.scanner), rays=1)
     away = []
     for frame in bench.frames[scanner.name]:
-        placed = measured_frame(bench, scanner, frame=frame, every=8).placed
-        away.append(np.linalg.norm(affine.points(placed) - full.points(placed), axis=1))
+        pulses = np.arange(0, len(firings(scanner.sensor, frame)), 8)
+        world = bench.world(scanner, frame, backend=FAST)
+        found = returns_of(plan, scanner, frame=frame, world=world, settings=settings, pulses=pulses)
+        away.append(np.linalg.norm(affine.points(found.xyz) - full.points(found.xyz), axis=1))
     every = np.concatenate(away)
     return {"99.9_m": percentile(every, 0.999), "max_m": percentile(every, 1.0)}
 
 
 def scene_label(first: Scene, other: Scene) -> str:
-    """What distinguishes a scene from the first: the build options that differ, or else its folder."""
+    """The build options in which a scene differs from the first, or else its folder."""
     a, b = (_flat(scene.manifest.get("options", {})) for scene in (first, other))
     differ = [f"{k}={b.get(k)}" for k in sorted(a.keys() | b.keys()) if a.get(k) != b.get(k)]
     return ",".join(differ) or other.path.name

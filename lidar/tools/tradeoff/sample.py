@@ -1,0 +1,311 @@
+"""Errors of the sensors of a drive in a sample of its frames, against the exact reference."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from math import inf, nan
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from geoscene.support.progress import Progress
+from geoscene.typing import Float, Ints
+from lidar.dataset.png import counts_to_depth, depth_to_counts
+from lidar.errors import InputError
+from lidar.options import PERCENTS
+from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.physics.settings import MOST_RAYS, ScannerSettings
+from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.sensors.rig.scanner import firings
+from lidar.simulation.frame_loop import chunks
+from lidar.simulation.plan import DrivePlan
+from lidar.tools.tradeoff.bench import EXACT, FAST, Bench, chosen_pulses, returns_of
+from lidar.tools.tradeoff.errors import (
+    IMAGE_STATISTICS,
+    ErrorEstimate,
+    ImageError,
+    PulseReturns,
+    percentile,
+    resample,
+)
+from lidar.tools.tradeoff.images import blocks_of_frame, image_error, pixels
+from lidar.tools.tradeoff.variants import camera_reference, noiseless, scanner_reference
+
+SensorSettings = ScannerSettings | CameraSettings
+
+_SCREENED, _SCREENS, _COMPARED = 6000, (1, 19, 61), 120
+"""Pulses of a frame that are screened, their numbers of rays, and how many of the hardest and of the others
+are compared with the reference."""
+
+_BLOCKS, _FEWEST = 48, 12
+"""Blocks of pixels of a frame that are compared, of all cameras, and of each at least."""
+
+_GOLDEN = 0.6180339887498949
+"""Multiples of it, modulo 1, are evenly spread, however many there are."""
+
+
+class DriveSample:
+    """Errors that settings of some sensors make in a sample of the frames of a drive.
+
+    The sample is empty at first and grows; its frames are spread evenly over the drive. The same drive has
+    the same sample.
+
+    other : whether it takes other frames than a small sample of the same drive without this
+    """
+
+    def __init__(
+        self,
+        plan: DrivePlan,
+        sensors: Sequence[Scanner | Camera],
+        *,
+        settings: Sequence[SensorSettings],
+        other: bool = False,
+        progress: Progress,
+    ) -> None:
+        self.settings = settings
+        self._plan, self._sensors, self._progress = plan, sensors, progress
+        order = slice(None, None, -1 if other else 1)
+        self._frames = {
+            sensor.name: _spread_evenly(_working_frames(plan, sensor))[order] for sensor in sensors
+        }
+        self._errors: dict[str, list[list[Any]]] = {sensor.name: [] for sensor in sensors}
+        self._blocks = max(_FEWEST, _BLOCKS // max(len(sensors), 1))
+        if idle := [name for name, frames in self._frames.items() if not len(frames)]:
+            raise InputError(
+                f"`rig`: {', '.join(idle)} has no frame in this drive, whose errors could be measured"
+            )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Number of frames in the sample, by sensor."""
+        return {name: len(errors) for name, errors in self._errors.items()}
+
+    @property
+    def complete(self) -> bool:
+        """Whether all frames of the drive are in the sample."""
+        return all(len(self._errors[name]) == len(frames) for name, frames in self._frames.items())
+
+    def grow(self, frames: int) -> None:
+        """Add frames until the sample has ``frames`` of each sensor, or all that there are."""
+        added = {
+            name: set(of[len(self._errors[name]) : frames].tolist()) for name, of in self._frames.items()
+        }
+        jobs = [job for job in self._plan.jobs if job.frame in added.get(job.sensor.name, ())]
+        done = 0
+        for run, _ in chunks(jobs, self._plan.trajectory):
+            numbers = {sensor.name: list[int]() for sensor in self._sensors}
+            for job in run:
+                numbers[job.sensor.name].append(job.frame)
+            bench = Bench(
+                self._plan, (self._plan.scene,), {name: tuple(of) for name, of in numbers.items() if of}
+            )
+            for job in run:
+                self._progress("measuring errors", done, total=len(jobs))
+                self._errors[job.sensor.name].append(self._frame_errors(bench, job.sensor, frame=job.frame))
+                done += 1
+        self._progress("measuring errors", done, total=len(jobs))
+
+    def figures(self, row: int) -> dict[str, dict[str, ErrorEstimate]]:
+        """Figures of the errors of one of the settings, by sensor, with 95 % intervals by resampling frames.
+
+        They are those of `range_figures` and `image_figures`.
+        """
+        found = {}
+        for sensor in self._sensors:
+            figures: Callable[[Sequence[Any]], Mapping[str, float]] = (
+                range_figures if isinstance(sensor, Scanner) else partial(image_figures, camera=sensor)
+            )
+            frames = [errors[row] for errors in self._errors[sensor.name]]
+            found[sensor.name] = resample(frames, seed=0, figures=figures)
+        return found
+
+    def _frame_errors(self, bench: Bench, sensor: Scanner | Camera, *, frame: int) -> list[Any]:
+        """Errors of each of the settings in a frame."""
+        if isinstance(sensor, Scanner):
+            scanning = [one for one in self.settings if isinstance(one, ScannerSettings)]
+            return scanner_errors(bench, sensor, frame=frame, settings=scanning)
+        imaging = [one for one in self.settings if isinstance(one, CameraSettings)]
+        return camera_errors(bench, sensor, frame=frame, settings=imaging, blocks=self._blocks)
+
+
+def sensors_with(sensors: Sequence[Scanner | Camera], *, kinds: Collection[str]) -> list[Scanner | Camera]:
+    """Sensors that have errors of some kinds: ranges, depths, colours."""
+    images = {image for kind, image in (("colours", "rgb"), ("depths", "depth")) if kind in kinds}
+    return [
+        sensor
+        for sensor in sensors
+        if ("ranges" in kinds if isinstance(sensor, Scanner) else images & set(sensor.spec.images))
+    ]
+
+
+def _working_frames(plan: DrivePlan, sensor: Scanner | Camera) -> Ints:
+    """Numbers of the frames of a sensor in which it works."""
+    count = plan.frames[sensor.name]
+    frames = np.arange(count)
+    if plan.scanning_ns is None or isinstance(sensor, Camera):
+        return frames
+    starts = np.fromiter(map(sensor.frame_start_ns, range(count)), np.int64, count)
+    first, last = plan.scanning_ns[:, 0], plan.scanning_ns[:, 1]
+    span = np.searchsorted(first, starts, side="right") - 1
+    return frames[(span >= 0) & (starts + sensor.period_ns <= last[np.maximum(span, 0)])]
+
+
+def _spread_evenly(frames: Ints) -> Ints:
+    """The frames in an order of which any successive ones are spread evenly over the drive."""
+    return frames[np.argsort((np.arange(len(frames)) * _GOLDEN + 0.5) % 1.0, kind="stable")]
+
+
+@dataclass(frozen=True, slots=True)
+class SampledError:
+    """Differences of some pulses of a frame from the reference, with weights by which they stand for all.
+
+    range   : (m,) metres, absolute, of returns that both have
+    weight  : (m,) number of returns for which each stands
+    missed, extra, returns : numbers of returns that only the reference has, only the other, and all of the
+                             reference
+    """
+
+    range: Float
+    weight: Float
+    missed: float
+    extra: float
+    returns: float
+
+
+def sampled_error(found: PulseReturns, *, exact: PulseReturns, weights: Float) -> SampledError:
+    """Differences between the returns of the same pulses; ``weights`` are by row of a pulse in its frame."""
+    _, a, b = np.intersect1d(found.key, exact.key, assume_unique=True, return_indices=True)
+    of_found, of_exact = (weights[returns.key // 256] for returns in (found, exact))
+    total, both = float(of_exact.sum()), float(of_exact[b].sum())
+    return SampledError(
+        np.abs(found.range[a] - exact.range[b]),
+        of_exact[b],
+        missed=total - both,
+        extra=float(of_found.sum()) - both,
+        returns=total,
+    )
+
+
+def scanner_errors(
+    bench: Bench, scanner: Scanner, *, frame: int, settings: Sequence[ScannerSettings]
+) -> list[SampledError]:
+    """Errors of each of some settings in a frame of a scanner."""
+    plain, seed = noiseless(settings[0]), bench.plan.options.seed
+    frame_returns = partial(_returns, bench, scanner, frame=frame)
+    count = len(firings(scanner.sensor, frame))
+    screened = chosen_pulses(count, _SCREENED, frame=frame, seed=seed)
+    casts = [frame_returns(settings=replace(plain, rays=rays), pulses=screened) for rays in _SCREENS]
+    rng = np.random.default_rng([seed, frame, 1])
+    pulses, weights = _stratify(screened, casts, count=count, rng=rng)
+    exact = scanner_reference(plain, rays=MOST_RAYS)
+    truth = frame_returns(settings=exact, pulses=pulses, backend=EXACT)
+    return [
+        sampled_error(frame_returns(settings=noiseless(one), pulses=pulses), exact=truth, weights=weights)
+        for one in settings
+    ]
+
+
+def _returns(
+    bench: Bench,
+    scanner: Scanner,
+    *,
+    frame: int,
+    settings: ScannerSettings,
+    pulses: NDArray[np.int64],
+    backend: str = FAST,
+) -> PulseReturns:
+    """Returns of some pulses of a frame; of the reference's backend, in the whole world."""
+    near = bench.plan.options.recording_settings.world
+    around = near if backend == FAST else replace(near, origin="near", reach=inf)
+    return returns_of(
+        bench.plan,
+        scanner,
+        frame=frame,
+        world=bench.world(scanner, frame, backend=backend, settings=around),
+        settings=settings,
+        pulses=pulses,
+        threads=os.cpu_count() or 1,
+    )
+
+
+def _stratify(
+    pulses: NDArray[np.int64], casts: Sequence[PulseReturns], *, count: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Float]:
+    """Pulses to compare of some that were cast with different rays, and weights (count,) by row of a pulse.
+
+    Those on which these casts differ most are taken, with weight 1; others at random, for all others.
+    """
+    first, *others = casts
+    apart = np.zeros(count)
+    for other in others:
+        _, a, b = np.intersect1d(first.key, other.key, assume_unique=True, return_indices=True)
+        np.maximum.at(apart, first.key[a] // 256, np.abs(first.range[a] - other.range[b]))
+        apart[np.setxor1d(first.key, other.key) // 256] = inf
+    order = pulses[np.argsort(-apart[pulses], kind="stable")]
+    hard, easy = order[:_COMPARED], rng.permutation(order[_COMPARED:])[:_COMPARED]
+    weights = np.ones(count)
+    if len(easy):
+        weights[easy] = (len(order) - len(hard)) / len(easy)
+    return np.sort(np.concatenate([hard, easy])), weights
+
+
+def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
+    """Metres that shares of the returns of frames do not exceed, by name, such as ``range_99.9_m``.
+
+    NaN without returns; and ``lost``, missed and extra returns over those of the reference.
+    """
+    ranges = np.concatenate([f.range for f in frames])
+    order = np.argsort(ranges)
+    below = np.cumsum(np.concatenate([f.weight for f in frames])[order])
+    ranges = ranges[order]
+    missed, extra, returns = np.sum([(f.missed, f.extra, f.returns) for f in frames], axis=0).tolist()
+    found = {f"range_{p:g}_m": _quantile(ranges, below, share=p / 100) for p in PERCENTS}
+    return found | {"lost": (missed + extra) / returns if returns else nan}
+
+
+def _quantile(values: Float, below: Float, *, share: float) -> float:
+    """The value that a share of a weight does not exceed; ``below`` is the weight up to each value.
+
+    NaN without values.
+    """
+    if not len(values) or below[-1] <= 0:
+        return nan
+    return float(values[min(int(np.searchsorted(below, share * below[-1])), len(values) - 1)])
+
+
+def camera_errors(
+    bench: Bench, camera: Camera, *, frame: int, settings: Sequence[CameraSettings], blocks: int
+) -> list[ImageError]:
+    """Errors of each of some settings in blocks of pixels of a frame; depths are those of the files."""
+    near = bench.plan.options.recording_settings.world
+    exact = camera_reference(settings[0], exposed=camera.spec.exposure_ns > 0)
+    shot = bench.shot(camera, frame)
+    chosen = blocks_of_frame(camera.spec, blocks, frame=frame, seed=bench.plan.options.seed)
+    whole = bench.world(camera, frame, backend=EXACT, settings=replace(near, origin="near", reach=inf))
+    truth = pixels(shot, chosen, world=whole, settings=exact)
+    world = bench.world(camera, frame, backend=FAST, settings=near)
+
+    def errors() -> Iterator[ImageError]:
+        for one in settings:
+            found = pixels(shot, chosen, world=world, settings=replace(one, camera_noise=False))
+            yield image_error(replace(found, depth=counts_to_depth(depth_to_counts(found.depth))), truth)
+
+    return list(errors())
+
+
+def image_figures(frames: Sequence[ImageError], *, camera: Camera) -> dict[str, float]:
+    """Rms of colours (``rgb_rms``) and metres that depths of shares of the pixels do not exceed.
+
+    Of those images that the camera writes; NaN without a depth.
+    """
+    kinds, found = camera.spec.images, {}
+    if "rgb" in kinds:
+        found["rgb_rms"] = IMAGE_STATISTICS["rgb_rms"](frames)
+    if "depth" in kinds:
+        depth = np.concatenate([f.depth for f in frames])
+        found |= {f"depth_{p:g}_m": percentile(depth, p / 100) if len(depth) else nan for p in PERCENTS}
+    return found
