@@ -20,7 +20,7 @@ from geoscene.buildings.stacks import with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags
-from geoscene.support.report import Problem, describe_unexpected, described, make_without_failures
+from geoscene.support.problems import Problem, describe_unexpected, described, make_without_failures
 from geoscene.tags import first_value
 from geoscene.typing import Ints
 

@@ -13,7 +13,7 @@ from geoscene.buildings.footprints import Polygons, clean, groups, subtract
 from geoscene.buildings.table import GRID, Texts
 from geoscene.sources.data import Relation
 from geoscene.support.graphs import components
-from geoscene.support.report import Problem, describe_unexpected
+from geoscene.support.problems import Problem, describe_unexpected
 from geoscene.typing import Bools, Float, Ints
 
 Rows = Ints

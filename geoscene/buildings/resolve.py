@@ -14,7 +14,7 @@ from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, THINNEST, Tagged, i
 from geoscene.buildings.roof_tags import RoofTags, default_roof_height
 from geoscene.buildings.table import BuildingOptions, Texts
 from geoscene.sources.data import Tags
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
 
 _HALLS = (

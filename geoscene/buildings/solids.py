@@ -19,7 +19,7 @@ from geoscene.errors import InputError
 from geoscene.geometry.mesh import FLOOR, ROOF, Mesh
 from geoscene.geometry.watertight import check_solids, weld
 from geoscene.support.columns import Columns
-from geoscene.support.report import Problem, described, make_without_failures
+from geoscene.support.problems import Problem, described, make_without_failures
 from geoscene.typing import Bools, Float, Ints
 
 _ALIGNED = 0.02

@@ -10,7 +10,7 @@ import shapely
 from geoscene.buildings.footprints import Polygons, subtract
 from geoscene.buildings.resolve import BuildingHeights, BuildingRow
 from geoscene.buildings.table import GRID
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 
 _SLIT = 0.3
 """Metres between a part's top and the underside of one above it that count as no gap; assumed, far below a

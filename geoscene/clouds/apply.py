@@ -20,7 +20,7 @@ from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 from geoscene.objects.vegetation import CLOUD_TREE
 from geoscene.sources.data import Area, OsmData, TaggedNode, Tags
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Float, Ints
 
 _DISAGREES = 2.0  # metres between a tagged and a measured height that are reported

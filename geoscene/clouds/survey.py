@@ -23,8 +23,8 @@ from geoscene.options import BuildOptions, CloudOptions
 from geoscene.sources.data import Credit, OsmData
 from geoscene.support.digests import digest, file_digest, value_digest
 from geoscene.support.files import atomic_path, temporary_folder
+from geoscene.support.problems import Problem
 from geoscene.support.progress import Progress, silent
-from geoscene.support.report import Problem
 
 _FAR = 100.0  # metres from a ground return beyond which the ground is not known
 _MOST_CELLS = 36_000_000  # of the raster of the ground

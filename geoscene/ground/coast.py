@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Float
 
 _ASIDE = 0.01

@@ -15,7 +15,7 @@ from geoscene.ground.coast import sea
 from geoscene.ground.kinds import SEA, SURFACES, GroundKind, area_kind, line_kind
 from geoscene.ground.layers import Layers
 from geoscene.sources.data import Area, OsmData, Tags, Way
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Float
 

@@ -19,7 +19,7 @@ from pyproj.exceptions import ProjError
 from geoscene.errors import InputError, SourceNotFoundError, reading
 from geoscene.geometry.frames import Frame, beside
 from geoscene.support.graphs import components
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Height
 
 Vertical = Literal["flat", "orthometric", "ellipsoidal"]

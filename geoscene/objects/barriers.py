@@ -17,7 +17,7 @@ from geoscene.ground.kinds import is_underground
 from geoscene.ground.partition import PRECISION, GroundPlan
 from geoscene.sources.data import OsmData, Tags
 from geoscene.support.columns import Columns
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Height
 

@@ -22,7 +22,7 @@ from geoscene.objects.street import street_shape
 from geoscene.roadgraph.tags import is_bridge, is_tunnel
 from geoscene.sources.data import OsmData, TaggedNode, Tags
 from geoscene.support.columns import Columns
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.tags import parse_direction, parse_length
 from geoscene.typing import Bools, Float, Height, Ints
 

@@ -15,7 +15,7 @@ from geoscene.geometry.mesh import ShapeInstances
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
 from geoscene.support.columns import Columns
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.support.splitmix import uniform_at
 from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float, Height

@@ -20,8 +20,8 @@ from geoscene.scene.writer import SceneWriter
 from geoscene.sources import OsmData
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.digests import file_digest, sources_digest, value_digest
+from geoscene.support.problems import Problem
 from geoscene.support.progress import Progress, silent
-from geoscene.support.report import Problem
 from geoscene.uses import USES
 
 _NOT_IN_TILES = frozenset({"name", "along", "reach", "use"})

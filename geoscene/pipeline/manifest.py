@@ -20,7 +20,7 @@ from geoscene.pipeline.tiles import TileReport
 from geoscene.roadgraph import find_components
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources import SOURCES, OsmData, credits_of
-from geoscene.support.report import Problem, summarise
+from geoscene.support.problems import Problem, summarise
 
 STEEP = 0.2
 """Gradient above which roads are counted as steep; few streets exceed it."""

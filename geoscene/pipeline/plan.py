@@ -83,8 +83,8 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
+from geoscene.support.problems import Problem
 from geoscene.support.progress import Progress
-from geoscene.support.report import Problem
 from geoscene.typing import Float, Height, Ints
 from geoscene.uses import USES, Use
 

@@ -37,8 +37,8 @@ from geoscene.structures import StructureOptions, built_structures
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.digests import file_digest
 from geoscene.support.files import naming, write_atomically
+from geoscene.support.problems import Problem, describe_unexpected, described, make_without_failures
 from geoscene.support.processes import run_tasks
-from geoscene.support.report import Problem, describe_unexpected, described, make_without_failures
 from geoscene.typing import Bools, Ints
 
 T = TypeVar("T")

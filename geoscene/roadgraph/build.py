@@ -16,7 +16,7 @@ from geoscene.roadgraph.lane_uses import read_lane_uses
 from geoscene.roadgraph.restrictions import add_turns
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.sources.data import OsmData, Way
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
 
 

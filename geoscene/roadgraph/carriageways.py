@@ -16,7 +16,7 @@ from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
 from geoscene.roadgraph.tags import CLASSES, Street, drivable, read_street
 from geoscene.sources.data import OsmData, Tags, Way
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Bools, Float, Ints
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources.data import Relation, Tags
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 
 # Vehicle classes that include a car, the most specific first: for restrictions and exemptions.
 _CAR = ("motorcar", "motor_vehicle", "vehicle")

@@ -25,7 +25,7 @@ from geoscene.scene.tile_files import write_shapes
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.digests import file_digest
 from geoscene.support.files import exclusive, write_json
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Ints
 from geoscene.uses import USES, Needed, Use
 

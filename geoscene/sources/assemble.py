@@ -11,7 +11,7 @@ from geoscene.sources.data import Bounds, OsmData, Relation, TaggedNode, Way
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.extent import checked_bounds, locate, near_extent
 from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
-from geoscene.support.report import Action, Problem
+from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Ints
 
 _KINDS = ("road", "railway", "waterway", "barrier")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Float, Ints
 
 Tags = dict[str, str]

@@ -13,7 +13,7 @@ from geoscene.geometry.frames import beside
 from geoscene.sources.data import METRES_PER_DEGREE, Area, Bounds
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.tags import is_building, kind_of
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float
 
 _WIDE = 25_000.0

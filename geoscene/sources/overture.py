@@ -19,7 +19,7 @@ from geoscene.sources.data import Area, Bounds, OsmData, Progress, Tags
 from geoscene.sources.extent import checked_bounds, close_together
 from geoscene.sources.registry import SOURCES
 from geoscene.sources.rings import polygons_of
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 
 _TAGS = {
     "name": "name",

@@ -12,7 +12,7 @@ from geoscene.buildings import Buildings
 from geoscene.buildings.table import GRID
 from geoscene.structures.heights import surface_heights
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
 
 _SCANT = 1.0

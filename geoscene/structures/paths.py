@@ -22,7 +22,7 @@ from geoscene.sources.data import OsmData, Way
 from geoscene.structures.heights import nearest_on_line
 from geoscene.structures.members import Members
 from geoscene.structures.table import StructureOptions
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Height, Ints
 
 _STATION = 5.0

@@ -15,7 +15,7 @@ from geoscene.structures.paths import path_members
 from geoscene.structures.pieces import NEAR, cut_pieces
 from geoscene.structures.piers import place_piers
 from geoscene.structures.table import StructureOptions, Structures
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 from geoscene.typing import Height
 
 

@@ -26,7 +26,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import FLOOR, ROOF, WALL
 from geoscene.geometry.watertight import check_solids, validate_mesh
 from geoscene.sources.data import Area, OsmData, Relation
-from geoscene.support.report import summarise
+from geoscene.support.problems import summarise
 
 FRAME = Frame.at(8.7, 49.4)
 

@@ -20,7 +20,7 @@ from geoscene.ground.coast import sea
 from geoscene.ground.terrain import open_terrain
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Way
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)

@@ -18,7 +18,7 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources import OsmData, demo_path, read_osm
 from geoscene.sources.areas import is_multipolygon
 from geoscene.sources.tags import is_building
-from geoscene.support.report import Problem
+from geoscene.support.problems import Problem
 
 ALL = [
     "baltimore_harbor.osm.pbf",

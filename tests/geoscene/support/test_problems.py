@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from geoscene.errors import InputError
-from geoscene.support.report import make_without_failures
+from geoscene.support.problems import make_without_failures
 
 
 @pytest.mark.parametrize("bad", [set(), {0}, {3, 4}, {0, 6}, set(range(7))])
