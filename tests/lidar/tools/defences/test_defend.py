@@ -309,7 +309,7 @@ def test_the_program_judges_lists_and_refuses(attacked, tmp_path):
     for extra, message in {
         ("--defence", "oclusion"): "is occlusion meant",
         ("--defence", "physics", "-o", str(tmp_path / "out")): "is not empty",
-        ("--defence", "physics", "--fuse", "mean"): "harmonic, max, fisher or none",
+        ("--defence", "physics", "--fuse", "mean"): "harmonic, max, fisher, none",
         ("--defence", "physics", "--calibrate"): "give --out",
         ("--defence", "physics", "--calibrate", "--fuse", "max"): "leave out",
         ("--defence", "physics", "--calibration", str(attacked / "dataset.json")): "no calibration",
