@@ -31,9 +31,11 @@ demo: $(STAMP)
 	$(BIN)/python examples/demo.py
 
 test: $(STAMP)
+	$(BIN)/python -m geoscene.support.kernels
 	$(PYTEST) -m "not full"
 
 test-all: $(STAMP)
+	$(BIN)/python -m geoscene.support.kernels
 	$(PYTEST)
 
 test-gpu: $(STAMP)

@@ -4,18 +4,21 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import pytest
 from filelock import FileLock
 from helpers import DEMO_BOX, ROOT
+from helpers.drives import PLAIN, record_in_town
 from hypothesis import HealthCheck, settings
 
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
+from lidar.simulation.drive import drive
 
 # Many tests start processes, which else compile every module that they import: half a second for each.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -32,28 +35,33 @@ FUZZ_FACTOR = 10
 
 FULL = (
     "extremes/test_footprints", "extremes/test_places", "extremes/test_rays", "extremes/test_scale",
-    "geoscene/pipeline/test_interruptions", "geoscene/pipeline/test_scale",
-    "geoscene/support/test_cluster", "geoscene/support/test_storage", "geoscene/view/test_view_browser",
-    "lidar/simulation/test_cluster", "lidar/simulation/test_killed", "lidar/simulation/test_storage",
-    "lidar/tools/odometry/test_lidar_methods", "lidar/tools/view/test_page_browser",
-    "lidar/traffic/test_sumo", "test_benchmarks", "test_documented_commands", "test_examples", "test_site",
+    "geoscene/pipeline/test_interruptions", "geoscene/pipeline/test_scale", "lidar/simulation/test_killed",
+    "test_benchmarks", "test_documented_commands", "test_examples", "test_site",
 )  # fmt: skip
-"""Modules of which `make test` runs nothing but tests marked ``gate``: they kill programs, start browsers,
-servers and clusters, run all documented commands, or need minutes."""
+"""Modules of which `make test` runs nothing but tests marked ``gate``."""
+
+SERVERS = {"address", "cluster", "storage_server", "window"}
+"""Fixtures that start servers, clusters and browsers, whose tests `make test` leaves out."""
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark tests that `make test` leaves out, and multiply the examples under ``--hypothesis-profile=fuzz``.
 
-    Modules that use a scene take longest and come first, so that all workers end together.
+    Modules that use a scene and others take turns, those with the drive through a town first. While one
+    worker compiles most kernels for it, another has tests that need few of them.
     """
     for item in items:
         module = item.path.relative_to(ROOT / "tests").with_suffix("").as_posix()
         is_full = module in FULL and not item.get_closest_marker("gate")
-        if is_full or item.get_closest_marker("shared"):
+        if is_full or item.get_closest_marker("shared") or SERVERS & set(getattr(item, "fixturenames", ())):
             item.add_marker("full")
-    in_scenes = {item.path for item in items if "scene" in getattr(item, "fixturenames", ())}
-    items.sort(key=lambda item: item.path not in in_scenes)
+    users = (
+        [i.path for i in items if name in getattr(i, "fixturenames", ())] for name in ("town_drive", "scene")
+    )
+    in_scenes = list(dict.fromkeys(chain(*users)))
+    others = list(dict.fromkeys(item.path for item in items if item.path not in in_scenes))
+    turn = {path: 2 * k + j for j, paths in enumerate((in_scenes, others)) for k, path in enumerate(paths)}
+    items.sort(key=lambda item: turn[item.path])
     if config.getoption("--hypothesis-profile") == "fuzz":
         attribute = "_hypothesis_internal_use_settings"  # there is no public way to the settings of a test
         functions = (item.obj for item in items if isinstance(item, pytest.Function))
@@ -92,19 +100,30 @@ def shared_dem() -> Callable[[str], Path]:
 
 
 @pytest.fixture(scope="session")
-def demo_scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
-    """The middle of the demo map in a CRS, built once for all worker processes of the test run; read only."""
-    folder = tmp_path_factory.getbasetemp()
-    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """A function that makes a folder by name once for all worker processes of the test run; read only."""
+    shared = tmp_path_factory.getbasetemp()
+    shared = shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared
 
-    def built(crs: str) -> Scene:
-        path = folder / f"demo-{crs}"
+    def made(name: str, make: Callable[[Path], object]) -> Path:
+        path = shared / name
         with FileLock(path.with_suffix(".lock")):
             if not path.exists():
-                return build(
-                    read_osm(demo_path(), bounds=DEMO_BOX), path, options=BuildOptions(name="demo", crs=crs)
-                )
-        return open_scene(path)
+                make(path)
+        return path
+
+    return made
+
+
+@pytest.fixture(scope="session")
+def demo_scene(once: Callable[..., Path]) -> Callable[[str], Scene]:
+    """The middle of the demo map in a CRS."""
+
+    def built(crs: str) -> Scene:
+        def make(path: Path) -> None:
+            build(read_osm(demo_path(), bounds=DEMO_BOX), path, options=BuildOptions(name="demo", crs=crs))
+
+        return open_scene(once(f"demo-{crs}", make))
 
     return built
 
@@ -119,6 +138,18 @@ def scene(demo_scene: Callable[[str], Scene]) -> Scene:
 def scene_utm(demo_scene: Callable[[str], Scene]) -> Scene:
     """The middle of the demo map in UTM."""
     return demo_scene("utm")
+
+
+@pytest.fixture(scope="session")
+def town_drive(scene: Scene, once: Callable[..., Path]) -> Path:
+    """Folder of 0.6 s of the rig `seed`, which has cameras, in snow, among road users and under attack."""
+    return once("a drive", lambda path: record_in_town(scene, path))
+
+
+@pytest.fixture(scope="session")
+def plain_drive(scene: Scene, once: Callable[..., Path]) -> Path:
+    """Folder of the drive that `helpers.drives.PLAIN` describes: ten sweeps of a VLP-16 as PCD and LAZ."""
+    return once("plain drive", lambda path: drive(scene, path, options=PLAIN))
 
 
 @pytest.fixture

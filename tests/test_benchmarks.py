@@ -65,6 +65,7 @@ def error_line(done):
     return line
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "name",
     sorted(
@@ -131,6 +132,7 @@ def test_two_runs_on_one_machine_have_ratios(quick, tmp_path):
     assert "another" in done.stderr
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("text", ["", "{}", "[]"])
 def test_files_that_are_no_reports_are_refused(text, tmp_path):
     path = tmp_path / "bench.json"
@@ -140,6 +142,7 @@ def test_files_that_are_no_reports_are_refused(text, tmp_path):
     assert str(path) in error_line(done)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0, 2.0])
 def test_exponents_of_known_curves(power, bench):
     rng = np.random.default_rng(1)
@@ -152,6 +155,7 @@ def test_exponents_of_known_curves(power, bench):
     assert exact.value == pytest.approx(power, abs=1e-12)
 
 
+@pytest.mark.gate
 def test_curves_without_an_exponent(bench):
     exponent = bench("bench.growth").exponent
     assert exponent([1, 2, 3], [1, 0, 2]) is None
@@ -162,6 +166,7 @@ def test_curves_without_an_exponent(bench):
     assert np.isnan(two.error)
 
 
+@pytest.mark.gate
 def test_curves_are_fitted_through_the_medians_of_their_sizes(bench):
     curve = bench("bench.growth").Curve
     x, cost = [1.0, 10.0, 100.0, 1000.0], [3.0, 40.0, 200.0, 3000.0]
@@ -210,6 +215,7 @@ def test_builds_that_are_measured_make_all_their_tiles(bench, tmp_path, monkeypa
     assert not maps.built(tmp_path / "a.osm", tmp_path / "scene", workers=1)
 
 
+@pytest.mark.gate
 def test_sides_take_turns_and_ratios_are_of_the_same_repetition(bench):
     measure, order = bench("bench.measure"), []
 

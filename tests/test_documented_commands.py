@@ -1,4 +1,4 @@
-"""The commands in the README, the documentation and the help texts do what they say.
+"""The commands in the README, the documentation and the help texts are parsed and do what they say.
 
 They run one after the other in a folder with the files that they name, each once, unless a later one needs
 what it writes. Those for map servers, and those that serve or open a window, are only parsed. The bundled map
@@ -108,19 +108,9 @@ SOURCES = [page for page in PAGES if in_page(page)] + ["geoscene --help", "lidar
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    """A folder with the input files of all examples."""
-    folder = tmp_path_factory.mktemp("inputs")
-    city = folder / "city.osm.pbf"
-    with osmium.BackReferenceWriter(str(city), str(demo_path()), overwrite=True) as writer:
-        for item in osmium.FileProcessor(demo_path()).with_locations():
-            if item.is_way() and any(inside(BOX, node) for node in item.nodes):
-                writer.add(item)
-    osm = read_osm(city, bounds=BOX)
-    rows = [overture_row(area) for area in osm.areas if "building" in area.tags]
-    write_overture(folder / "buildings.parquet", rows)
-    write_slope(folder / "heights.tif", BOX, rise=0.3)
-    write_survey(folder / "survey.laz", BOX)
+def texts(tmp_path_factory):
+    """A folder with the input files of all examples that are text."""
+    folder = tmp_path_factory.mktemp("texts") / "texts"
     reference = ROOT / "docs" / "reference"
     pages = [(reference / f"{name}.md").read_text("utf-8") for name in ("stages", "sweeps", "security")]
     stages, sweep, matrix = (page.split("```toml")[1].split("```")[0] for page in pages)
@@ -131,6 +121,23 @@ def inputs(tmp_path_factory):
     texts["examples/redteam.toml"] = brief((folder / "examples" / "redteam.toml").read_text("utf-8"))
     for name, text in texts.items():
         (folder / name).write_text(text, "utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inputs(texts, tmp_path_factory):
+    """A folder with the input files of all examples."""
+    folder = shutil.copytree(texts, tmp_path_factory.mktemp("inputs") / "inputs")
+    city = folder / "city.osm.pbf"
+    with osmium.BackReferenceWriter(str(city), str(demo_path()), overwrite=True) as writer:
+        for item in osmium.FileProcessor(demo_path()).with_locations():
+            if item.is_way() and any(inside(BOX, node) for node in item.nodes):
+                writer.add(item)
+    osm = read_osm(city, bounds=BOX)
+    rows = [overture_row(area) for area in osm.areas if "building" in area.tags]
+    write_overture(folder / "buildings.parquet", rows)
+    write_slope(folder / "heights.tif", BOX, rise=0.3)
+    write_survey(folder / "survey.laz", BOX)
     for name in ("scene", "city"):
         scene = build(osm, folder / name)
     options = DriveOptions(rig=str(folder / "my_rig.toml"), duration=0.2, formats=("kitti",))
@@ -219,9 +226,21 @@ def inside(box, node):
     return node.location.valid() and box[0] < node.lon < box[2] and box[1] < node.lat < box[3]
 
 
+def commands_of(source):
+    return in_help(source.split()[0]) if source.endswith("--help") else in_page(source)
+
+
+@pytest.mark.gate
+@pytest.mark.parametrize("source", SOURCES)
+def test_documented_commands_are_parsed(source, texts, monkeypatch):
+    monkeypatch.chdir(texts)
+    for program, *words in commands_of(source):
+        APPS[program].parse_args(words, exit_on_error=False, print_error=False)
+
+
 @pytest.mark.parametrize("source", SOURCES)
 def test_documented_commands_succeed(source, folder):
-    found = in_help(source.split()[0]) if source.endswith("--help") else in_page(source)
+    found = commands_of(source)
     for number, (program, *words) in enumerate(found):
         _, bound, _ = APPS[program].parse_args(words, exit_on_error=False, print_error=False)
         if is_only_parsed(words):

@@ -39,6 +39,7 @@ def rows_of(path):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.gate
 def test_all_examples_are_tested():
     text = Path(__file__).read_text("utf-8")
     for path in FOLDER.glob("*.py"):

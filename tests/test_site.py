@@ -70,6 +70,7 @@ def test_the_reference_lists_all_sensors_and_rigs(site):
         assert re.search(rf"\b{name}\b", text), name
 
 
+@pytest.mark.gate
 def test_links_of_the_repositorys_pages_lead_to_files():
     """On a repository host, where README and the others are read as they are."""
     for page in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]:

@@ -81,8 +81,16 @@ def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
         ("geoscene", ["build", "--demo", "--along", "nan,nan", "nan,nan", "-o", "x"], "--along nan,nan"),
         ("geoscene", ["info", "nowhere"], "nowhere"),
         ("geoscene", ["validate", "nowhere"], "nowhere"),
-        ("lidar", ["drive", "nowhere", "--route", "random", "--format", "doc", "-o", "x"], "--format doc"),
-        ("lidar", ["drive", "nowhere", "--route", "random", "--set", "ray=7", "-o", "x"], "--set ray"),
+        (
+            "lidar",
+            ["drive", "nowhere", "--route", "random", "--format", "doc", "-o", "x"],
+            "format 'doc' is unknown",
+        ),
+        (
+            "lidar",
+            ["drive", "nowhere", "--route", "random", "--set", "ray=7", "-o", "x"],
+            "--set 'ray' is unknown",
+        ),
         ("lidar", ["drive", "nowhere", "--route", "random", "-o", "x"], "nowhere"),
         ("lidar", ["drive", "nowhere", "--seed", "1.5", "-o", "x"], "--seed"),
         ("lidar", ["map", "nowhere", "-o", "x.laz"], "nowhere"),
@@ -159,6 +167,7 @@ def test_closed_pipe_ends_the_program_without_a_message(scene, name, words):
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.full
 def test_suggested_commands_quote_paths_and_new_folders_are_named(tmp_path):
     out = tmp_path / "my scenes" / "it's one"
     done = run_program("geoscene", "build", "--demo", "--bbox", BOX, "-o", out)
@@ -171,6 +180,7 @@ def test_suggested_commands_quote_paths_and_new_folders_are_named(tmp_path):
 FORMATS = ["tif", "gpkg", "glb", "city.json", "geojson", "parquet", "obj", "ply", "stl"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("suffix", [*FORMATS, "html"])
 def test_full_disk_gives_one_line_that_names_the_file(scene, tmp_path, suffix):
     """Files of at most 30 kB stand for a full disk; both fail when bytes are written."""

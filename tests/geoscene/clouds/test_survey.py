@@ -127,6 +127,7 @@ def test_heights_roofs_trees_and_ground_of_a_village_are_measured(cloud_file, tm
     assert np.percentile(np.abs(terrain.height(x, y) - ground(x)), 95) < 0.05
 
 
+@pytest.mark.full
 def test_the_result_does_not_depend_on_the_number_of_workers(cloud_file, tmp_path):
     one = measured(village_map(), cloud_file, tmp_path / "one", workers=1)
     two = measured(village_map(), cloud_file, tmp_path / "two", workers=2)

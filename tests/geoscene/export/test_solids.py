@@ -213,6 +213,7 @@ def test_cityjson_of_a_frame_without_a_code_is_in_utm_and_closed(tmp_path):
     np.testing.assert_allclose(verdict.volume, SOLID_VOLUMES[0], rtol=1e-6)
 
 
+@pytest.mark.full
 def test_every_solid_of_a_real_place_is_still_closed_after_ply(demo_scene, tmp_path):
     scene = demo_scene("utm")
     mesh = trimesh.load(export_scene(scene, tmp_path / "a.ply").path, process=False)

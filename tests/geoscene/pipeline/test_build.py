@@ -163,6 +163,7 @@ def test_number_of_workers_does_not_change_the_bytes(osm, scene, tmp_path):
     same_files(scene.path, again.path)
 
 
+@pytest.mark.full
 def test_spawned_workers_give_the_same_bytes(tmp_path, monkeypatch):
     spawn = multiprocessing.get_context("spawn")
     monkeypatch.setattr("geoscene.support.processes.multiprocessing.get_context", lambda: spawn)

@@ -69,6 +69,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.gate
 def test_every_option_has_a_change():
     assert set(CHANGES) == {f.name for f in fields(BuildOptions)}
 
@@ -107,6 +108,7 @@ def test_tiles_of_other_sources_are_built_again(osm, whole, tmp_path, monkeypatc
     assert len(made) == len(again.tile_indices)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     ("change", "noticed"),
     [
@@ -141,6 +143,7 @@ def test_elevation_file_with_other_heights_is_noticed(osm, raster, tmp_path):
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("lod", [1, 2])
 def test_damaged_tile_is_built_again(lod, osm, whole, tmp_path):
     shutil.copytree(whole.path, tmp_path / "scene")
@@ -151,6 +154,7 @@ def test_damaged_tile_is_built_again(lod, osm, whole, tmp_path):
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "{}", '{"keys": 1, "tiles": 2}', '{"keys": {}, "tiles": [1]}']
 )
@@ -177,6 +181,7 @@ def ended_by(error, osm, path, monkeypatch):
     monkeypatch.setattr(geoscene.pipeline.tiles, "build_tile", build_tile)
 
 
+@pytest.mark.gate
 def test_resumed_build_replaces_damaged_tiles_and_skips_damaged_lines(osm, whole, tmp_path, monkeypatch):
     ended_by(KeyboardInterrupt(), osm, tmp_path / "scene", monkeypatch)
     files = SceneFiles(tmp_path / "scene.part")
@@ -224,7 +229,7 @@ def test_interruption_ends_the_program_without_waiting_for_its_threads(error):
         env=ENVIRONMENT,
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=50,
         check=False,
     )
     assert (done.returncode, done.stderr) == (130, "geoscene: interrupted\n")
@@ -252,7 +257,7 @@ def test_interruption_that_is_lost_ends_the_program_soon(number, code):
         process.send_signal(number)
         process.stdout.readline()
         process.send_signal(number)  # as `timeout` does
-        _, errors = process.communicate(timeout=20)
+        _, errors = process.communicate(timeout=50)
     assert (process.returncode, errors) == (code, "geoscene: interrupted\n")
 
 
@@ -262,7 +267,7 @@ def test_interruption_that_is_lost_ends_the_program_soon(number, code):
 def test_interruption_stops_all_processes_at_once_and_keeps_the_journal(send, number, code, tmp_path):
     process = started(tmp_path / "scene", 3)
     send(process.pid, number)
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=50)
     assert (process.returncode, errors) == (code, "geoscene: interrupted; repeat the command to resume\n")
     assert alive(process.pid) == []
     assert [path.name for path in tmp_path.iterdir()] == ["scene.part"]
@@ -286,7 +291,7 @@ def test_finished_tiles_are_kept_when_all_workers_are_killed(tmp_path):
     process = started(tmp_path / "scene", 3)
     for worker in set(alive(process.pid)) - {process.pid}:
         os.kill(worker, signal.SIGKILL)
-    _, errors = process.communicate(timeout=20)
+    _, errors = process.communicate(timeout=50)
     assert process.returncode == 1
     assert "--workers" in errors.splitlines()[-1]
     assert "Traceback" not in errors
@@ -304,6 +309,7 @@ def test_partly_written_tiles_of_killed_workers_are_deleted(osm, whole, tmp_path
     same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
 
 
+@pytest.mark.gate
 def test_error_of_a_task_reaches_the_caller():
     with pytest.raises(ZeroDivisionError) as raised:
         list(run_tasks(partial(divmod, 1), [1, 0, 2], workers=2))
@@ -369,6 +375,7 @@ def test_tiles_are_kept_when_space_or_memory_ends(error, osm, whole, tmp_path, m
     same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
 
 
+@pytest.mark.gate
 def test_files_of_others_are_kept_and_named(osm, whole, tmp_path, caplog):
     scene = tmp_path / "scene"
     shutil.copytree(whole.path, scene)
@@ -391,6 +398,7 @@ def test_files_of_others_are_kept_and_named(osm, whole, tmp_path, caplog):
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("renamed", [False, True])
 def test_replacement_that_was_killed_is_completed(renamed, osm, whole, tmp_path):
     """Killed after the old scene was set aside, before or after the new one got its name."""
@@ -420,6 +428,7 @@ def test_scene_behind_a_link_is_replaced(osm, whole, tmp_path):
     same_files(whole.path, tmp_path / "scene")
 
 
+@pytest.mark.gate
 @pytest.mark.parametrize("out", [".", "..", "/"])
 def test_current_directory_is_refused_before_the_work(out, tmp_path):
     (tmp_path / "inner").mkdir()
@@ -428,6 +437,7 @@ def test_current_directory_is_refused_before_the_work(out, tmp_path):
     assert "cannot be replaced" in done.stderr
 
 
+@pytest.mark.gate
 def test_target_is_checked_before_the_map_is_read(whole):
     done = run_program("geoscene", "build", "--osm", "nowhere.osm", "-o", whole.path)
     assert "--overwrite" in done.stderr

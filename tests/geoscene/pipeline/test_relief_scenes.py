@@ -59,6 +59,7 @@ def test_parts_that_stand_out_leave_solids_closed(relief):
     assert relief.manifest["relief"]["facades"]["balconies"] > 0
 
 
+@pytest.mark.full
 def test_the_bytes_of_relief_do_not_depend_on_workers(osm, relief, tmp_path):
     build(osm, tmp_path / "two", options=FULL, workers=2)
     same_files(relief.path, tmp_path / "two")

@@ -76,6 +76,7 @@ def test_synthetic_city_builds_without_repairs(scene):
     assert scene.layers["structures"][1] > scene.layers["structures"][0]
 
 
+@pytest.mark.gate
 def test_partition_of_a_tile_ignores_distant_polygons(monkeypatch):
     compared = []
     partition = importlib.import_module("geoscene.ground.partition")
@@ -107,7 +108,7 @@ def test_build_resumes_after_sigkill_with_the_same_bytes(town, scene, tmp_path):
         time.sleep(0.02)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 60
     while alive(process.pid) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert alive(process.pid) == []  # its workers have exited
@@ -141,6 +142,7 @@ def test_long_wall_in_range_adds_its_tile(make_osm, town, tmp_path):
     assert (walled.tile(*home).mesh.klass == Class.WALL).any()
 
 
+@pytest.mark.gate
 def test_bridge_with_an_end_in_range_adds_its_tile(town, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.pipeline.reach.OFFSET", 0.0)
     monkeypatch.setattr("geoscene.pipeline.reach._CROWN", 0.0)
@@ -182,6 +184,7 @@ def test_drive_on_tiles_along_its_route_gives_the_same_bytes(make_osm, town, tmp
     assert plan_drive(part, words).limits == []
 
 
+@pytest.mark.gate
 def test_drive_beyond_what_was_built_along_a_route_says_so(make_osm, part, scene):
     lonlat = make_osm.on_globe(np.array([(-300.0, 0.0), (-250.0, 0.0), (250.0, 0.0)]))
     route = tuple((lat, lon) for lon, lat in lonlat.tolist())
@@ -205,6 +208,7 @@ def part(make_osm, town, tmp_path_factory):
         return build(read_osm(town), tmp_path_factory.mktemp("part") / "scene", options=options)
 
 
+@pytest.mark.gate
 def test_tables_along_a_route_hold_what_is_in_reach_with_the_numbers_of_the_whole_scene(scene, part):
     assert part.layers == scene.layers
     assert sum(p.stat().st_size for p in (part.files.features, part.files.road_graph)) < 0.6 * sum(
@@ -227,6 +231,7 @@ def test_tables_along_a_route_hold_what_is_in_reach_with_the_numbers_of_the_whol
     assert part.table_length("buildings") < 0.6 * scene.table_length("buildings")
 
 
+@pytest.mark.gate
 def test_edges_of_structures_along_a_route_are_those_of_its_road_graph(part):
     structures, graph = part.features("structures"), part.road_graph()
     roads = part.features("roads")

@@ -595,7 +595,10 @@ def test_forking_tunnels_share_one_tube_without_walls_across_lanes():
         assert (first_above(mesh, moved(points, 0, 0, 0.3)) > points[:, 2] + 4.5).all()
 
 
-@pytest.mark.parametrize("arms_deg", [(-144, 39, 87), (7, 58, 77), (-84, 92, -9)])
+@pytest.mark.parametrize(
+    "arms_deg",
+    [(-144, 39, 87), *(pytest.param(arms, marks=pytest.mark.full) for arms in ((7, 58, 77), (-84, 92, -9)))],
+)
 def test_tunnels_that_meet_at_any_angle_leave_no_wall_at_the_bend(arms_deg):
     places, ways = {1: (0.0, 0.0)}, []
     for k, arm in enumerate(np.radians(arms_deg)):

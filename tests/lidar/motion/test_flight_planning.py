@@ -174,37 +174,30 @@ def test_impossible_flights_are_refused_in_one_line(scene, rig, change, says):
 # ---------------------------------------------------------------------------------------------- replays
 
 
-@pytest.fixture(scope="module")
-def driven(scene, tmp_path_factory):
-    out = tmp_path_factory.mktemp("drive") / "a"
-    drive(scene, out, options=DriveOptions(rig="vlp16", duration=6.0, seed=3, formats=("pcd",)))
-    return out
-
-
-def test_a_replayed_trajectory_is_bit_identical(scene, driven, tmp_path):
-    options = DriveOptions(rig="vlp16", route=driven / "trajectory.csv", formats=("pcd",), duration=2.0)
+def test_a_replayed_trajectory_is_bit_identical(scene, plain_drive, tmp_path):
+    options = DriveOptions(rig="vlp16", route=plain_drive / "trajectory.csv", formats=("pcd",), duration=0.5)
     drive(scene, tmp_path / "b", options=options)
     again = read_trajectory(tmp_path / "b" / "trajectory.csv")
-    first = read_trajectory(driven / "trajectory.csv").until(2_000_000_000)
+    first = read_trajectory(plain_drive / "trajectory.csv").until(500_000_000)
     np.testing.assert_array_equal(again.position, first.position)
-    for k in (0, 19):
+    for k in (0, 4):
         name = f"lidar_top/pcd/{k:06d}.pcd"
-        assert (tmp_path / "b" / name).read_bytes() == (driven / name).read_bytes()
+        assert (tmp_path / "b" / name).read_bytes() == (plain_drive / name).read_bytes()
 
 
-def test_replayed_poses_agree_within_centimetres(scene, driven):
-    again = read_replay(driven / "poses.csv", scene.frame)
-    first = read_trajectory(driven / "trajectory.csv")
-    span = again.time_ns[again.time_ns < 5_800_000_000]
+def test_replayed_poses_agree_within_centimetres(scene, plain_drive):
+    again = read_replay(plain_drive / "poses.csv", scene.frame)
+    first = read_trajectory(plain_drive / "trajectory.csv")
+    span = again.time_ns[again.time_ns < 800_000_000]
     np.testing.assert_allclose(again.at(span).position, first.at(span).position, atol=0.02)
     np.testing.assert_allclose(again.at(span).rotation, first.at(span).rotation, atol=0.01)
 
 
 @pytest.mark.parametrize(("rows", "word"), [(1, "row 2 is"), (None, "area")])
-def test_a_damaged_trajectory_is_refused(scene_utm, driven, tmp_path, rows, word):
+def test_a_damaged_trajectory_is_refused(scene_utm, plain_drive, tmp_path, rows, word):
     """A single place far away needs an impossible speed; where all are, the axes are not known."""
-    shutil.copy(driven / "dataset.json", tmp_path)
-    first, *lines = (driven / "trajectory.csv").read_text().splitlines()
+    shutil.copy(plain_drive / "dataset.json", tmp_path)
+    first, *lines = (plain_drive / "trajectory.csv").read_text().splitlines()
     for k, line in enumerate(lines[:rows]):
         time, _, *rest = line.split(",")
         lines[k] = ",".join([time, "1e12", *rest])
@@ -214,21 +207,26 @@ def test_a_damaged_trajectory_is_refused(scene_utm, driven, tmp_path, rows, word
 
 
 @pytest.mark.parametrize("name", ["trajectory.csv", "poses.csv"])
-def test_a_drive_replayed_in_another_frame_keeps_its_geographic_positions(scene, scene_utm, driven, name):
-    here, there = read_replay(driven / name, scene.frame), read_replay(driven / name, scene_utm.frame)
-    lon, lat = scene.frame.to_geographic(*here.position[::100, :2].T)
+def test_a_drive_replayed_in_another_frame_keeps_its_geographic_positions(
+    scene, scene_utm, plain_drive, name
+):
+    here, there = (
+        read_replay(plain_drive / name, scene.frame),
+        read_replay(plain_drive / name, scene_utm.frame),
+    )
+    lon, lat = scene.frame.to_geographic(*here.position[::20, :2].T)
     np.testing.assert_allclose(
-        scene_utm.frame.to_geographic(*there.position[::100, :2].T), (lon, lat), atol=1e-9
+        scene_utm.frame.to_geographic(*there.position[::20, :2].T), (lon, lat), atol=1e-9
     )
     # one metre ahead of the vehicle is the same place too: axes are turned by the convergence
     ahead = np.tile([1.0, 0.0, 0.0], (len(lon), 1))
-    one, other = (t.at(t.time_ns[::100]).place(ahead) for t in (here, there))
+    one, other = (t.at(t.time_ns[::20]).place(ahead) for t in (here, there))
     found = scene.frame.from_geographic(*scene_utm.frame.to_geographic(*other[:, :2].T))
     np.testing.assert_allclose(np.column_stack(found), one[:, :2], atol=1e-4)
 
 
-def test_a_replay_that_never_comes_near_the_scene_is_refused(scene, driven, tmp_path):
-    first, *lines = (driven / "trajectory.csv").read_text().splitlines()
+def test_a_replay_that_never_comes_near_the_scene_is_refused(scene, plain_drive, tmp_path):
+    first, *lines = (plain_drive / "trajectory.csv").read_text().splitlines()
     column = first.split(",").index("x")
     rows = [line.split(",") for line in lines]
     moved = [[*row[:column], str(float(row[column]) + 5000.0), *row[column + 1 :]] for row in rows]
@@ -247,8 +245,8 @@ def test_tables_without_poses_are_refused(scene, tmp_path):
         read_replay(tmp_path / "y.csv", scene.frame)
 
 
-def test_poses_of_other_programs_need_no_dataset(scene, driven, tmp_path):
-    shutil.copy(driven / "poses.csv", tmp_path / "poses.csv")
+def test_poses_of_other_programs_need_no_dataset(scene, plain_drive, tmp_path):
+    shutil.copy(plain_drive / "poses.csv", tmp_path / "poses.csv")
     with (tmp_path / "poses.csv").open() as file:
         rows = list(csv.DictReader(file))
     trajectory = read_replay(tmp_path / "poses.csv", scene.frame)

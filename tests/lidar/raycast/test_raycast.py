@@ -16,7 +16,7 @@ from lidar.errors import BackendError, InputError
 from lidar.geometry.poses import Poses
 from lidar.raycast import ALL, Caster, MeshInstances, caster, library
 from lidar.raycast.columns import CHUNK
-from lidar.raycast.geometry import planes
+from lidar.raycast.geometry import check_mesh, planes, split
 from lidar.raycast.hull import displacements
 from lidar.raycast.rays import free_rays, share
 
@@ -524,7 +524,7 @@ def test_rays_miss_an_empty_mesh(backend):
 def test_hits_do_not_depend_on_earlier_updates():
     """Parts attached and detached step by step give the same hits as the final set at once."""
     rng = np.random.default_rng(11)
-    parts = {k: caster.split(*caster.check_mesh(*soup(rng, 50)))[0] for k in range(8)}
+    parts = {k: split(*check_mesh(*soup(rng, 50)))[0] for k in range(8)}
     way = directions(rng, 20_000)
     moved = Caster(origin=np.zeros(3), dynamic=True)
     moved.update(attach={k: parts[k] for k in (0, 3, 5, 6)})
@@ -612,6 +612,6 @@ def test_a_forked_process_casts_with_its_own_threads():
     out = context.Queue()
     child = context.Process(target=_cast_in_child, args=(solid, start, way, out))
     child.start()
-    np.testing.assert_array_equal(out.get(timeout=30), before)
+    np.testing.assert_array_equal(out.get(timeout=120), before)
     child.join(30)
     assert child.exitcode == 0

@@ -121,6 +121,7 @@ def test_files_hold_no_column_of_the_truth(plain, altered):
     assert FORMATS["pcd"].read(plain / first).keys() == FORMATS["pcd"].read(altered / first).keys()
 
 
+@pytest.mark.full
 def test_bytes_do_not_depend_on_workers_or_on_a_resumed_drive(scene, options, altered, tmp_path):
     wanted = replace(options, stages=STAGES, workers=3)
     drive(scene, tmp_path / "a", options=wanted)
@@ -359,7 +360,7 @@ class Watching(Stage):
 FORMER = {}
 
 
-@pytest.mark.parametrize("chunk", [200.0, 0.5])
+@pytest.mark.parametrize("chunk", [pytest.param(200.0, marks=pytest.mark.full), 0.5])
 def test_stages_are_given_earlier_clouds_as_they_are_without_stages(
     scene, options, plain, tmp_path, chunk, monkeypatch
 ):

@@ -72,6 +72,7 @@ def test_a_drive_that_is_killed_while_it_is_deleted_counts_as_not_finished(forke
     assert finished == (number == 4)  # the rename of the manifest
 
 
+@pytest.mark.gate
 def test_a_drive_that_fails_before_its_first_frame_keeps_the_files_of_others(scene, copy, monkeypatch):
     (copy.path / "notes.txt").write_text("mine")
 
@@ -100,6 +101,7 @@ def test_a_drive_that_another_process_records_is_not_deleted(scene, dataset, cop
     same_files(copy.path, dataset.path)
 
 
+@pytest.mark.gate
 def test_a_map_appears_after_the_files_beside_it(dataset, tmp_path, monkeypatch):
     write = maps.write_map_provenance
 
@@ -136,6 +138,7 @@ def test_a_drive_is_deleted_by_whoever_comes_after_a_kill(forked, dataset, copy,
         shutil.copytree(dataset.path, copy.path, dirs_exist_ok=True)
 
 
+@pytest.mark.gate
 def test_a_file_that_cannot_be_copied_is_named_in_one_line(copy, tmp_path):
     (copy.path / "lidar_top" / "pcd" / "000001.pcd").unlink()
     (copy.path / "lidar_top" / "pcd" / "000001.pcd").symlink_to(tmp_path / "gone")

@@ -129,6 +129,7 @@ def test_drives_of_a_map_have_the_bytes_of_drives_in_its_whole_scene(kind, town,
     same_drives(tmp_path / "a", tmp_path / "b")
 
 
+@pytest.mark.full
 def test_flights_of_a_map_have_the_bytes_of_flights_in_its_whole_scene(town, tmp_path):
     south, north = at(400, -60), at(900, 60)
     survey = f"{south[1]},{south[0]},{north[1]},{north[0]}"
@@ -202,6 +203,7 @@ def test_damaged_and_half_scenes_of_the_cache_are_built_again(harm, town, south,
     assert sorted(p.name for p in first.scene.path.parent.iterdir()) == ["drives", "scene"]
 
 
+@pytest.mark.full
 def test_scenes_are_built_by_several_processes_that_start_anew_if_libraries_have_threads(
     town, south, tmp_path
 ):
@@ -211,6 +213,7 @@ def test_scenes_are_built_by_several_processes_that_start_anew_if_libraries_have
     same_files(alone.path, together.path)
 
 
+@pytest.mark.full
 def test_a_program_that_is_killed_while_a_scene_grows_leaves_a_cache_that_works(
     town, south, tmp_path, monkeypatch
 ):
@@ -304,6 +307,7 @@ def program(town, out, cache, *words):
     )  # fmt: skip
 
 
+@pytest.mark.full
 def test_programs_share_the_cache_without_harm(town, south, tmp_path):
     cache = tmp_path / "cache"
     routes = [[at(20), at(180)], [at(2020), at(2180)], [at(20), at(180)]]
@@ -324,6 +328,7 @@ def test_programs_share_the_cache_without_harm(town, south, tmp_path):
         same_drives(tmp_path / f"w{k}", tmp_path / f"d{k}")
 
 
+@pytest.mark.full
 def test_the_program_says_what_it_built(town, tmp_path):
     route = [f"{lat},{lon}" for lat, lon in (at(20), at(180))]
     first, second = (

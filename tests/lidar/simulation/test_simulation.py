@@ -80,7 +80,9 @@ def options_with(stages, folder):
     )
 
 
-@pytest.mark.parametrize("altered", [False, True], ids=["clear", "stages"])
+@pytest.mark.parametrize(
+    "altered", [pytest.param(False, marks=pytest.mark.full), True], ids=["clear", "stages"]
+)
 def test_simulated_frames_are_those_that_a_drive_records(altered, scene, tmp_path):
     options = options_with(read_stages(STAGES).stages if altered else (), tmp_path)
     dataset = lidar.open_dataset(drive(scene, tmp_path / "drive", options=options).path)

@@ -36,7 +36,9 @@ def recorded(folder):
     return {p.relative_to(folder): p.read_bytes() for p in files}
 
 
-@pytest.mark.parametrize(("use", "rig"), [("lidar", "vlp16"), ("camera", "seed")])
+@pytest.mark.parametrize(
+    ("use", "rig"), [("lidar", "vlp16"), pytest.param("camera", "seed", marks=pytest.mark.full)]
+)
 def test_drive_through_a_scene_for_its_sensors_has_the_bytes_of_the_whole_one(use, rig, scenes, tmp_path):
     options = replace(OPTIONS, rig=rig)
     for name in ("all", use):

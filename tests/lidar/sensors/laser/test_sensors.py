@@ -129,7 +129,7 @@ def test_the_sick_scanner_halves_its_step_at_half_the_rate():
 def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
     for name in sensor_names():
         sensor = load_sensor(name)
-        frames = [firings(sensor, k) for k in (0, 1, 7)]
+        frames = [firings(sensor, k) for k in (0, 7)]
         for f in frames:
             assert np.linalg.norm(f.direction, axis=1) == pytest.approx(1.0, abs=1e-12), name
             assert sorted(f.order) == list(range(len(f))), name

@@ -220,6 +220,7 @@ def test_it_finds_more_vehicles_than_the_rules_on_a_drive_it_was_not_trained_on(
     assert _f1(street, tmp_path, "learned") > _f1(street, tmp_path, "rules") + 0.03
 
 
+@pytest.mark.full
 def test_training_gives_the_same_bytes_for_any_number_of_workers(street: Path, tmp_path: Path) -> None:
     made = [
         train([street], tmp_path / f"{k}.npz", trees=5, seed=seed, workers=workers)

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
-from helpers.drives import record
 from helpers.programs import run_program
 from PIL import Image
 
@@ -25,11 +24,6 @@ from lidar.tools.films.panes import CameraPane, MapPane, SweepPane, Sweeps
 SMALL = {"size": (320, 240)}
 
 
-@pytest.fixture(scope="module")
-def drive(scene, tmp_path_factory):
-    return record(scene, tmp_path_factory.mktemp("drive") / "drive")
-
-
 def decoded(path):
     """Images (n, h, w, 3) of an MP4, their times in seconds, and its length."""
     with av.open(path) as file:
@@ -41,8 +35,8 @@ def decoded(path):
         )
 
 
-def test_an_mp4_has_every_sweep_at_its_time(drive, tmp_path):
-    made = film(open_dataset(drive), tmp_path / "a.mp4", options=FilmOptions(**SMALL))
+def test_an_mp4_has_every_sweep_at_its_time(town_drive, tmp_path):
+    made = film(open_dataset(town_drive), tmp_path / "a.mp4", options=FilmOptions(**SMALL))
     images, times, length = decoded(tmp_path / "a.mp4")
     assert images.shape == (6, 240, 320, 3)
     assert times == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
@@ -53,23 +47,25 @@ def test_an_mp4_has_every_sweep_at_its_time(drive, tmp_path):
     assert all((a != b).any() for a, b in itertools.pairwise(images))
 
 
-def test_speed_and_every_change_the_times(drive, tmp_path):
-    film(open_dataset(drive), tmp_path / "a.mp4", options=FilmOptions(speed=0.5, every=2, **SMALL))
+def test_speed_and_every_change_the_times(town_drive, tmp_path):
+    film(open_dataset(town_drive), tmp_path / "a.mp4", options=FilmOptions(speed=0.5, every=2, **SMALL))
     _, times, length = decoded(tmp_path / "a.mp4")
     assert times == pytest.approx([0.0, 0.4, 0.8])
     assert length == pytest.approx(1.2)
 
 
-def test_a_fast_film_leaves_frames_out_that_no_viewer_shows(drive, tmp_path):
-    made = film(open_dataset(drive), tmp_path / "a.gif", options=FilmOptions(speed=10, show="map", **SMALL))
+def test_a_fast_film_leaves_frames_out_that_no_viewer_shows(town_drive, tmp_path):
+    made = film(
+        open_dataset(town_drive), tmp_path / "a.gif", options=FilmOptions(speed=10, show="map", **SMALL)
+    )
     assert made.images == 3
     assert made.seconds == pytest.approx(0.06)
     assert "each 2nd frame" in made.notes[0]
 
 
-def test_a_gif_is_the_same_bytes_again_and_lasts_as_long_as_the_drive(drive, tmp_path):
+def test_a_gif_is_the_same_bytes_again_and_lasts_as_long_as_the_drive(town_drive, tmp_path):
     for name in ("a.gif", "b.gif"):
-        film(open_dataset(drive), tmp_path / name, options=FilmOptions(show="sweep", speed=0.3, **SMALL))
+        film(open_dataset(town_drive), tmp_path / name, options=FilmOptions(show="sweep", speed=0.3, **SMALL))
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as gif:
         assert (gif.n_frames, gif.size) == (6, (320, 240))
@@ -81,23 +77,23 @@ def test_a_gif_is_the_same_bytes_again_and_lasts_as_long_as_the_drive(drive, tmp
     assert set(lengths) == {330, 340}
 
 
-def test_films_of_cameras_follow_the_camera(drive, tmp_path):
+def test_films_of_cameras_follow_the_camera(town_drive, tmp_path):
     words = ("--show", "cameras", "--size", "320x240", "-o", tmp_path / "a.mp4", "--json")
-    told = json.loads(run_program("lidar", "animate", drive, *words).stdout)
-    count = len(list((drive / "camera_front" / "rgb").glob("*.png")))
+    told = json.loads(run_program("lidar", "animate", town_drive, *words).stdout)
+    count = len(list((town_drive / "camera_front" / "rgb").glob("*.png")))
     images, _, _ = decoded(tmp_path / "a.mp4")
     assert len(images) == told["images"] == count
     assert told["shown"] == ["camera_front"]
 
 
-def sweeps_of(drive, **options):
-    dataset = open_dataset(drive)
+def sweeps_of(town_drive, **options):
+    dataset = open_dataset(town_drive)
     clouds = scanner_clouds(dataset)
     return Sweeps(dataset, [clouds], trajectory=dataset.trajectory(), options=FilmOptions(**options))
 
 
-def test_the_camera_pane_has_the_recorded_image(drive):
-    dataset = open_dataset(drive)
+def test_the_camera_pane_has_the_recorded_image(town_drive):
+    dataset = open_dataset(town_drive)
     images = images_of(dataset, "camera_front")
     pane = CameraPane(dataset, [images], time_ns=images.stream.time_ns, size=(400, 400), columns=1)
     shown = pane.draw(2)
@@ -109,8 +105,8 @@ def test_the_camera_pane_has_the_recorded_image(drive):
     assert (shown[below_name, 1:399] == expected[40:]).all()
 
 
-def test_the_map_shows_the_highest_return_at_each_place(drive):
-    sweeps = sweeps_of(drive)
+def test_the_map_shows_the_highest_return_at_each_place(town_drive):
+    sweeps = sweeps_of(town_drive)
     pane = MapPane(sweeps, size=(300, 300), legend=False)
     pane.draw(0)
     points, colors, moving = sweeps.returns(0)
@@ -128,11 +124,11 @@ def test_the_map_shows_the_highest_return_at_each_place(drive):
     assert (pane._image != pane._image[0, 0]).any(axis=2).sum() > drawn, "the map grows"
 
 
-def test_colours_are_those_of_the_truth(drive):
-    sweeps = sweeps_of(drive, color="origin")
+def test_colours_are_those_of_the_truth(town_drive):
+    sweeps = sweeps_of(town_drive, color="origin")
     _, colors, _ = sweeps.returns(3)
     named = {tuple(np.asarray(color).tolist()): name for name, color in sweeps.key}
-    with np.load(drive / "lidar_top" / "truth" / "000003.npz") as truth:
+    with np.load(town_drive / "lidar_top" / "truth" / "000003.npz") as truth:
         origin = truth["origin"]
     assert {named[tuple(c)] for c in np.unique(colors, axis=0).tolist()} <= {
         "surface",
@@ -141,7 +137,7 @@ def test_colours_are_those_of_the_truth(drive):
         "receiver",
     }
     assert (np.unique(colors, axis=0).shape[0]) == len(np.unique(origin))
-    _, by_class, _ = sweeps_of(drive).returns(3)
+    _, by_class, _ = sweeps_of(town_drive).returns(3)
     assert (by_class == class_codes().color[Class.ROAD]).all(axis=1).any()
 
 
@@ -189,18 +185,18 @@ def test_a_gif_that_would_fill_the_memory_is_refused(tmp_path):
         (("--frames", "70:80", "-o", "a.gif"), "frames 0 to 5"),
     ],
 )
-def test_what_cannot_be_shown_ends_with_a_line(drive, tmp_path, words, told):
+def test_what_cannot_be_shown_ends_with_a_line(town_drive, tmp_path, words, told):
     (tmp_path / "taken.gif").write_bytes(b"")
-    run = run_program("lidar", "animate", drive, *words, cwd=tmp_path)
+    run = run_program("lidar", "animate", town_drive, *words, cwd=tmp_path)
     assert run.returncode == 2
     assert told in run.stderr
     assert run.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["taken.gif"]
 
 
-def test_missing_data_and_extras_are_named(drive, tmp_path, monkeypatch):
+def test_missing_data_and_extras_are_named(town_drive, tmp_path, monkeypatch):
     copy = tmp_path / "copy"
-    shutil.copytree(drive, copy)
+    shutil.copytree(town_drive, copy)
     for folder in [*copy.glob("*/rgb"), *copy.glob("*/depth"), *copy.glob("*/truth")]:
         shutil.rmtree(folder)
     monkeypatch.setitem(sys.modules, "av", None)

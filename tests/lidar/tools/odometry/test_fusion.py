@@ -191,6 +191,7 @@ def test_fixes_with_few_satellites_state_multipath(monkeypatch):
     np.testing.assert_allclose(sigma[2], sigma[1] * [2, 2, 3])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("relative", ["small_gicp", "none"])
 def test_a_recorded_drive_is_georeferenced(drive, tmp_path, relative):  # noqa: F811
     """Within what fixes of single frequency can tell: metres, and their stated deviations."""

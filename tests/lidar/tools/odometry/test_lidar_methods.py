@@ -40,7 +40,14 @@ def street(tmp_path_factory):
     return dataset(tmp_path_factory.mktemp("street") / "drive")
 
 
-@pytest.mark.parametrize(("method", "metres"), [("kiss-icp", 0.25), ("genz-icp", 0.25), ("small_gicp", 0.05)])
+@pytest.mark.parametrize(
+    ("method", "metres"),
+    [
+        pytest.param("kiss-icp", 0.25, marks=pytest.mark.full),
+        pytest.param("genz-icp", 0.25, marks=pytest.mark.full),
+        ("small_gicp", 0.05),
+    ],
+)
 def test_methods_follow_a_drive_in_a_bend_uphill(street, method, metres):
     """8.8 m of way at 8 m/s: sweeps are skewed by 0.8 m, and the first has no motion to be de-skewed with."""
     found = lidar_odometry(scans_of(street), method, settings=SETTINGS, progress=silent)
@@ -109,6 +116,7 @@ def test_sweeps_without_returns_move_on_as_before(tmp_path):
     assert found.sigma[-1, 3] > found.sigma[-4, 3]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("method", LIDAR_METHODS)
 def test_the_truth_is_not_read_and_runs_have_the_same_bytes(street, tmp_path, method):
     """Without the true trajectory, its poses and boxes the same files are written."""

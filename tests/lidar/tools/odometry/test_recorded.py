@@ -100,7 +100,7 @@ def errors_by_evo(drive, estimate, tmp_path):
     return error.error, reference.path_length
 
 
-@pytest.mark.parametrize("seed", [4, 7, 8])
+@pytest.mark.parametrize("seed", [4, *(pytest.param(seed, marks=pytest.mark.full) for seed in (7, 8))])
 def test_the_first_motion_is_that_of_the_vehicle_not_of_its_rings(scene, tmp_path, seed):
     """Rings of 64 lasers on level ground match at any speed; the vehicle is under way at the first sweep."""
     lidar = '[[lidar]]\nname = "top"\npreset = "hdl64e_s3"\ntranslation = [0.8, 0.0, 1.7]\nrate_hz = 10.0\n'
@@ -118,7 +118,14 @@ def test_the_first_motion_is_that_of_the_vehicle_not_of_its_rings(scene, tmp_pat
     np.testing.assert_allclose(found[:3, 3], ahead, atol=0.05)
 
 
-@pytest.mark.parametrize(("method", "share"), [("small_gicp", 0.01), ("orb+depth", 0.03), ("stereo", 0.05)])
+@pytest.mark.parametrize(
+    ("method", "share"),
+    [
+        ("small_gicp", 0.01),
+        pytest.param("orb+depth", 0.03, marks=pytest.mark.full),
+        pytest.param("stereo", 0.05, marks=pytest.mark.full),
+    ],
+)
 def test_methods_follow_a_recorded_drive(drive, tmp_path, method, share):
     """Errors against the truth by evo, in parts of the way."""
     summary = estimate_motion(drive.path, tmp_path / "e", options=OdometryOptions(method=method))
@@ -128,6 +135,7 @@ def test_methods_follow_a_recorded_drive(drive, tmp_path, method, share):
     assert summary.estimate.report["sensors"][0] in ("top", "left")
 
 
+@pytest.mark.full
 def test_a_single_camera_tells_the_shape_of_the_way(drive, tmp_path):
     """Its scale is that of the camera's height over the road, or unknown: the direction of travel is not."""
     estimate = estimate_motion(drive.path, tmp_path / "e", options=OdometryOptions(method="orb")).estimate
@@ -138,6 +146,7 @@ def test_a_single_camera_tells_the_shape_of_the_way(drive, tmp_path):
     assert "scale" in estimate.report
 
 
+@pytest.mark.full
 def test_images_have_the_same_poses_in_every_run_and_without_the_truth(drive, tmp_path):
     options = OdometryOptions(method="stereo")
     estimate_motion(drive.path, tmp_path / "first", options=options)
@@ -175,6 +184,7 @@ def test_sweeps_hold_what_is_within_range(drive):
     assert -1.01 < share.min() < share.max() <= 0
 
 
+@pytest.mark.full
 def test_the_report_counts_features_and_keyframes(drive, tmp_path):
     done = run_program(
         "lidar", "odometry", drive.path, "--method", "orb+depth", "-o", tmp_path / "e", "--json", "-q"

@@ -12,7 +12,6 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from helpers.drives import record
 from helpers.programs import run_program
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,19 +35,14 @@ from lidar.tools.plots.sweeps import _image_sides
 SCANNER = "lidar_top"
 
 
-@pytest.fixture(scope="module")
-def drive(scene, tmp_path_factory):
-    return record(scene, tmp_path_factory.mktemp("drive") / "drive")
+def clouds(town_drive):
+    return [read_table(path) for path in sorted((town_drive / SCANNER / "pcd").glob("*.pcd"))]
 
 
-def clouds(drive):
-    return [read_table(path) for path in sorted((drive / SCANNER / "pcd").glob("*.pcd"))]
-
-
-def drawn(drive, tmp_path, what, *words):
+def drawn(town_drive, tmp_path, what, *words):
     """The SVG of a figure, and the numbers that the program tells of it."""
     out = tmp_path / f"{what}.svg"
-    done = run_program("lidar", "plot", what, drive, *words, "-o", out, "--json")
+    done = run_program("lidar", "plot", what, town_drive, *words, "-o", out, "--json")
     assert done.returncode == 0, done.stderr
     return out.read_text("utf-8"), json.loads(done.stdout)
 
@@ -77,10 +71,10 @@ def test_the_program_offers_every_figure():
 
 
 @pytest.mark.parametrize("what", FIGURES)
-def test_every_figure_is_a_png_and_the_same_bytes_again(drive, tmp_path, what):
+def test_every_figure_is_a_png_and_the_same_bytes_again(town_drive, tmp_path, what):
     once, again = tmp_path / "a.png", tmp_path / "b.png"
     for out in (once, again):
-        plot(open_dataset(drive), what, out=out)
+        plot(open_dataset(town_drive), what, out=out)
     assert once.read_bytes() == again.read_bytes()
     picture = np.asarray(Image.open(once))
     assert picture.shape[1] >= 700
@@ -88,9 +82,9 @@ def test_every_figure_is_a_png_and_the_same_bytes_again(drive, tmp_path, what):
     assert (edge == 255).all(), "nothing is cut off"
 
 
-def test_the_speed_is_that_of_the_trajectory(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "speed")
-    with (drive / "trajectory.csv").open() as file:
+def test_the_speed_is_that_of_the_trajectory(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "speed")
+    with (town_drive / "trajectory.csv").open() as file:
         rows = list(csv.DictReader(file))
     speed = [float(np.linalg.norm([float(row[k]) for k in ("vx", "vy", "vz")])) for row in rows]
     shown = series(svg, "speed")
@@ -98,13 +92,13 @@ def test_the_speed_is_that_of_the_trajectory(drive, tmp_path):
     assert straight(shown[:, 0], [int(row["time_ns"]) for row in rows]) < 0.02
     assert straight(shown[:, 1], speed) < 0.02
     assert told["maximum_speed_m_s"] == pytest.approx(max(speed))
-    manifest = json.loads((drive / "dataset.json").read_text())
+    manifest = json.loads((town_drive / "dataset.json").read_text())
     assert told["length_m"] == pytest.approx(manifest["length_m"], rel=0.01)
 
 
-def test_returns_by_range_are_those_of_the_clouds(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "returns", "--frames", "1:4")
-    tables = clouds(drive)[1:4]
+def test_returns_by_range_are_those_of_the_clouds(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "returns", "--frames", "1:4")
+    tables = clouds(town_drive)[1:4]
     distance = np.concatenate([np.sqrt(sum(t[k].astype(float) ** 2 for k in "xyz")) for t in tables])
     assert told["returns"] == len(distance)
     assert told["median_m"] == pytest.approx(np.median(distance), abs=told["bin_m"])
@@ -114,19 +108,19 @@ def test_returns_by_range_are_those_of_the_clouds(drive, tmp_path):
     assert 'data-name="injected"' in svg, "the attack's returns are shown by their origin"
 
 
-def test_intensities_are_those_of_each_class(drive, tmp_path):
-    _, told = drawn(drive, tmp_path, "intensity")
-    label = np.concatenate([t["label"] for t in clouds(drive)])
-    value = np.concatenate([t["intensity"] for t in clouds(drive)]).astype(float)
+def test_intensities_are_those_of_each_class(town_drive, tmp_path):
+    _, told = drawn(town_drive, tmp_path, "intensity")
+    label = np.concatenate([t["label"] for t in clouds(town_drive)])
+    value = np.concatenate([t["intensity"] for t in clouds(town_drive)]).astype(float)
     for name, mean in told["mean_intensity"].items():
         of_class = label == Class[name.replace(" ", "_").upper()]
         assert mean == pytest.approx(value[of_class].mean(), rel=1e-5)
     assert len(told["mean_intensity"]) == len(np.unique(label))
 
 
-def test_the_range_image_has_each_return_at_its_azimuth_and_ring(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "range-image", "--frames", "2:")
-    table = clouds(drive)[2]
+def test_the_range_image_has_each_return_at_its_azimuth_and_ring(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "range-image", "--frames", "2:")
+    table = clouds(town_drive)[2]
     assert (told["frame"], told["returns"]) == (2, len(table["x"]))
     *_, by_class = images(svg)
     azimuth = np.degrees(np.arctan2(table["y"].astype(float), table["x"].astype(float)))
@@ -165,14 +159,14 @@ def test_rows_of_scanners_that_look_down_are_times():
     assert rows.ends == (0, 10)
 
 
-def test_coverage_counts_every_true_return(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER, "--resolution", "0.5")
-    dataset = open_dataset(drive)
+def test_coverage_counts_every_true_return(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "coverage", "--sensor", SCANNER, "--resolution", "0.5")
+    dataset = open_dataset(town_drive)
     trajectory, mount = dataset.trajectory(), np.array(dataset.sensors()[SCANNER]["vehicle_from_sensor"])
     starts = dataset.sample_times(SCANNER).tolist()
     cells = set()
     returns = 0
-    for start, table in zip(starts, clouds(drive), strict=True):
+    for start, table in zip(starts, clouds(town_drive), strict=True):
         placed, _ = placed_returns(table, trajectory, start_ns=start, vehicle_from_sensor=mount)
         true = placed[table["label"] != Class.NOISE]
         returns += len(true)
@@ -185,14 +179,14 @@ def test_coverage_counts_every_true_return(drive, tmp_path):
     assert plan.shape[:2] == (round((north - south) / 0.5), round((east - west) / 0.5))
 
 
-def test_coverage_is_drawn_in_cells_that_fit(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "coverage", "--sensor", SCANNER)
+def test_coverage_is_drawn_in_cells_that_fit(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "coverage", "--sensor", SCANNER)
     (plan,) = images(svg)
     assert 200 <= max(plan.shape[:2]) <= 500
     side = told["cell_m"]
     assert all(math.isclose(bound / side, round(bound / side), abs_tol=1e-6) for bound in told["bounds_m"])
     (tmp_path / "fine").mkdir()
-    fine = drawn(drive, tmp_path / "fine", "coverage", "--sensor", SCANNER, "--resolution", "0.5")[1]
+    fine = drawn(town_drive, tmp_path / "fine", "coverage", "--sensor", SCANNER, "--resolution", "0.5")[1]
     assert told["returns"] == fine["returns"]
 
 
@@ -212,9 +206,9 @@ def test_larger_cells_hold_the_counts_of_the_smaller_ones_in_them(grid, first, f
     assert {cell: count for cell, count in found.items() if count} == +expected
 
 
-def test_errors_of_fixes_are_geodesic_differences(drive, tmp_path):
-    svg, told = drawn(drive, tmp_path, "gnss")
-    with (drive / "gnss.csv").open() as file:
+def test_errors_of_fixes_are_geodesic_differences(town_drive, tmp_path):
+    svg, told = drawn(town_drive, tmp_path, "gnss")
+    with (town_drive / "gnss.csv").open() as file:
         rows = list(csv.DictReader(file))
     value = {
         key: np.array([float(row[key]) for row in rows])
@@ -260,18 +254,18 @@ def test_long_lines_keep_their_peaks_and_gaps():
         (("speed", "nowhere", "-o", "a.png"), "no dataset.json"),
     ],
 )
-def test_what_cannot_be_drawn_ends_with_a_line(drive, tmp_path, words, told):
+def test_what_cannot_be_drawn_ends_with_a_line(town_drive, tmp_path, words, told):
     (tmp_path / "taken.png").write_bytes(b"")
-    run = run_program("lidar", "plot", *(word.format(drive=drive) for word in words), cwd=tmp_path)
+    run = run_program("lidar", "plot", *(word.format(town_drive=town_drive) for word in words), cwd=tmp_path)
     assert run.returncode in (1, 2)
     assert told in run.stderr
     assert run.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["taken.png"]
 
 
-def test_data_that_are_missing_are_named(drive, tmp_path):
+def test_data_that_are_missing_are_named(town_drive, tmp_path):
     copy = tmp_path / "copy"
-    shutil.copytree(drive, copy)
+    shutil.copytree(town_drive, copy)
     for folder in copy.glob("*/pcd"):
         shutil.rmtree(folder)
     calibration = json.loads((copy / "calibration.json").read_text())

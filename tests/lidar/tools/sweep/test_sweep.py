@@ -56,6 +56,7 @@ def test_every_combination_is_a_dataset_with_its_row_in_both_tables(recorded):
     assert len({row["digest"] for row in rows}) == 4
 
 
+@pytest.mark.full
 def test_bytes_do_not_depend_on_the_number_of_processes(recorded, tmp_path):
     file, summary = recorded
     sweep(file, tmp_path / "out", workers=2)
@@ -307,6 +308,7 @@ def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
     assert tile.read_bytes() == before
 
 
+@pytest.mark.full
 def test_a_drive_that_kills_its_process_is_a_row_and_the_others_go_on(scene, tmp_path, monkeypatch):
     recorded = lidar.simulation.drive.drive
 

@@ -14,7 +14,6 @@ from zlib import decompress
 
 import numpy as np
 import pytest
-from helpers.drives import record
 from helpers.programs import run_program
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,14 +31,9 @@ from lidar.tools.view.window import colored_points, show_window
 
 
 @pytest.fixture(scope="module")
-def drive(scene, tmp_path_factory):
-    return record(scene, tmp_path_factory.mktemp("drive") / "a drive")
-
-
-@pytest.fixture(scope="module")
-def page(drive, tmp_path_factory):
+def page(town_drive, tmp_path_factory):
     out = tmp_path_factory.mktemp("page") / "page.html"
-    return view_drive(open_dataset(drive), out)
+    return view_drive(open_dataset(town_drive), out)
 
 
 def elements(path):
@@ -67,8 +61,8 @@ def test_whole_numbers_survive_as_planes_of_bytes(numbers):
     assert np.array_equal((folded >> 1) ^ -(folded & 1), values)
 
 
-def test_the_page_has_every_frame_image_and_road_user(drive, page):
-    dataset = open_dataset(drive)
+def test_the_page_has_every_frame_image_and_road_user(town_drive, page):
+    dataset = open_dataset(town_drive)
     blobs, head = elements(page.path)
     assert [one["name"] for one in head["scanners"]] == ["lidar_top"]
     assert head["numbers"] == list(range(6))
@@ -79,7 +73,7 @@ def test_the_page_has_every_frame_image_and_road_user(drive, page):
     for frame in head["numbers"]:
         told = head_of(blobs[f"sweep-0-{frame}"])
         rows = dataset.paths.frame_boxes("lidar_top", frame).read_text("utf-8").splitlines()[1:]
-        assert told["count"] == len(read_table(drive / "lidar_top" / "pcd" / f"{frame:06d}.pcd")["x"])
+        assert told["count"] == len(read_table(town_drive / "lidar_top" / "pcd" / f"{frame:06d}.pcd")["x"])
         assert len(told["boxes"]) == len(rows) > 3
         image = Image.open(BytesIO(blobs[f"image-0-rgb-{frame}"]))
         assert image.size == (640, 360)
@@ -98,14 +92,14 @@ def test_a_sweep_of_a_scanner_that_repeats_its_pattern_needs_little_more_than_ra
     assert 8 * size / page.returns < 14  # bits, with snow; its file has 41 bytes
 
 
-def test_equal_drives_give_equal_pages(drive, page, tmp_path):
-    again = view_drive(open_dataset(drive), tmp_path / "again.html")
+def test_equal_drives_give_equal_pages(town_drive, page, tmp_path):
+    again = view_drive(open_dataset(town_drive), tmp_path / "again.html")
     assert again.path.read_bytes() == page.path.read_bytes()
 
 
-def test_the_speeds_and_the_path_are_those_of_the_trajectory(drive, page):
+def test_the_speeds_and_the_path_are_those_of_the_trajectory(town_drive, page):
     _, head = elements(page.path)
-    trajectory = open_dataset(drive).trajectory()
+    trajectory = open_dataset(town_drive).trajectory()
     at = trajectory.at(np.array(head["time_ns"]))
     assert np.allclose(head["position"], at.position, atol=6e-4)
     speed = np.linalg.norm(np.diff(at.position, axis=0), axis=1) / 0.1
@@ -114,17 +108,17 @@ def test_the_speeds_and_the_path_are_those_of_the_trajectory(drive, page):
     assert np.hypot(*(near - at.position[0, :2]).T).min() < 60
 
 
-def test_without_the_scene_the_plan_has_no_roads_and_says_so(drive, tmp_path):
-    dataset = open_dataset(drive)
+def test_without_the_scene_the_plan_has_no_roads_and_says_so(town_drive, tmp_path):
+    dataset = open_dataset(town_drive)
     dataset.manifest["scene"]["path"] = str(tmp_path / "gone")
     summary = view_drive(dataset, tmp_path / "page.html")
     assert elements(summary.path)[1]["roads"] == []
     assert any("no roads" in note for note in summary.notes)
 
 
-def test_a_selection_of_frames_and_sensors_is_shown(drive, tmp_path):
+def test_a_selection_of_frames_and_sensors_is_shown(town_drive, tmp_path):
     options = PlaybackOptions(sensors=("lidar_front",), frames="1:20", every=4)
-    summary = view_drive(open_dataset(drive), tmp_path / "page.html", options=options)
+    summary = view_drive(open_dataset(town_drive), tmp_path / "page.html", options=options)
     _, head = elements(summary.path)
     assert [one["name"] for one in head["scanners"]] == ["lidar_front"]
     assert head["numbers"] == list(range(1, 20, 4))
@@ -132,8 +126,8 @@ def test_a_selection_of_frames_and_sensors_is_shown(drive, tmp_path):
     assert any("5 of " in note for note in summary.notes)
 
 
-def test_of_several_scanners_the_nearest_sweeps_are_shown_together(drive, tmp_path):
-    dataset = open_dataset(drive)
+def test_of_several_scanners_the_nearest_sweeps_are_shown_together(town_drive, tmp_path):
+    dataset = open_dataset(town_drive)
     options = PlaybackOptions(sensors=("lidar_top", "lidar_front"), frames=":4")
     summary = view_drive(dataset, tmp_path / "page.html", options=options)
     blobs, head = elements(summary.path)
@@ -144,7 +138,7 @@ def test_of_several_scanners_the_nearest_sweeps_are_shown_together(drive, tmp_pa
     wanted = [int(np.argmin(np.abs(starts - time))) for time in head["time_ns"]]
     assert head["numbers"] == [0, 1, 2, 3]
     for place, frame in zip(front["index"], wanted, strict=True):
-        returns = len(read_table(drive / "lidar_front" / "pcd" / f"{frame:06d}.pcd")["x"])
+        returns = len(read_table(town_drive / "lidar_front" / "pcd" / f"{frame:06d}.pcd")["x"])
         assert head_of(blobs[f"sweep-1-{place}"])["count"] == returns
     assert summary.returns == sum(
         head_of(data)["count"] for name, data in blobs.items() if name.startswith("sweep-")
@@ -152,15 +146,15 @@ def test_of_several_scanners_the_nearest_sweeps_are_shown_together(drive, tmp_pa
     assert not any("lidar_front" in note for note in summary.notes)
 
 
-def test_a_page_that_would_be_too_large_names_a_selection_that_fits(drive, tmp_path):
+def test_a_page_that_would_be_too_large_names_a_selection_that_fits(town_drive, tmp_path):
     out = tmp_path / "page.html"
     with pytest.raises(InputError, match="would have about") as caught:
-        view_drive(open_dataset(drive), out, options=PlaybackOptions(max_mb=0.3))
+        view_drive(open_dataset(town_drive), out, options=PlaybackOptions(max_mb=0.3))
     assert list(tmp_path.iterdir()) == []
     every = int(re.search(r"`every` (\d+)", str(caught.value))[1])
     frames = re.search(r"`frames` (\d+:\d+)", str(caught.value))[1]
     for options in (PlaybackOptions(max_mb=0.3, every=every), PlaybackOptions(max_mb=0.3, frames=frames)):
-        assert view_drive(open_dataset(drive), out, options=options, overwrite=True).frames >= 1
+        assert view_drive(open_dataset(town_drive), out, options=options, overwrite=True).frames >= 1
 
 
 @pytest.mark.parametrize(
@@ -170,9 +164,9 @@ def test_a_page_that_would_be_too_large_names_a_selection_that_fits(drive, tmp_p
         ({"frames": "100:200"}, "has frames 0 to 5"),
     ],
 )
-def test_what_the_dataset_does_not_have_is_refused(drive, tmp_path, options, message):
+def test_what_the_dataset_does_not_have_is_refused(town_drive, tmp_path, options, message):
     with pytest.raises(InputError, match=message):
-        view_drive(open_dataset(drive), tmp_path / "page.html", options=PlaybackOptions(**options))
+        view_drive(open_dataset(town_drive), tmp_path / "page.html", options=PlaybackOptions(**options))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -184,29 +178,29 @@ def test_options_without_sense_are_refused(given):
         PlaybackOptions(**given)
 
 
-def test_a_dataset_without_clouds_in_the_sensor_frame_is_refused(drive, tmp_path):
+def test_a_dataset_without_clouds_in_the_sensor_frame_is_refused(town_drive, tmp_path):
     bare = tmp_path / "bare"
     bare.mkdir()
     for name in ("dataset.json", "calibration.json", "trajectory.csv"):
-        (bare / name).write_bytes((drive / name).read_bytes())
+        (bare / name).write_bytes((town_drive / name).read_bytes())
     with pytest.raises(DatasetError, match="--format pcd"):
         view_drive(open_dataset(bare), tmp_path / "page.html")
 
 
-def test_the_command_line_wants_one_of_page_server_and_window(drive, tmp_path):
+def test_the_command_line_wants_one_of_page_server_and_window(town_drive, tmp_path):
     for words in ((), ("-o", tmp_path / "page.html", "--serve")):
-        done = run_program("lidar", "view", drive, *words)
+        done = run_program("lidar", "view", town_drive, *words)
         assert done.returncode == 2
         assert "--out, --serve and --open3d" in done.stderr
-    done = run_program("lidar", "view", drive, "-o", tmp_path / "page.html")
+    done = run_program("lidar", "view", town_drive, "-o", tmp_path / "page.html")
     assert done.returncode == 0
     assert "6 frames" in done.stdout
-    assert run_program("lidar", "view", drive, "-o", tmp_path / "page.html").returncode == 2  # exists
+    assert run_program("lidar", "view", town_drive, "-o", tmp_path / "page.html").returncode == 2  # exists
 
 
 @contextmanager
-def serving(drive, **options):
-    with DriveServer(open_dataset(drive), **options) as server:
+def serving(town_drive, **options):
+    with DriveServer(open_dataset(town_drive), **options) as server:
         thread = Thread(target=server.serve_forever)
         thread.start()
         try:
@@ -221,9 +215,9 @@ def fetch(url):
         return answer.read()
 
 
-def test_the_server_has_the_bytes_of_the_page(drive, page):
+def test_the_server_has_the_bytes_of_the_page(town_drive, page):
     blobs, _ = elements(page.path)
-    with serving(drive) as server:
+    with serving(town_drive) as server:
         assert fetch(f"{server.address}sweep/0/3") == blobs["sweep-0-3"]
         assert fetch(f"{server.address}image/0/depth/2") == blobs["image-0-depth-2"]
         assert b"connect-src 'self'" in fetch(server.address)
@@ -239,30 +233,33 @@ def test_the_server_has_the_bytes_of_the_page(drive, page):
                 fetch(server.address + path)
 
 
-def test_the_server_answers_this_machine_only(drive):
-    with serving(drive) as server:
+def test_the_server_answers_this_machine_only(town_drive):
+    with serving(town_drive) as server:
         assert server.server_address[0] == "127.0.0.1"
         link = HTTPConnection("127.0.0.1", server.server_port, timeout=60)
         link.request("GET", "/sweep/0/0", headers={"Host": "elsewhere.example"})
         assert link.getresponse().status == 403
         link.close()
         with pytest.raises(InputError, match="`port`"):
-            DriveServer(open_dataset(drive), port=server.server_port)
+            DriveServer(open_dataset(town_drive), port=server.server_port)
 
 
-def test_a_window_without_open3d_says_what_to_install(drive, monkeypatch):
+def test_a_window_without_open3d_says_what_to_install(town_drive, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "open3d", None)
     with pytest.raises(MissingExtraError, match=r"geoscene\[open3d\]"):
-        show_window(drive)
+        show_window(town_drive)
 
 
-def test_a_window_shows_a_sweep_or_a_map_in_colours(drive, tmp_path):
-    points, colors = colored_points(drive, PlaybackOptions(frames="2:"))
-    recorded = read_table(drive / "lidar_top" / "pcd" / "000002.pcd")
+def test_a_window_shows_a_sweep_or_a_map_in_colours(town_drive, tmp_path):
+    points, colors = colored_points(town_drive, PlaybackOptions(frames="2:"))
+    recorded = read_table(town_drive / "lidar_top" / "pcd" / "000002.pcd")
     assert len(points) == len(recorded["x"])
     assert np.abs(np.linalg.norm(points, axis=1) - recorded["range"]).max() < 3  # less the vehicle's motion
     assert len(np.unique(colors, axis=0)) > 3
-    assert run_program("lidar", "map", drive, "-o", tmp_path / "map.laz", "--color", "height").returncode == 0
+    assert (
+        run_program("lidar", "map", town_drive, "-o", tmp_path / "map.laz", "--color", "height").returncode
+        == 0
+    )
     points, colors = colored_points(tmp_path / "map.laz", PlaybackOptions())
     assert np.abs(points.mean(axis=0)).max() < 1e-3
     assert colors.min() >= 0

@@ -6,7 +6,6 @@ from threading import Thread
 import numpy as np
 import pytest
 from helpers.browser import browser
-from helpers.drives import record
 from PIL import Image
 
 from lidar.dataset.boxes import read_boxes
@@ -27,8 +26,8 @@ SLOW = ("GPU stall due to ReadPixels", "willReadFrequently")
 
 
 @pytest.fixture(scope="module")
-def dataset(scene, tmp_path_factory):
-    return open_dataset(record(scene, tmp_path_factory.mktemp("drive") / "drive"))
+def dataset(town_drive):
+    return open_dataset(town_drive)
 
 
 @pytest.fixture(scope="module")
