@@ -1,17 +1,13 @@
-"""Charts, tables and pages of reports: scatter plots, tables of the console, self-contained HTML."""
+"""Charts of reports: scatter plots, curves of shares, shares with intervals."""
 
 from __future__ import annotations
 
-import base64
-import html
 import io
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from PIL import Image, ImageDraw, ImageFont
-from rich.console import Console
-from rich.table import Table
 
 from geoscene.drawing.axes import log_axis
 from geoscene.drawing.canvas import INK, Color, drawable
@@ -21,15 +17,6 @@ GREY: Color = (205, 208, 214)
 
 _CHOICE, _OTHER = (200, 60, 40), (60, 110, 180)
 _BAND = (250, 224, 160)
-_STYLE = (
-    "body{font:15px system-ui,sans-serif;margin:2em;color:#1e2026}"
-    ".wide{overflow-x:auto;margin:1em 0}table{border-collapse:collapse;font-size:13px}"
-    "td,th{border-bottom:1px solid #cdd0d6;padding:.3em .5em;text-align:right;white-space:nowrap}"
-    "td:first-child,th:first-child{position:sticky;left:0;background:#fff}"
-    "td:first-child,th:first-child{text-align:left;white-space:normal;min-width:12em}"
-    "td.text,th.text{text-align:left;white-space:normal}td.text:last-child{min-width:16em}"
-    "img{max-width:100%}"
-)
 _LEGEND = (
     (_CHOICE, "no other setting is both cheaper and more exact"),
     (_OTHER, "another setting is cheaper and at least as exact"),
@@ -221,71 +208,3 @@ def _png(picture: Image.Image) -> bytes:
 def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
     """Whether two boxes (left, top, right, bottom) overlap."""
     return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
-
-
-def print_table(head: Sequence[str], rows: Sequence[Sequence[str]], *, title: str) -> None:
-    """Print a table, 240 characters wide if not to a terminal."""
-    table = Table(*head, title=title)
-    for row in rows:
-        table.add_row(*row)
-    _console().print(table)
-
-
-def print_lines(texts: Iterable[str]) -> None:
-    """Print texts that are not empty, each from a new line."""
-    for text in filter(None, texts):
-        _console().print(text, highlight=False)
-
-
-def _console() -> Console:
-    console = Console()
-    return console if console.is_terminal else Console(width=240)
-
-
-def html_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table of texts; intervals in brackets stand below their values, columns of words to the left."""
-    wordy = [any(row[k][:1].isalpha() for row in rows) for k in range(len(head))]
-
-    def cell(text: str, *, tag: str, words: bool) -> str:
-        if words:
-            return f'<{tag} class="text">{html.escape(text)}</{tag}>'
-        return f"<{tag}>{html.escape(text).replace(' (', '<br>(')}</{tag}>"
-
-    def line(cells: Sequence[str], tag: str) -> str:
-        texts = (cell(text, tag=tag, words=words) for text, words in zip(cells, wordy, strict=True))
-        return f"<tr>{''.join(texts)}</tr>"
-
-    return (
-        f'<div class="wide"><table>{line(head, "th")}{"".join(line(row, "td") for row in rows)}</table></div>'
-    )
-
-
-def html_matrix(
-    head: Sequence[str], rows: Sequence[Sequence[str]], *, shades: Sequence[Sequence[float]]
-) -> str:
-    """A table of texts whose cells but the first of each row are shaded from 0 (white) to 1; nan is white."""
-
-    def cell(text: str, shade: float) -> str:
-        strength = 0.0 if math.isnan(shade) else min(max(shade, 0.0), 1.0)
-        words = html.escape(text).replace(" (", "<br>(")
-        return f'<td style="background:rgba(70,150,90,{0.65 * strength:.2f})">{words}</td>'
-
-    lines = [
-        f"<tr><td>{html.escape(row[0])}</td>{''.join(map(cell, row[1:], some))}</tr>"
-        for row, some in zip(rows, shades, strict=True)
-    ]
-    titles = "".join(f"<th>{html.escape(name)}</th>" for name in head)
-    return f'<div class="wide"><table><tr>{titles}</tr>{"".join(lines)}</table></div>'
-
-
-def html_picture(png: bytes, *, alt: str) -> str:
-    """A picture within the page."""
-    return f'<img alt="{html.escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
-
-
-def html_page(title: str, body: str) -> bytes:
-    """A page without links to other files."""
-    return (
-        f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(title)}</title>'
-        f"<style>{_STYLE}</style><h1>{html.escape(title)}</h1>{body}</html>\n"
-    ).encode()
