@@ -94,8 +94,11 @@ def no_clouds(dataset: Dataset, *, of: str = "", formats: Sequence[Format] = ())
     of      : scanners or kind of the clouds
     formats : that would do; by default those with times and labels
     """
-    names = ", ".join(form.name for form in formats or labelled_formats())
-    return DatasetError(f"{dataset.path}: no clouds{of} in the sensor frame; drive with `formats` {names}")
+    first, *others = (form.name for form in formats or labelled_formats())
+    also = f" (or {', '.join(others)})" if others else ""
+    return DatasetError(
+        f"{dataset.path}: no clouds{of} in the sensor frame; drive with --format {first}{also}"
+    )
 
 
 def scanner_clouds(dataset: Dataset, name: str = "") -> Stream:

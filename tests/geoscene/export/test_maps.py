@@ -246,7 +246,7 @@ def test_exports_without_contents_or_with_the_name_of_others_are_refused(
 def test_invalid_options_are_refused_before_writing(scene, tmp_path):
     with pytest.raises(InputError, match="unknown suffix"):
         export_scene(scene, tmp_path / "a.json")
-    with pytest.raises(InputError, match="`kind` dwg"):
+    with pytest.raises(InputError, match="`kind` 'dwg'"):
         export_scene(scene, tmp_path / "a", options=ExportOptions(kind="dwg"))
     with pytest.raises(InputError, match=r"`resolution` does not go with PLY, which takes `layers`"):
         export_scene(scene, tmp_path / "a.ply", options=ExportOptions(resolution=1))

@@ -119,7 +119,7 @@ def test_tiles_of_other_sources_are_built_again(osm, whole, tmp_path, monkeypatc
     ],
 )
 def test_digest_of_sources_covers_code_and_tables(change, noticed, tmp_path, monkeypatch):
-    monkeypatch.setattr("geoscene.support.files.resources.files", tmp_path.joinpath)
+    monkeypatch.setattr("geoscene.support.digests.resources.files", tmp_path.joinpath)
     files = {"__init__.py": "", "walls.py": "HEIGHT = 3\n", "tables/sizes.toml": "door = 2.1\n"}
     for name, contents in {"before": files, "after": files | change}.items():
         for file, text in contents.items():

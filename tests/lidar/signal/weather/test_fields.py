@@ -134,8 +134,8 @@ def test_the_column_of_a_field_is_its_integral():
 def test_plumes_of_dust_drift_with_the_wind():
     setting = weather(kind="dust", amount=20.0, wind=4.0, wind_from=270.0)
     options = {"seed": 1, "count": 301}
-    first = plume_pattern(setting, 0.0, corner=(0.0, 0.0), **options)
-    later = plume_pattern(setting, 5.0, corner=(20.0, 0.0), **options)
+    first = plume_pattern(setting.stage, 0.0, corner=(0.0, 0.0), **options)
+    later = plume_pattern(setting.stage, 5.0, corner=(20.0, 0.0), **options)
     np.testing.assert_allclose(later, first, atol=1e-9)
     assert np.mean(first > 0) == pytest.approx(0.4, abs=0.12)
     assert np.mean(first[first > 0]) == pytest.approx(1, abs=0.25)

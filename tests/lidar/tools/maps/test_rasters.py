@@ -79,7 +79,7 @@ def test_rasters_that_no_file_can_hold_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"raster": ("dsn",)}, "`raster` dsn"),
+        ({"raster": ("dsn",)}, "`raster` 'dsn'"),
         ({"resolution": 0.0}, "`resolution` 0"),
         ({"resolution": float("nan")}, "nan"),
     ],

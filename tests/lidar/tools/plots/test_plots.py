@@ -256,7 +256,7 @@ def test_long_lines_keep_their_peaks_and_gaps():
 )
 def test_what_cannot_be_drawn_ends_with_a_line(town_drive, tmp_path, words, told):
     (tmp_path / "taken.png").write_bytes(b"")
-    run = run_program("lidar", "plot", *(word.format(town_drive=town_drive) for word in words), cwd=tmp_path)
+    run = run_program("lidar", "plot", *(word.format(drive=town_drive) for word in words), cwd=tmp_path)
     assert run.returncode in (1, 2)
     assert told in run.stderr
     assert run.stderr.count("\n") == 1
