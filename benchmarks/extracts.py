@@ -40,7 +40,7 @@ def row_of(extract: Path, folder: Path, *, lod: int, workers: int) -> dict[str, 
             said.seek(0)
             return {"extract": extract.name, "error": said.read().decode().strip()}
     scene = open_scene(out).manifest
-    judge = [sys.executable, "-m", "geoscene.cli", "validate", str(out), "--json"]
+    judge = [sys.executable, "-m", "geoscene", "validate", str(out), "--json"]
     verdict = json.loads(subprocess.run(judge, stdout=subprocess.PIPE, check=False).stdout)
     counts, ground, problems = scene["counts"], scene["ground"], scene["problems"]
     missing = ground["area"] + ground["open_area"] - ground["extent_area"]

@@ -14,6 +14,7 @@ from geoscene.sources.registry import SOURCES as SOURCES
 from geoscene.sources.registry import credits_of as credits_of
 from geoscene.sources.registry import merge_sources as merge_sources
 from geoscene.sources.registry import read_source as read_source
+from geoscene.support.lazy import lazily
 
 if TYPE_CHECKING:
     from geoscene.sources.demo import demo_path as demo_path
@@ -41,10 +42,4 @@ _LATE = {
 }
 
 
-def __getattr__(name: str) -> object:
-    """Import the module of a function on first access, because shapely and osmium are slow to import."""
-    if name not in _LATE:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib  # noqa: PLC0415
-
-    return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)
+__getattr__ = lazily(__name__, _LATE)

@@ -12,7 +12,7 @@ import pytest
 from helpers.clouds import write_las
 from helpers.programs import ENVIRONMENT, SMALL_FILES, command, run_process, run_program
 
-from geoscene import cli
+from geoscene.cli import scene_text
 from geoscene.sources import demo_path
 
 BOX = "24.9405,60.1655,24.9475,60.1690"
@@ -186,7 +186,7 @@ def test_full_disk_gives_one_line_that_names_the_file(scene, tmp_path, suffix):
     """Files of at most 30 kB stand for a full disk; both fail when bytes are written."""
     out = tmp_path / f"x.{suffix}"
     limit = "import resource, runpy, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000));"
-    run = "sys.argv = sys.argv[1:]; runpy.run_module('geoscene.cli', run_name='__main__')"
+    run = "sys.argv = sys.argv[1:]; runpy.run_module('geoscene', run_name='__main__')"
     words = ["view" if suffix == "html" else "export", str(scene), "-o", str(out)]
     done = subprocess.run(
         [sys.executable, "-c", limit + run, "geoscene", *words],
@@ -209,9 +209,9 @@ def test_help_does_not_import_large_libraries(program, also):
 
 def test_steep_roads_are_told_only_of_terrain_that_has_some():
     none, some = {"road_km": 0.0, "road_km_steep": 0.0}, {"road_km": 2.0, "road_km_steep": 0.1}
-    assert cli._steep_roads(none, terrain=True) == ""
-    assert cli._steep_roads(some, terrain=False) == ""
-    assert "0.1 km steeper" in cli._steep_roads(some, terrain=True)
+    assert scene_text._steep_roads(none, terrain=True) == ""
+    assert scene_text._steep_roads(some, terrain=False) == ""
+    assert "0.1 km steeper" in scene_text._steep_roads(some, terrain=True)
 
 
 def test_a_cloud_that_is_cut_off_is_refused_in_one_line(tmp_path):

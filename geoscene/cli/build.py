@@ -1,0 +1,169 @@
+"""The commands `build` and `tradeoff`."""
+
+from __future__ import annotations
+
+import os
+import time
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Group, Parameter
+
+from geoscene.cli.program import OUTPUT, Out, Reporting
+from geoscene.cli.scene_text import print_scene
+from geoscene.cli.source import MapSource, Source, cache_of, read_elevation, read_map
+from geoscene.errors import InputError
+from geoscene.options import BuildOptions, BuildTradeoffOptions, CloudOptions
+from geoscene.support.console import Report, command_line, note_new_folder, print_json, progress_bar, whole
+
+_SCENE = Group("Scene", sort_key=2)
+_CLOUD = Group("Point clouds", sort_key=3)
+
+
+def build(
+    *,
+    source: Source = MapSource(),
+    options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
+    clouds: Annotated[CloudOptions, Parameter(group=_CLOUD)] = CloudOptions(),
+    out: Out,
+    workers: Annotated[int | None, Parameter(group=OUTPUT, converter=whole)] = None,
+    scheduler: Annotated[str, Parameter(group=OUTPUT, metavar="ADDRESS")] = "",
+    report: Reporting = Report(),
+) -> int:
+    """Build a scene: solids of all buildings, one ground surface, the drivable road graph.
+
+    For example:
+
+    geoscene build --demo -o scene
+
+    geoscene build --osm city.osm.pbf -o scene --crs utm
+
+    geoscene build --osm city.osm.pbf --source overture=buildings.parquet -o scene
+
+    geoscene build --osm city.osm.pbf --cloud survey.laz -o scene
+
+    geoscene build --place "Norfolk, VA" -o norfolk
+
+    geoscene build --point 36.8853,-76.3059 --radius 800 -o odu
+
+    Parameters
+    ----------
+    out
+        Directory to write the scene to, or URL of one in object storage (s3://BUCKET/NAME, gs://).
+    workers
+        Number of processes, by default one per core. The scene does not depend on it.
+    scheduler
+        Address of the scheduler of a Dask cluster (tcp://HOST:8786), whose workers build the tiles instead;
+        they need the output folder under the same path.
+    """
+    from geoscene.pipeline.build import build as build_scene  # noqa: PLC0415  (half a second, not needed for --help)
+    from geoscene.scene.layout import SceneFiles  # noqa: PLC0415
+    from geoscene.scene.writer import check_target  # noqa: PLC0415
+    from geoscene.support.cluster import connect  # noqa: PLC0415
+    from geoscene.support.kernels import compile_ahead  # noqa: PLC0415
+    from geoscene.support.storage import publish, shown, url_of  # noqa: PLC0415
+
+    started = time.perf_counter()
+    if workers is not None and not 1 <= workers <= 256:
+        raise InputError(f"`workers` {workers}: give 1 to 256")
+    if source.dem_server and not options.elevation_tiles:
+        raise InputError("`dem_server` needs --dem tiles")
+    if not url_of(out):
+        check_target(out, overwrite=report.overwrite)
+        note_new_folder(out)
+    compile_ahead("build", quiet=report.quiet)
+    bar = partial(progress_bar, quiet=report.quiet)
+    with (
+        connect(scheduler) if scheduler else nullcontext() as cluster,
+        publish(out, last=SceneFiles(Path()).manifest.name, replaces=report.overwrite, bar=bar) as folder,
+        bar() as progress,
+    ):
+        progress("reading the map", 0, total=0)
+        data = read_map(source)
+        options = read_elevation(source, data, options=options, progress=progress)
+        many = workers or os.cpu_count() or 1
+        if clouds.cloud:
+            from geoscene.clouds.survey import with_clouds  # noqa: PLC0415
+
+            data, options = with_clouds(
+                data, options, cloud=clouds, cache_dir=cache_of(source), workers=many, progress=progress
+            )
+        scene = build_scene(
+            data,
+            folder,
+            options=options,
+            overwrite=report.overwrite,
+            workers=many,
+            cluster=cluster,
+            progress=progress,
+        )
+    document = scene.manifest | {"path": shown(out), "seconds": round(time.perf_counter() - started, 2)}
+    if report.json:
+        print_json(document)
+    else:
+        print_scene(document)
+        path = shown(out)
+        drive = ("lidar", "drive", path, "--route", *(options.along or ("random",)), "-o", "drive")
+        words = drive if document["counts"]["road_edges"] else ("geoscene", "export", path, "-o", "scene.glb")
+        if not scene.has_tiles:
+            words = ("geoscene", "export", path, "-o", "scene.gpkg")
+        print(f"\n{document['seconds']:.1f} s; next: {command_line(*words)}")
+    return 0
+
+
+def tradeoff(
+    *,
+    source: Source = MapSource(),
+    options: Annotated[BuildOptions, Parameter(group=_SCENE)] = BuildOptions(),
+    compared: BuildTradeoffOptions = BuildTradeoffOptions(),
+    out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
+    report: Reporting = Report(),
+) -> int:
+    """Build a place with other settings, measure error and cost of each, and recommend the cheapest.
+
+    Errors are those of the surface model, of volumes and footprints of buildings, and missing objects,
+    against the full scene (--lod 2, all of --only, --for all); costs are CPU time, peak memory and bytes of
+    a build by one process.
+
+    For example:
+
+    geoscene tradeoff --osm city.osm.pbf -o tradeoff
+
+    geoscene tradeoff --osm city.osm.pbf --dem heights.tif --settings lod,terrain --json
+
+    Parameters
+    ----------
+    out
+        Folder to write tradeoff.json, tradeoff.html and pareto.png to.
+    """
+    from geoscene.drawing.panels import require_matplotlib  # noqa: PLC0415
+    from geoscene.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
+    from geoscene.tradeoff.report import document, to_text, write_report  # noqa: PLC0415
+
+    if options.elevation_tiles:
+        raise InputError("`dem` tiles: not compared; give elevation files")
+    if out is not None:
+        note_new_folder(out)
+        if out.exists() and not report.overwrite:
+            raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+        require_matplotlib()
+    with progress_bar(quiet=report.quiet) as progress:
+        found = measured(
+            partial(read_map, source),
+            options,
+            settings=compared.settings,
+            resolution=compared.resolution,
+            repetitions=compared.repetitions,
+            progress=progress,
+        )
+    if report.json:
+        print_json(document(found))
+    else:
+        print(to_text(found))
+    if out is not None:
+        write_report(found, out)
+        if not report.json:
+            print(f"{out / 'tradeoff.html'}")
+    return 0
