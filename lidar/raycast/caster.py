@@ -6,7 +6,6 @@ import functools
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,8 +126,7 @@ class Caster:
             self.scene.parts[number] = replace(self.scene.parts[number], first=start)
         if instances is not None:
             self.instances = tuple(instances)
-            shapes: Any = [[shape.scene for shape in group.shapes] for group in self.instances]
-            self.scene.place(self.instances, shapes)
+            self.scene.place(self.instances, [[shape.scene for shape in g.shapes] for g in self.instances])
         self.scene.commit()
 
     def cast(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +13,6 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.box_tree import Tree, tree_of
 from lidar.raycast.hull import LONG, NARROW, displacements, margins_of, patches
-
-if TYPE_CHECKING:
-    from lidar.raycast.caster import Caster
-
 
 ALL = 0xFFFFFFFF
 """The mask that includes every face."""
@@ -142,6 +138,13 @@ def _tree(vertices: Float, faces: NDArray[np.int32]) -> Tree:
     return tree_of(corners.min(axis=1), corners.max(axis=1))
 
 
+class Instanced(Protocol):
+    """A `lidar.raycast.Caster` whose mesh is instanced: its scene, and its own instances."""
+
+    scene: Any
+    instances: tuple[MeshInstances, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class MeshInstances(Columns):
     """Instances of other casters' meshes, static or moving.
@@ -154,7 +157,7 @@ class MeshInstances(Columns):
                 all bits
     """
 
-    shapes: tuple[Caster, ...]
+    shapes: tuple[Instanced, ...]
     shape: NDArray[np.int32]
     transform: Float
     mask: NDArray[np.uint32] | None = None
