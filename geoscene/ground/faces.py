@@ -53,19 +53,15 @@ class GroundFaces:
         rings, count = np.arange(len(self.ring) - 1), np.diff(self.face)
         if chosen is not None:
             rings, count = rings[np.repeat(chosen, count)], count[chosen]
-        return _polygons(self.points, self.a, ring=self.ring, rings=rings, count=count)
-
-    def simplified(self, bend: float) -> NDArray[np.object_]:
-        """Shapely polygons (n,) without vertices of borders between two faces that bend them by too little.
-
-        bend : metres; its square is the area of the largest triangle that it may make with those beside it
-        """
-        from geoscene.ground.bends import without_bends  # noqa: PLC0415 - slow to import
-
-        vertex, ring = without_bends(self.points, self.a, self.b, self.other, self.ring, bend**2)
-        return _polygons(
-            self.points, vertex, ring=ring, rings=np.arange(len(ring) - 1), count=np.diff(self.face)
+        size = np.diff(self.ring)[rings] + 1
+        closed = np.append(0, np.cumsum(size))
+        place = np.arange(closed[-1]) + np.repeat(self.ring[rings] - closed[:-1], size)
+        place[closed[1:] - 1] = self.ring[rings]
+        offsets = (closed, np.append(0, np.cumsum(count)))
+        made: NDArray[np.object_] = shapely.from_ragged_array(
+            shapely.GeometryType.POLYGON, self.points[self.a[place]], offsets
         )
+        return made
 
     def inner_points(self) -> Float:
         """A point (n, 2) within each face."""
@@ -93,16 +89,3 @@ def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, flo
     if abs(covered - whole) > 1e-7 * whole:
         raise GeosceneError(f"ground cells of the tile at {box} cover {covered:.6f} m2 of {whole:.6f}")
     return GroundFaces(points, *columns)
-
-
-def _polygons(points: Float, vertex: Ints, *, ring: Ints, rings: Ints, count: Ints) -> NDArray[np.object_]:
-    """Polygons of ``count`` (n,) of the chosen rings each, whose vertices follow each other."""
-    size = np.diff(ring)[rings] + 1
-    closed = np.append(0, np.cumsum(size))
-    place = np.arange(closed[-1]) + np.repeat(ring[rings] - closed[:-1], size)
-    place[closed[1:] - 1] = ring[rings]
-    offsets = (closed, np.append(0, np.cumsum(count)))
-    made: NDArray[np.object_] = shapely.from_ragged_array(
-        shapely.GeometryType.POLYGON, points[vertex[place]], offsets
-    )
-    return made

@@ -478,7 +478,7 @@ def _cells(
     row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
     joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
-    return joined.simplified(BEND), row, slivers
+    return shapely.coverage_simplify(joined.polygons(), BEND, simplify_boundary=False), row, slivers
 
 
 def _noded_faces(
