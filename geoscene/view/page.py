@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
@@ -10,23 +9,20 @@ from typing import IO, Any
 import numpy as np
 
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, compact_json
+from geoscene.export.files import Summary
 from geoscene.export.objects import attribution
 from geoscene.options import ViewOptions
 from geoscene.scene import Scene
 from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
-from geoscene.view.assembly import check_page, link_credits, part, script_text, write_blob, write_page
+from geoscene.view.assembly import check_page, write_blob, write_page
 from geoscene.view.contents import PageContents, tiles_within
 from geoscene.view.lonlat import ACCURACY
 from geoscene.view.streamed import MARK, NAMES, write_streamed
 
-SCRIPTS = (
-    *("blob.js", "camera.js", "gestures.js", "program.js"),
-    *("data.js", "facades.js", "shaders.js", "draw.js", "panel.js"),
-)
-"""The viewer's parts, in the order in which they are joined; before ``main.js`` comes the way of loading."""
+_SCRIPTS = ("data.js", "facades.js", "shaders.js", "draw.js", "panel.js")
+"""The viewer's own scripts, in the order in which they are joined; then that of loading and ``main.js``."""
 
 
 def view_scene(
@@ -109,16 +105,17 @@ def _write_folder(contents: PageContents, chosen: Ints, *, out: Path, progress: 
 
 
 def _join(file: IO[bytes], scene: Scene, *, head: dict[str, Any], blobs: IO[bytes], load: str) -> None:
-    """Write the page: the template with its placeholders filled in and the bytes of the scene."""
-    words = {
-        "title": html.escape(str(head["name"])),
-        "credit": link_credits(attribution(scene)),
-        "style": part("page.css"),
-        "sources": "'unsafe-inline'" if load == "whole.js" else "'unsafe-inline' 'self' file:",
-        "scene": script_text(compact_json(head).decode()),
-        "script": "\n".join(part(name) for name in (*SCRIPTS, load, "main.js")),
-    }
-    write_page(file, part("page.html"), words=words, blobs=blobs)
+    """Write the page with the bytes of the scene."""
+    write_page(
+        file,
+        package="geoscene.view",
+        scripts=(*_SCRIPTS, load, "main.js"),
+        title=str(head["name"]),
+        credit=attribution(scene),
+        head=head,
+        blobs=blobs,
+        sources="" if load == "whole.js" else " 'self' file:",
+    )
 
 
 def _middle(tiles: Ints) -> Ints:

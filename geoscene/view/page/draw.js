@@ -7,8 +7,7 @@ const LEAST_PIXELS = 0.3; // copies whose second side is smaller are not drawn
 
 class Renderer {
   constructor(canvas, head, shapes) {
-    const gl = canvas.getContext("webgl2", { antialias: true });
-    if (!gl) throw new Error("This browser does not support WebGL 2, which the page needs.");
+    const gl = contextOf(canvas);
     Object.assign(this, { canvas, gl, head, tiles: [], made: [], bytes: 0, mode: 0, selected: -1, glow: 0, shadows: false, guesses: true, sunAzimuth: 2.6 });
     this.hidden = new Set();
     this.programs = {};

@@ -1,11 +1,9 @@
 // Main program: loading, events, and the loop that redraws after changes.
 
-const $ = (id) => document.getElementById(id);
 const MODES = { look: 0, material: 1, class: 2, source: 3, sigma: 3, guesses: 3 };
 
 async function start() {
-  if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot decompress the page's data.");
-  const head = JSON.parse($("scene").textContent);
+  const head = readHead();
   const shapes = readShapes(head.shapes, await blobOf("shapes"));
   const renderer = new Renderer($("canvas"), head, shapes);
   const camera = new Camera(head.low, head.high);
@@ -224,20 +222,15 @@ function listen(view) {
     click: (x, y) => click(view, x, y),
   });
 
-  document.addEventListener("keydown", (event) => {
-    if (/INPUT|SELECT/.test(event.target.tagName) || event.ctrlKey || event.metaKey || event.altKey) return;
+  onKeys(({ tagName }) => /INPUT|SELECT/.test(tagName), () => {
     const far = camera.distance / 20;
-    const action = {
+    return {
       ArrowLeft: () => camera.move(-far, 0), ArrowRight: () => camera.move(far, 0),
       ArrowUp: () => camera.move(0, far), ArrowDown: () => camera.move(0, -far),
       ...turningKeys(camera), n: () => { camera.azimuth = 0; }, h: () => camera.whole(camera, window.innerWidth / window.innerHeight),
       Escape: () => select(view, null),
-    }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!action) return;
-    event.preventDefault();
-    action();
-    moving();
-  });
+    };
+  }, moving);
 
   $("color").onchange = () => color(view, $("color").value);
   $("sun").oninput = () => {
@@ -264,13 +257,6 @@ function listen(view) {
   };
   $("search").oninput = list;
   $("search").onkeydown = (event) => event.key === "Enter" && find(view, $("search").value);
-  canvas.addEventListener("webglcontextlost", () => fail(new Error("The graphics context was lost; reload the page.")));
-}
-
-function fail(error) {
-  $("message").hidden = false;
-  $("message").textContent = error.message;
-  document.documentElement.dataset.ready = "failed";
 }
 
 start().catch(fail);

@@ -33,13 +33,6 @@ function isGuess(source) {
   return /default|inferred|assumed|guess/.test(source);
 }
 
-/** An element with text or children. */
-function make(tag, content = [], set = {}) {
-  const element = Object.assign(document.createElement(tag), set);
-  element.append(...[content].flat());
-  return element;
-}
-
 /** Centimetres, without a minus before zero. */
 function metres(value) {
   return (Math.round(value * 100) / 100 + 0).toFixed(2);
@@ -48,14 +41,6 @@ function metres(value) {
 /** Degrees from -180 to 180. */
 function wrapped(lon) {
   return ((lon + 540) % 360) - 180;
-}
-
-function words(name) {
-  return name.replaceAll("_", " ");
-}
-
-function toHex(rgb) {
-  return `rgb(${rgb.join(",")})`;
 }
 
 /** A value for people, with its unit. */

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import html
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
 from typing import IO, Any
 
-from geoscene.export.files import compact_json
 from geoscene.support.files import atomic_file, exclusive, spool
 from geoscene.support.progress import Progress, silent
-from geoscene.view.assembly import check_page, link_credits, part, script_text, write_blob, write_page
+from geoscene.view.assembly import check_page, write_blob, write_page
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import PlaybackOptions
 from lidar.tools.view.drive import Drive
 from lidar.tools.view.sweeps import pack_slots
 
-SHARED = ("blob.js", "camera.js", "gestures.js", "program.js")
-"""Parts of the page of scenes that the player uses."""
-
-SCRIPTS = ("sweep.js", "draw.js", "panels.js", "player.js")
-"""The player's own parts, in the order in which they are joined."""
+_SCRIPTS = ("sweep.js", "draw.js", "panels.js", "player.js")
+"""The player's own scripts, in the order in which they are joined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,17 +96,17 @@ def write_player(
     blobs  : elements with the bytes of frames
     served : frames come from the server of the page instead; nothing else can be loaded
     """
-    words = {
-        "title": html.escape(f"{head['name']}, {', '.join(one['name'] for one in head['scanners'])}"),
-        "credit": link_credits(str(drive.dataset.manifest.get("attribution", ""))),
-        "connect": "'self'" if served else "'none'",
-        "style": part("page.css", package="lidar.tools.view"),
-        "head": script_text(compact_json(head | {"served": served}).decode()),
-        "script": "\n".join(
-            [part(name) for name in SHARED] + [part(name, package="lidar.tools.view") for name in SCRIPTS]
-        ),
-    }
-    write_page(file, part("page.html", package="lidar.tools.view"), words=words, blobs=blobs)
+    write_page(
+        file,
+        package="lidar.tools.view",
+        scripts=_SCRIPTS,
+        title=f"{head['name']}, {', '.join(one['name'] for one in head['scanners'])}",
+        credit=str(drive.dataset.manifest.get("attribution", "")),
+        head=head | {"served": served},
+        blobs=blobs,
+        generator="geoscene lidar",
+        connect="'self'" if served else "'none'",
+    )
 
 
 def _write_slots(blobs: IO[bytes], drive: Drive) -> None:

@@ -42,7 +42,7 @@ def folder(scene, tmp_path_factory):
 @pytest.fixture(scope="module")
 def head(folder):
     text = (folder / "index.html").read_text("utf-8")
-    return json.loads(re.search(r'id="scene">([^<]*)<', text)[1])
+    return json.loads(re.search(r'id="head">([^<]*)<', text)[1])
 
 
 def node(folder, number):

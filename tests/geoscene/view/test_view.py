@@ -64,7 +64,7 @@ class Page(HTMLParser):
         return b64decode(self.scripts[name])
 
     def json(self, name):
-        return json.loads(self.scripts[name] if name == "scene" else decompress(self.bytes(name), 31))
+        return json.loads(self.scripts[name] if name == "head" else decompress(self.bytes(name), 31))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def moved_corners(scene, table):
 
 
 def test_page_contains_every_triangle_and_instance_of_the_scene(scene, page):
-    told, looks = page.json("scene")["tiles"], read_looks(scene)
+    told, looks = page.json("head")["tiles"], read_looks(scene)
     assert len(told) == len(scene.tile_indices) > 4
     faces = number = 0
     for k, entry in enumerate(told):
@@ -136,7 +136,7 @@ def test_page_contains_every_triangle_and_instance_of_the_scene(scene, page):
 
 
 def test_faces_are_in_the_group_of_their_layer_and_pads_lie_on_the_ground(scene, page):
-    head = page.json("scene")
+    head = page.json("head")
     seen = set()
     for k, entry in enumerate(head["tiles"]):
         mesh = unpack_tile(entry, page.bytes(f"tile-{k}"))[0].mesh
@@ -160,7 +160,7 @@ def test_the_page_makes_no_requests(path, page):
     code = page.scripts["viewer"]
     assert "default-src 'none'" in text
     assert all(link.startswith(("https://www.openstreetmap.org/", "data:,")) for link in page.links)
-    addresses = re.findall(r"\b[a-z]+://[^\s\"'`<>]*", text.replace(page.scripts["scene"], ""))
+    addresses = re.findall(r"\b[a-z]+://[^\s\"'`<>]*", text.replace(page.scripts["head"], ""))
     assert {a for a in addresses if not a.startswith("https://www.openstreetmap.org/")} == set()
     assert not [word for word in LOADERS if word in code]
     assert not {"img", "iframe", "object", "embed", "video", "audio"} & set(page.tags)
@@ -176,7 +176,7 @@ def test_names_from_the_map_are_escaped(scene, tmp_path):
     odd = replace(scene, manifest={**scene.manifest, "name": name})
     view_scene(odd, tmp_path / "page.html")
     page = Page((tmp_path / "page.html").read_text("utf-8"))
-    assert page.json("scene")["name"] == name
+    assert page.json("head")["name"] == name
     assert page.tags.count("script") == 5 + len(scene.tile_indices)
     assert "<script>document" not in (tmp_path / "page.html").read_text("utf-8")
 
@@ -227,7 +227,7 @@ def test_bounds_select_the_tiles_that_they_intersect(scene, tmp_path):
     )
     page = Page((tmp_path / "part.html").read_text("utf-8"))
     assert summary.faces == len(scene.tile(0, 0).mesh)
-    assert rows(unpack_tile(page.json("scene")["tiles"][0], page.bytes("tile-0"))[0]).tolist() == (
+    assert rows(unpack_tile(page.json("head")["tiles"][0], page.bytes("tile-0"))[0]).tolist() == (
         rows(read_looks(scene).dressed(scene.tile(0, 0))).tolist()
     )
     present = set(np.unique(scene.tile(0, 0).mesh.feature)) | set(scene.tile(0, 0).instances.feature)

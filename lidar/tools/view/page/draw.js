@@ -76,8 +76,7 @@ void main() { color = vec4(vColor, 1.0); }`;
 
 class Renderer {
   constructor(canvas, head) {
-    const gl = canvas.getContext("webgl2", { antialias: true });
-    if (!gl) throw new Error("This browser does not support WebGL 2, which the page needs.");
+    const gl = contextOf(canvas);
     Object.assign(this, { canvas, gl, head, mode: 0, size: 2, picked: -1 });
     this.points = programOf(gl, POINT_VERTEX, POINT_FRAGMENT);
     this.lines = programOf(gl, LINE_VERTEX, LINE_FRAGMENT);

@@ -1,17 +1,5 @@
 // Panels beside the point cloud: images, range image, plan, speed, legend, what is known of a return.
 
-const $ = (id) => document.getElementById(id);
-
-/** An element with its content and properties. */
-function make(tag, content = [], set = {}) {
-  const element = Object.assign(document.createElement(tag), set);
-  element.append(...[content].flat());
-  return element;
-}
-
-const words = (name) => name.replaceAll("_", " ");
-const css = (rgb) => `rgb(${rgb.join(",")})`;
-
 /** Colours by: title, and marks below the ramp. */
 const COLORINGS = {
   class: { title: "class" },
@@ -39,12 +27,12 @@ function legend(view) {
   if (rows) {
     for (const [color, text, code, column] of rows()) {
       const dot = make("span", [], { className: "dot" });
-      dot.style.background = css(color);
+      dot.style.background = toHex(color);
       items.push(make("li", [dot, `${text} (${sweep[column].filter((c) => c === code).length})`]));
     }
   } else if (ends) {
     const bar = make("div", [], { className: "ramp" });
-    bar.style.background = `linear-gradient(90deg, ${head.ramp.filter((_, k) => k % 15 === 0).map(css).join(",")})`;
+    bar.style.background = `linear-gradient(90deg, ${head.ramp.filter((_, k) => k % 15 === 0).map(toHex).join(",")})`;
     items.push(make("li", [bar, make("div", ends.map((end) => make("span", end)), { className: "ends" })]));
   }
   if (mode === "origin" && !head.truth) items.push(make("li", "No stage acted: all returns are of surfaces."));
@@ -136,7 +124,7 @@ function plan(view) {
   line(head.path, "#e0a030", 2);
   for (const box of sweep.boxes) {
     const corners = cornersOf(box);
-    context.fillStyle = css(head.classes[box.class][1]);
+    context.fillStyle = toHex(head.classes[box.class][1]);
     context.beginPath();
     [0, 1, 5, 4].forEach((k, n) => (n ? context.lineTo(...at(corners[k])) : context.moveTo(...at(corners[k]))));
     context.fill();

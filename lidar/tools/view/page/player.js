@@ -53,8 +53,7 @@ class Sweeps {
 }
 
 async function start() {
-  if (!("DecompressionStream" in window)) throw new Error("This browser is too old: it cannot decompress the page's data.");
-  const head = JSON.parse($("head").textContent);
+  const head = readHead();
   const renderer = new Renderer($("canvas"), head);
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   const far = Math.max(...head.scanners.map((scanner) => scanner.far));
@@ -276,22 +275,17 @@ function listen(view) {
       tell(view, hit && hit.row);
     },
   });
-  document.addEventListener("keydown", (event) => {
-    if (/SELECT/.test(event.target.tagName) || event.target.type === "number" || event.ctrlKey || event.metaKey || event.altKey) return;
-    const ten = event.shiftKey ? 10 : 1;
-    const action = {
+  onKeys(({ tagName, type }) => tagName === "SELECT" || type === "number", ({ shiftKey }) => {
+    const ten = shiftKey ? 10 : 1;
+    return {
       " ": () => play(view, !view.playing), ArrowLeft: () => step(-ten), ArrowRight: () => step(ten),
       Home: () => step(-Infinity), End: () => step(Infinity),
       "[": () => rate(-1), "]": () => rate(1), "<": () => together(-1), ">": () => together(1),
       c: () => color(view, Object.keys(COLORINGS)[(renderer.mode + 1) % Object.keys(COLORINGS).length]),
       b: () => toggle("boxes"), v: () => toggle("follow"), h: () => behind(view, view.frame),
       ...turningKeys(camera), Escape: () => tell(view, null),
-    }[event.key.length === 1 ? event.key.toLowerCase() : event.key];
-    if (!action) return;
-    event.preventDefault();
-    action();
-    moving();
-  });
+    };
+  }, moving);
 
   $("play").onclick = () => play(view, !view.playing);
   $("back").onclick = () => step(-1);
@@ -310,13 +304,6 @@ function listen(view) {
     moving();
   };
   $("boxes").onchange = moving;
-  canvas.addEventListener("webglcontextlost", () => fail(new Error("The graphics context was lost; reload the page.")));
-}
-
-function fail(error) {
-  $("message").hidden = false;
-  $("message").textContent = error.message;
-  if (document.documentElement.dataset.ready !== "yes") document.documentElement.dataset.ready = "failed";
 }
 
 start().catch(fail);
