@@ -1,4 +1,4 @@
-"""What scenes hold for a use: a drive, a map or a GIS needs only part of a scene."""
+"""Contents of scenes by use: a drive, a map or a GIS needs only part of a scene."""
 
 from __future__ import annotations
 

@@ -264,7 +264,7 @@ def _measured_top(row: BuildingRow, source: str) -> float:
 
 
 def _ranks(rows: Sequence[BuildingRow], heights: BuildingHeights) -> Ints:
-    """How well each row is described (n,): 2 if the height of its building is known, 1 if only its name."""
+    """Rank (n,) of each row: 2 if the height of its building is known, 1 if only its name."""
     outline = [r.outline for r in rows]
     known = np.isin(heights.source, ("cloud", "tag", "est_height", "levels", "parts"))
     known |= known[outline]

@@ -10,7 +10,7 @@ from geoscene.uses import USES
 
 
 def _count_guessed(relief: dict[str, Any]) -> dict[str, int]:
-    """What is guessed besides the openings of facades, by kind."""
+    """Number of guessed features by kind, openings of facades excluded."""
     furniture = sum(relief.get("furniture_guessed", {}).values())
     found = relief.get("parts_guessed", {}) | relief.get("roofs_guessed", {}) | {"furniture": furniture}
     return {name: count for name, count in found.items() if count}
@@ -72,7 +72,7 @@ def print_scene(report: dict[str, Any]) -> None:
 
 
 def _left_out_text(counts: dict[str, int]) -> str:
-    """What a scene for a use does not have."""
+    """Text on the contents that a scene for one use leaves out."""
     names = {
         "tiles": "tiles with all meshes",
         "features": "features of other tables",

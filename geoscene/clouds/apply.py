@@ -179,7 +179,7 @@ def _with_roof(tags: Tags, roof: Roof, *, turn: float) -> Tags:
 def _with_trees(
     osm: OsmData, measured: CloudMeasurements, *, prefer_tags: bool
 ) -> tuple[OsmData, dict[str, int]]:
-    """The map with measured sizes of its trees and with those that it lacks; counts."""
+    """The map with measured sizes of its trees and with measured trees added, and counts."""
     frame, found = measured.frame, measured.trees
     mapped = [k for k, point in enumerate(osm.points) if point.tags.get("natural") == "tree"]
     lonlat = np.array([(osm.points[k].lon, osm.points[k].lat) for k in mapped]).reshape(-1, 2)
@@ -237,7 +237,7 @@ def _match(xy: Float, found: Float, *, crown: Float) -> Ints:
 
 
 def _within_forests(osm: OsmData, frame: Frame, *, xy: Float) -> Any:
-    """Which places (n,) lie in mapped forests, whose trees are generated."""
+    """Mask (n,) of places in mapped forests, whose trees are generated."""
     shapes = [
         a.geometry for a in osm.areas if a.tags.get("landuse") in _FOREST or a.tags.get("natural") in _FOREST
     ]
@@ -250,7 +250,7 @@ def _within_forests(osm: OsmData, frame: Frame, *, xy: Float) -> Any:
 
 
 def _in_rows(osm: OsmData, frame: Frame, *, xy: Float) -> Any:
-    """Which places (n,) lie along mapped tree rows, whose trees are generated."""
+    """Mask (n,) of places along mapped tree rows, whose trees are generated."""
     lines = [
         shapely.LineString(np.column_stack(frame.from_geographic(*way.lonlat.T)))
         for way in osm.ways

@@ -94,7 +94,7 @@ def ground_heights(points: SurveyPoints, grid: CloudGrid, *, classified: bool, b
 
 
 def ground_returns(points: SurveyPoints, grid: CloudGrid, *, built: Bools) -> Bools:
-    """Which points (n,) lie on the ground, by a progressive morphological filter (SMRF, Pingel et al. 2013).
+    """Mask (n,) of ground returns, by a progressive morphological filter (SMRF, Pingel et al. 2013).
 
     The lowest last returns of the cells are opened with windows of growing width. What an opening lowers by
     more than the slope allows is no ground; gaps are bridged, and points near the surface left are ground.

@@ -33,7 +33,7 @@ _NO_ROOF = (2, 3, 4, 5, 7, 9, 11, 17, 18)  # classes of ground, vegetation, nois
 
 
 class Work(NamedTuple):
-    """What all squares are measured with; the shift is added to all points."""
+    """Inputs shared by all squares; the shift is added to all points."""
 
     spool: Spool
     footprints: Any
@@ -61,7 +61,7 @@ class _Objects(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CloudMeasurements:
-    """What was measured in a cloud.
+    """Measurements of roofs and trees in a point cloud.
 
     frame     : of the scene
     buildings : table of the map before the measurement

@@ -265,7 +265,7 @@ def _covers(roof: Roof, inliers: Float, *, polygon: Any, among: int) -> bool:
 
 
 def roof_points(polygon: Any, xyz: Float, *, inset: float) -> Bools:
-    """Which points (n,) lie within a footprint, at least ``inset`` metres from its walls where it is wide."""
+    """Mask (n,) of points within a footprint, at least ``inset`` metres from its walls where it is wide."""
     inner = shapely.buffer(polygon, -inset)
     if shapely.area(inner) < 0.3 * shapely.area(polygon):
         inner = shapely.buffer(polygon, -inset / 2)

@@ -1,4 +1,4 @@
-"""What all exports share: the summary they return, and small conversions."""
+"""Summary that all exports return, and small conversions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What an export wrote.
+    """Summary of an export.
 
     path    : the file, or the folder
     kind    : name of the format

@@ -1,4 +1,4 @@
-"""What a scene can be exported as, and the one function that does it."""
+"""Export formats, one row each, and the function that writes them."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def export_scene(
 
 
 def _relief_note(scene: Scene) -> str:
-    """How many walls of a scene have openings as geometry, and why others have none."""
+    """Text on the number of walls with openings as geometry, and reasons for walls without."""
     counts = scene.manifest.get("relief", {}).get("facades", {})
     causes = {
         "small": "are too small for openings",

@@ -192,7 +192,7 @@ def write_stl(
 
 
 def _in_single_precision(mesh: Mesh) -> tuple[Mesh, int]:
-    """The solids rounded to float32 without those that are no longer closed, and the number of the latter."""
+    """Solids rounded to float32 that are still closed, and the number of the others."""
     points = mesh.vertices.astype(np.float32).astype(np.float64)
     rounded = replace(mesh, vertices=points)
     rounded = rounded.take(~degenerate_faces(points, mesh.faces))

@@ -1,4 +1,4 @@
-"""The vertices of a file that is written tile by tile, each once, also where tiles meet."""
+"""Vertices of a file that is written tile by tile, each once, also along the borders of tiles."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def _turned_boxes(corners: Ints, owner: Ints) -> tuple[Ints, Ints]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _met(low: Ints, high: Ints, order: Ints, body: Ints, corners: Ints, faces: Ints) -> Ints:
-    """Pairs of triangles of one owner and of different bodies that are not apart, and how they meet: (k, 3).
+    """Pairs (k, 3) of triangles of one owner and of different bodies that are not apart, and their contact.
 
     The first of a pair has the smaller number.
 
@@ -183,7 +183,7 @@ def _distances(first: Ints, second: Ints, same: Bools) -> Float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meeting(a: int, b: int, corners: Ints, faces: Ints, planes: Float, same: Bools, turned: Bools) -> int:
-    """How two triangles lie to each other.
+    """Kind of contact of two triangles.
 
     planes       : (m, 4, 4) of all triangles, from `_find_planes`
     same, turned : (3, 3) room for the common corners
@@ -362,7 +362,7 @@ def _one_side(sides: Ints, same: Bools) -> bool:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _edges_pierce(one: Ints, two: Ints, sides: Ints, same: Bools) -> bool:
-    """Whether an edge of a triangle without common corners meets another triangle.
+    """Whether an edge of a triangle without common corners intersects another triangle.
 
     sides : (3,) of the other's plane on which the corners lie
     """
@@ -405,7 +405,7 @@ def _turn(a: Ints, b: Ints, c: Ints, i: int, j: int) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet_in_plane(p: Ints, q: Ints, triangle: Ints) -> bool:
-    """Whether a segment in the plane of a triangle meets it."""
+    """Whether a segment in the plane of a triangle intersects it."""
     i, j = _axes(triangle)
     left = right = True
     for k in range(3):

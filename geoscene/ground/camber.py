@@ -80,7 +80,7 @@ class Camber:
 
 @dataclass(frozen=True, slots=True)
 class Raised:
-    """What stands above the planned height of the ground: crowns of carriageways and beds of tracks.
+    """Surfaces above the planned height of the ground: crowns of carriageways and beds of tracks.
 
     They do not overlap.
     """

@@ -195,7 +195,7 @@ def _profiles(ways: Sequence[Way], frame: Frame, *, height: Height) -> tuple[Flo
 
 
 def _flood(plan: GroundPlan, points: Float, *, z: Float, levels: WaterLevels, beside: Beside) -> Float:
-    """Heights (n,) of points (n, 2); those that water touches take its level."""
+    """Heights (n,) of points (n, 2), at the level of the water on the shore and in water."""
     vertex, row, _ = beside
     on_water = values_at(plan.layers.body, row, base="") != ""
     vertex, row = vertex[on_water], row[on_water]

@@ -156,7 +156,7 @@ def _meeting(shapes: NDArray[np.object_], bands: NDArray[np.object_]) -> tuple[I
 
 
 class Beside(NamedTuple):
-    """What touches the vertices of triangles.
+    """Layers that touch the vertices of triangles.
 
     vertex : (k,) numbers of vertices
     row    : (k,) rows of the layers that touch them, -1 for the base

@@ -1,4 +1,4 @@
-"""Which of many points lie near which of many shapes: candidates by bounding boxes, for a closer look."""
+"""Candidate pairs of points and nearby shapes, by bounding boxes."""
 
 from __future__ import annotations
 

@@ -215,7 +215,7 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
 
 
 def _touches_itself(shape: Any) -> bool:
-    """Rings of the shape meet in a point, where a solid would have an edge of four faces."""
+    """Whether rings of the shape touch in a point, where a solid would have an edge of four faces."""
     rings = shapely.get_rings(shapely.get_parts(shape))
     coordinates = np.concatenate([np.empty((0, 2)), *(shapely.get_coordinates(ring)[:-1] for ring in rings)])
     return len(np.unique(np.rint(coordinates / PRECISION), axis=0)) < len(coordinates)

@@ -28,7 +28,7 @@ _SHARES = {"needleleaved": 1.0, "coniferous": 1.0, "mixed": 0.5}
 
 @dataclass(frozen=True, slots=True)
 class Forests:
-    """What the trees of a scene's forests are generated from, beside their ground.
+    """Parameters of the trees of a scene's forests, beside their ground.
 
     feature : (k,) int64, forests with needle-leaved trees, by feature number, ascending
     needles : (k,) float64, their share of needle-leaved trees

@@ -1,4 +1,4 @@
-"""What is drawn on traffic signs, from tags: human-readable names and the codes of countries."""
+"""Faces of traffic signs from tags: human-readable names and the codes of countries."""
 
 from __future__ import annotations
 

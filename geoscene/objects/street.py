@@ -147,7 +147,7 @@ class FurnitureGuesses(Columns):
 
 
 def guess_furniture(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> FurnitureGuesses:
-    """What may stand along the streets and before the restaurants within an extent of a map.
+    """Guessed street furniture along streets and before restaurants within an extent of a map.
 
     It is drawn by the OSM id of each street and the place on it, whatever else there is.
     """

@@ -110,7 +110,7 @@ _RAISED = 1.0  # metres, minimum height of an underside for a building to have n
 
 @dataclass(frozen=True, slots=True)
 class BuildPlan:
-    """All that tiles are built from.
+    """Inputs of all tiles.
 
     frame     : frame of the scene
     terrain   : elevation model, or level ground

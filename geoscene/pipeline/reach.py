@@ -1,4 +1,4 @@
-"""What a build along a route has: tiles and features within reach of the route."""
+"""Tiles and features of a build along a route."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Reach:
 
     @classmethod
     def within(cls, area: Any) -> Reach:
-        """What is in an area, a shapely polygon in scene metres."""
+        """Reach that is an area, a shapely polygon in scene metres."""
         shapely.prepare(area)
         return cls(area, 0.0)
 

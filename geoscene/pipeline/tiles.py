@@ -135,7 +135,7 @@ def make_solids(plan: BuildPlan, tile: tuple[int, int], *, lod: int) -> tuple[Me
 
 @dataclass(frozen=True, slots=True)
 class TileSurroundings:
-    """What a tile holds besides its buildings.
+    """Contents of a tile without its buildings.
 
     mesh      : ground, barriers and structures, scene metres
     instances : trees and furniture, scene metres
@@ -152,7 +152,7 @@ class TileSurroundings:
 
 
 def make_ground(plan: BuildPlan, tile: tuple[int, int]) -> TileSurroundings:
-    """All of tile (i, j) but its buildings."""
+    """Build the tile's ground, objects and structures."""
     i, j = tile
     height, problems = plan.height, list[Problem]()
 
@@ -292,7 +292,7 @@ def _facades(plan: BuildPlan, setting: FacadeSetting, *, solids: Mesh, problems:
 def _roof_objects(
     plan: BuildPlan, solids: Mesh, *, lod: int, problems: list[Problem]
 ) -> tuple[ShapeInstances, dict[str, int]]:
-    """What stands on the roofs of a tile's buildings, scene metres, and its number by shape."""
+    """Roof objects of a tile's buildings, scene metres, and their number by shape."""
     none = ShapeInstances.empty()
     if plan.rooftops is None or lod < 2:
         return none, {}

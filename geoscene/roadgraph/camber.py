@@ -1,4 +1,4 @@
-"""Which carriageways have a camber, and where it fades out."""
+"""Carriageways with a camber, and the stretches over which it fades out."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def find_crowns(roads: Carriageways) -> Crowns:
 
 
 def _goes_on(roads: Carriageways, cambered: Bools) -> Bools:
-    """Whether the crown of each carriageway goes on over its start and end (k, 2)."""
+    """Whether the crown of each carriageway continues beyond its start and end (k, 2)."""
     k = len(roads)
     node, road = roads.ends.T.ravel(), np.tile(np.arange(k), 2)
     rank = np.where(roads.place == 0, roads.importance, len(roads.node_xy) + 1)[road]

@@ -35,7 +35,7 @@ _OCTAGON = np.arange(8) * np.pi / 4 + np.pi / 8
 
 
 def cover_rows(osm: OsmData, roads: Carriageways, *, frame: Frame, guess: bool) -> SurfaceRows:
-    """What is set into carriageways, flush with them.
+    """Manhole covers, gullies and patches in carriageways.
 
     Mapped are points tagged ``manhole`` or ``man_made=manhole``. Guessed are covers, gullies at kerbs and
     patches along streets of built-up areas: drawn by the ids of the street and of its first node, and by

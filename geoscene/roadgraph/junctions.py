@@ -141,7 +141,7 @@ def junction_reach(roads: Carriageways) -> tuple[Float, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Arms:
-    """Ends of carriageways, grouped by where they meet, counter-clockwise within a group.
+    """Ends of carriageways, grouped by junction, counter-clockwise within a group.
 
     group : (a,) int64 ascending
     road, end : (a,) int64 row of the carriageways, and 0 for its start or 1 for its end
@@ -248,7 +248,7 @@ def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
 
 
 def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]:
-    """What lies between each arm and the next one, as seen from the node."""
+    """Areas between each arm and the next one, as seen from the node."""
     turn = np.linspace(0.0, 1.0, 9)
     angle = arms.angle[:, None] + between[:, None] * turn
     radius = (2.0 * reach + 60.0)[:, None]

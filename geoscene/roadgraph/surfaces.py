@@ -124,7 +124,7 @@ def _beside(roads: Carriageways) -> Float:
 
 
 def _junction_reach(roads: Carriageways) -> Float:
-    """Metres (n,) from each node to the outside of the junction there, at most; 0 where roads do not meet."""
+    """Maximum metres (n,) from each node to the outside of its junction; 0 without a junction."""
     reach = np.zeros(len(roads.node_xy))
     np.maximum.at(reach, roads.ends.ravel(), np.repeat(_beside(roads), 2) + JOINT)
     reach[np.bincount(roads.ends.ravel(), minlength=len(reach)) < 2] = 0.0

@@ -128,7 +128,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame, index
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """What a layer of a GeoPackage holds.
+    """Geometry type and columns of a layer of a GeoPackage.
 
     geometry_type : as GDAL names it: ``Polygon``, ``MultiPolygon Z`` ...
     columns       : column name to type; object for text

@@ -165,7 +165,7 @@ class Scene(Previewed):
 
     @property
     def use(self) -> str:
-        """What the scene was built for, one of `geoscene.uses.USES`."""
+        """Use for which the scene was built, one of `geoscene.uses.USES`."""
         return str(self.manifest.get("options", {}).get("use", "all"))
 
     def require(self, *parts: str) -> None:
@@ -197,7 +197,7 @@ class Scene(Previewed):
         return np.hstack([low, low + span]) * self.tile_size
 
     def tiles_at(self, xy: Float) -> Ints:
-        """Row (k,) in `tile_indices` of the tile that each point (k, 2) is on, -1 where there is none."""
+        """Row (k,) in `tile_indices` of the tile of each point (k, 2), -1 beyond all tiles."""
         boxes, row = self.tile_boxes, np.full(len(xy), -1, np.int64)
         point, tile = shapely.STRtree(shapely.box(*boxes.T)).query(shapely.points(xy))
         on = ((xy[point] >= boxes[tile, :2]) & (xy[point] < boxes[tile, 2:])).all(axis=1)
@@ -251,7 +251,7 @@ class Scene(Previewed):
 
     @functools.cached_property
     def forests(self) -> Forests | None:
-        """What the trees of forests are generated from, None for a scene without them."""
+        """Parameters of the trees of forests, None for a scene without forests."""
         document = self.manifest.get("forests")
         return None if document is None else Forests.from_json(document)
 

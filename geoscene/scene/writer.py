@@ -209,7 +209,7 @@ def _select_needed(layer: Layer, use: Use) -> Layer:
 
 
 def _left_out(layers: Sequence[Layer], use: Use) -> dict[str, int]:
-    """Number of features that a use does not need, of attributes of the others, and bytes of both."""
+    """Numbers of features and attributes that a use does not need, and bytes of both."""
     found = {"features": 0, "attributes": 0, "bytes": 0}
     for layer in layers:
         needed = _select_needed(layer, use)

@@ -74,7 +74,7 @@ class _Net:
 
 @dataclass(frozen=True, slots=True)
 class _Crossed:
-    """What paths may cross, and the rules for it.
+    """Features that paths may cross, and the rules for crossings.
 
     height : height of the terrain at x, y; None for level ground at 0
     """
@@ -109,7 +109,7 @@ def path_members(
     height: Height | None,
     options: StructureOptions,
 ) -> tuple[Members, list[Problem]]:
-    """Bridges and tunnels of ways that are not in the road graph, and those that end above the ground.
+    """Bridges and tunnels of ways outside the road graph, and the ways that end above the ground.
 
     Beside a road bridge of the same layer they have its height. Otherwise they run evenly from ground to
     ground, but with the required clearance over (or under) roads, tracks and water, from where they fall

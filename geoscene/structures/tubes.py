@@ -137,7 +137,7 @@ def stations_every(table: Structures, k: int, *, spacing: float) -> tuple[Float,
 
 
 def mouths(table: Structures, k: int) -> Float:
-    """Stations just inside the ends of a piece where a road goes on in the open."""
+    """Stations just inside the ends of a piece where a road continues in the open."""
     approach = table.approach[k]
     if shapely.is_empty(approach) or approach is None:
         return np.empty(0)

@@ -37,7 +37,7 @@ class Problem:
 def make_without_failures(
     make: Callable[[Ints], T], rows: Ints, *, failed: Callable[[int, Exception], None]
 ) -> list[T]:
-    """What ``make`` returns for all rows together, or for as many runs of them as there are failures.
+    """Results of ``make`` for all rows at once, or for the runs of rows between failures.
 
     One feature must not end a build: rows for which ``make`` raises an exception are halved until the one
     that causes it is alone; that row goes to ``failed`` and is left out. Errors that no feature causes, of

@@ -41,7 +41,7 @@ class _Worker(Generic[Task]):
     task: Task | None = None
 
     def end(self) -> str:
-        """How the process ended, in words."""
+        """Text on the end of the process."""
         self.process.join()
         code = self.process.exitcode or 0
         cause = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
@@ -92,7 +92,7 @@ def run_tasks(work: Callable[[Task], Result], tasks: Sequence[Task], *, workers:
 
 
 def _context() -> BaseContext:
-    """How processes are started: as is current, but not by a fork while libraries have threads."""
+    """Start method of processes: the current one, but no fork while libraries have threads."""
     context = multiprocessing.get_context()
     forks = context.get_start_method() == "fork"
     return multiprocessing.get_context("spawn") if forks and threads_of_libraries() else context

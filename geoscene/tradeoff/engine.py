@@ -156,7 +156,7 @@ def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Measures:
-    """What is compared of a scene.
+    """Figures of a scene that are compared.
 
     height : (rows, columns) of the highest face over each cell; NaN without one
     klass  : (rows, columns) class of that face

@@ -1,4 +1,4 @@
-"""What a page shows of a scene: chosen layers with guessed looks, attributes, and boxes of features."""
+"""Contents of a page: chosen layers with guessed looks, attributes, and bounding boxes of features."""
 
 from __future__ import annotations
 

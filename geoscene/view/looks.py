@@ -35,7 +35,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class FacadeLooks(Columns):
-    """How windows are drawn on the walls of buildings, one row each.
+    """Parameters of the windows drawn on the walls of buildings, one row each.
 
     feature : (b,) int32, feature numbers
     base    : (b,) float32, z in scene metres from which storeys count

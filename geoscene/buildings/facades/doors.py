@@ -125,7 +125,7 @@ def put_guessed_doors(sheet: Sheet, at: Elevations, *, facing: Bools) -> None:
 
 
 def _doors_of(at: Elevations, wall: Ints, *, facing: Bools, once: bool) -> Ints:
-    """Which (d,) of the cells with room for a door get one, given their walls (n,), sorted.
+    """Sorted cells (d,) that get a door, among those with room for one, given the walls (n,).
 
     once : one in each building at most
     """

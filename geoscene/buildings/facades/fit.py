@@ -25,7 +25,7 @@ _SKIN = 0.01
 
 
 def obstacles(at: Elevations, wall: Ints, *, shape: NDArray[np.object_]) -> tuple[Ints, Float]:
-    """Which shapes (p,) in plan before walls (n,) buildings intersect.
+    """Rows of shapes (p,) in plan before walls (n,) that buildings intersect.
 
     Returns also the lower and upper height (p, 2) of the building or part above the base of the wall's.
     """
@@ -173,7 +173,7 @@ def _enter(triangles: Float, *, low: Float, high: Float) -> Bools:
 
 
 class Sheet:
-    """What each cell holds, while it is filled in."""
+    """Contents of each cell, while doors, shop fronts and windows are placed."""
 
     def __init__(self, at: Elevations) -> None:
         cells = at.cells

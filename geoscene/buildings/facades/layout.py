@@ -95,7 +95,7 @@ def wall_relief(
 
 
 def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Attached]:
-    """What each cell holds, and what stands out of walls with the counts of both."""
+    """Contents of each cell, solids attached to walls, and counts of both."""
     sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
     facing = facing_street(at)
     _put_windows(sheet, at)

@@ -1,4 +1,4 @@
-"""What facades depend on besides the walls themselves: styles, neighbours, streets and mapped entrances."""
+"""Context of facades: styles, neighbouring buildings, streets, mapped entrances and shops."""
 
 from __future__ import annotations
 
