@@ -60,7 +60,7 @@ class Buildings(Columns):
                        not tagged
     roof_across      : (n,) bool, whether the ridge runs across the longer side
     top              : (n,) z in metres of the top where a point cloud gave it, NaN elsewhere; ``height`` is
-                       then the top less the base (`geoscene.buildings.tops`)
+                       then the top less the base (`geoscene.buildings.resolve`)
     height_source    : (n,) str: cloud, tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)

@@ -352,16 +352,16 @@ def _solve(
         shape=(len(a), len(terrain)),
     )
     cost = (stiff + rise.T @ diags_array(taut / metres) @ rise + diags_array(weight)).tocsr()
-    pull = weight * terrain
+    linear = weight * terrain
     # Stations at which the terrain already satisfies all bounds need no solution.
-    restless = np.abs(cost @ terrain - pull) > _STILL
+    restless = np.abs(cost @ terrain - linear) > _STILL
     short = np.flatnonzero(bounds.a @ terrain < bounds.b - _STILL)
     restless[bounds.a[short].indices] = True
     z, radius = terrain, _AROUND
     while restless.any():
         far = _distance(len(terrain), (a, b, metres), start=restless, limit=radius)
         free = far < radius
-        z = _solve_some(cost, pull, bounds=bounds, terrain=terrain, free=free)
+        z = _solve_some(cost, linear, bounds=bounds, terrain=terrain, free=free)
         rim = free & (far > radius / 2)
         if free.all() or np.abs(z - terrain)[rim].max(initial=0.0) < _MOVED:
             break
@@ -369,7 +369,7 @@ def _solve(
     return z
 
 
-def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free: Bools) -> Float:
+def _solve_some(cost: Any, linear: Float, *, bounds: Bounds, terrain: Float, free: Bools) -> Float:
     """Heights (v,) of minimum cost within the bounds; stations that are not free lie on the terrain."""
     held = np.where(free, 0.0, terrain)
     columns = np.flatnonzero(free)
@@ -378,7 +378,10 @@ def _solve_some(cost: Any, pull: Float, *, bounds: Bounds, terrain: Float, free:
     some = Bounds(a[rows], (bounds.b - bounds.a @ held)[rows], bounds.weight[rows])
     z = held
     z[columns] = interior_point(
-        cost[columns][:, columns].tocsc(), (pull - cost @ held)[columns], bounds=some, start=terrain[columns]
+        cost[columns][:, columns].tocsc(),
+        (linear - cost @ held)[columns],
+        bounds=some,
+        start=terrain[columns],
     )
     return z
 

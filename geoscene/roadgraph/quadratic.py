@@ -28,8 +28,8 @@ class Bounds:
     weight: Float
 
 
-def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> Float:
-    """The z (n,) that minimises ``z cost z / 2 - pull z`` plus the cost of violated bounds.
+def interior_point(cost: Any, linear: Float, *, bounds: Bounds, start: Float) -> Float:
+    """The z (n,) that minimises ``z cost z / 2 - linear z`` plus the cost of violated bounds.
 
     Mehrotra's predictor-corrector method (Nocedal and Wright, Numerical Optimization, 2nd edition, 16.6),
     with one sparse factorisation per iteration; it ends when residuals and steps are under 0.1 mm.
@@ -45,7 +45,7 @@ def interior_point(cost: Any, pull: Float, *, bounds: Bounds, start: Float) -> F
     gap = np.maximum(a @ z - b, _GAP)
     force = np.full(len(b), _FORCE)
     for _ in range(_ROUNDS):
-        dual = cost @ z - pull - across @ force
+        dual = cost @ z - linear - across @ force
         primal = a @ z + give * force - b - gap
         stiff = 1.0 / (give + gap / force)
         system = (cost + across @ diags_array(stiff) @ a).tocsc()
