@@ -138,7 +138,6 @@ def tradeoff(
     out
         Folder to write tradeoff.json, tradeoff.html and pareto.png to.
     """
-    from geoscene.drawing.panels import require_matplotlib  # noqa: PLC0415
     from geoscene.tradeoff.engine import tradeoff as measured  # noqa: PLC0415
     from geoscene.tradeoff.report import document, to_text, write_report  # noqa: PLC0415
 
@@ -148,7 +147,6 @@ def tradeoff(
         note_new_folder(out)
         if out.exists() and not report.overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
-        require_matplotlib()
     with progress_bar(quiet=report.quiet) as progress:
         found = measured(
             partial(read_map, source),
