@@ -148,7 +148,10 @@ def compile_ahead(*uses: str, quiet: bool = False) -> None:
     process = subprocess.Popen(command, stdin=subprocess.PIPE)  # noqa: S603
 
     def wait() -> None:
-        if process.wait() == 0 and not quiet:
+        code = process.wait()
+        if process.stdin:
+            process.stdin.close()
+        if code == 0 and not quiet:
             _say(f"compiled in {time.monotonic() - begun:.0f} s")
 
     threading.Thread(target=wait, daemon=True).start()
