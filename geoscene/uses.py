@@ -1,4 +1,4 @@
-"""Contents of scenes by use: a drive, a map or a GIS needs only part of a scene."""
+"""Uses of scenes: a drive, a map or a GIS needs only part of a scene."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def _material(value: str | None) -> Material | None:
 
 
 def read_walls(tags: Tags) -> Appearance:
-    """The tagged colour and material of the walls: of their face, else of what they are built of."""
+    """Tagged colour and material of the walls: of the facade, else of the building's material."""
     colors = [key.format(word) for key in _FACES for word in ("colour", "color")]
     substances = [key.format("material") for key in _FACES]
     return Appearance(

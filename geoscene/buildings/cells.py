@@ -43,7 +43,7 @@ def sloped_cells(polygons: Polygons, direction: Float) -> RoofCells:
 
 
 def _ends(owner: Ints, count: int) -> Ints:
-    """Where the rows of each owner (count,) end among rows sorted by owner."""
+    """End (count,) of each owner's rows among rows sorted by owner."""
     return np.searchsorted(owner, np.arange(count), side="right")
 
 

@@ -264,7 +264,7 @@ def _measured_top(row: BuildingRow, source: str) -> float:
 
 
 def _ranks(rows: Sequence[BuildingRow], heights: BuildingHeights) -> Ints:
-    """Rank (n,) of each row: 2 if the height of its building is known, 1 if only its name."""
+    """Rank (n,) of each row's description: 2 if the building's height is known, 1 if only its name."""
     outline = [r.outline for r in rows]
     known = np.isin(heights.source, ("cloud", "tag", "est_height", "levels", "parts"))
     known |= known[outline]
@@ -273,7 +273,7 @@ def _ranks(rows: Sequence[BuildingRow], heights: BuildingHeights) -> Ints:
 
 
 def _ignored_tags(rows: Sequence[BuildingRow], heights: BuildingHeights) -> list[Problem]:
-    """A problem for each row with tags that cannot be used, which names what was made instead."""
+    """A problem for each row with unusable tags, which names the value used instead."""
     problems = []
     for k, row in enumerate(rows):
         if row.is_remainder:  # has the tags of its outline, which is a row itself

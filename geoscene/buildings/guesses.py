@@ -1,4 +1,4 @@
-"""Guessed looks of buildings whose colours the map does not give: walls, roofs, storeys and windows.
+"""Inferred appearance of buildings without mapped colours: walls, roofs, storeys and windows.
 
 Guesses are for pictures only. They depend on a building's OSM id, use, size and region, not on its
 neighbours or its place in the table.
@@ -162,7 +162,7 @@ def guess_looks(
 
 
 def seeds(osm_id: Names) -> Ints:
-    """A number (n,) for each OSM id, from which what is guessed of the feature is drawn."""
+    """Seed (n,) of each OSM id, from which inferred values of the feature are drawn."""
     digests = [hashlib.blake2b(str(name).encode(), digest_size=8).digest() for name in osm_id]
     return np.array([int.from_bytes(some, "little", signed=True) for some in digests], np.int64)
 

@@ -154,7 +154,7 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
 
 
 def _tagged_height(read: Quantities) -> tuple[float, str, float]:
-    """Height in metres, source and standard deviation from a tagged height; NaN and "" if there is none."""
+    """Height in metres, source and standard deviation of a tagged height; NaN and "" without one."""
     height = read.first("height", "building:height", parse=parse_length, low=THINNEST, high=HIGHEST)
     if np.isfinite(height) and CLOUD_SIGMA in read.tags:
         return height, "cloud", read.first(CLOUD_SIGMA, parse=parse_number)

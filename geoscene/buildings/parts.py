@@ -124,7 +124,7 @@ def clusters(polygons: Polygons) -> Rows:
 
 
 def remainder(outline: Any, parts: Polygons, *, strip: float) -> tuple[Any, float, float]:
-    """What parts leave of an outline: its pieces that are anywhere wider than ``strip`` metres.
+    """Outline minus its parts: the pieces that are wider than ``strip`` metres somewhere.
 
     Also returns the share of the outline that the parts cover, and the area in square metres that neither
     they nor the pieces do.

@@ -73,7 +73,7 @@ def texts(values: Sequence[str]) -> Texts:
 def resolve_heights(
     rows: Sequence[BuildingRow], *, options: BuildingOptions
 ) -> tuple[BuildingHeights, list[Problem]]:
-    """Underside, top and roof height of every row (buildings first, then parts), and what was repaired."""
+    """Underside, top and roof height of every row (buildings, then parts), and repairs."""
     problems: list[Problem] = []
     tagged = [r.tagged for r in rows]
     h = BuildingHeights(

@@ -32,7 +32,7 @@ _STEEP = ("dome", "onion", "cone", "pyramidal")
 
 @dataclass(frozen=True, slots=True)
 class RoofTags:
-    """A roof as tagged.
+    """Roof tags of a building or part.
 
     shape         : one of SHAPES
     unknown       : the value of roof:shape if it is not one of them, else ""

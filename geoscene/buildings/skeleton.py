@@ -28,7 +28,7 @@ _JITTERS = (0.0, 1e-6, 1e-5, 1e-4, 1e-3)
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """A straight skeleton; face k stands on edge k of the polygon.
+    """A straight skeleton; face k belongs to edge k of the polygon.
 
     xy      : (n, 2) nodes, metres; the polygon's own corners first, ring by ring, exterior first
     time    : (n,) distance of each node from the edges it belongs to, metres; 0 at the polygon's corners
@@ -148,7 +148,7 @@ class _Front:
             self._close(second)
 
     def _collapse_antiparallel(self) -> bool:
-        """Collapse a corner between antiparallel edges to its nearer neighbour; whether there was one."""
+        """Collapse a corner between antiparallel edges to its nearer neighbour; False without any."""
         for corner in self.alive:
             if self.speed[corner] is None:
                 here = self.point[corner]

@@ -57,7 +57,7 @@ def build_solids(
     lod: int = 2,
     parapet: Float | None = None,
 ) -> tuple[Mesh, list[Problem]]:
-    """One body without faults (`check_solids`) per building, and what was simplified or dropped.
+    """One valid body (`check_solids`) per building, and the simplified or dropped ones.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
     material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
@@ -145,7 +145,7 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
 
 
 def _parapets(pieces: _Pieces, parapet: Float) -> Float:
-    """Heights (n,) of parapets: 0 beside a piece of the building that is about as high or higher."""
+    """Heights (n,) of parapets: 0 next to a piece of the building of similar or greater height."""
     rise = np.where(pieces.flat, parapet[pieces.row], 0.0)
     i, j = shapely.STRtree(pieces.polygon).query(pieces.polygon, predicate="dwithin", distance=0.1)
     beside = (i != j) & (pieces.building[i] == pieces.building[j]) & (pieces.high[j] > pieces.high[i] - 1.0)
@@ -199,7 +199,7 @@ def _align(pieces: _Pieces) -> _Pieces:
 
 
 def _overlapping(pieces: _Pieces) -> _Pieces:
-    """The pieces, those with roofs enlarged by 1 cm, 2 cm ...: those that meet by different amounts."""
+    """The pieces; those with roofs are enlarged by different amounts (1 cm, 2 cm ...) to overlap."""
     near = 10 * _OVERLAP
     i, j = shapely.STRtree(pieces.polygon).query(pieces.polygon, predicate="dwithin", distance=near)
     same = pieces.building[i] == pieces.building[j]
@@ -306,7 +306,7 @@ def _shells(buildings: Buildings, pieces: _Pieces) -> tuple[ShellTriangles, list
 
 
 def _roof(buildings: Buildings, pieces: _Pieces, *, rows: Ints) -> tuple[ShellTriangles, dict[int, str]]:
-    """The closed shells of pieces (rows) with their roofs, and what was replaced of them, by piece."""
+    """Closed shells of pieces (rows) with their roofs, and replaced roofs, by piece."""
     of = pieces.row[rows]
     columns = (
         buildings.roof_shape[of],

@@ -1,4 +1,4 @@
-"""Parts that stand on one another: nothing floats over a hole or a slit that only the tags' rounding left."""
+"""Stacked building parts: close the holes and slits that rounded heights leave under them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SUPPORT = 0.01
 def with_support(
     rows: Sequence[BuildingRow], footprint: Polygons, *, heights: BuildingHeights
 ) -> list[Problem]:
-    """Extend remainders of outlines under the parts that stand on them, and close slits, both in place.
+    """Extend remainders of outlines under the parts above them, and close slits, both in place.
 
     A remainder keeps the ground of the parts that begin at its top or above: a penthouse does not stand over
     a hole. The underside of a part that lies less than 0.3 m over the flat top of another one is put on it,

@@ -25,7 +25,7 @@ SHAPES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildingOptions:
-    """Options of the interpretation of building tags.
+    """Options of reading buildings from tags.
 
     level_height  : metres per storey where only storeys are tagged
     min_area      : square metres; smaller buildings are dropped (parts: a hundredth of it)

@@ -41,7 +41,7 @@ _MERGE = 15
 def unite(
     buildings: Sequence[ShellTriangles], cuts: Sequence[Sequence[ShellTriangles]]
 ) -> list[tuple[ShellTriangles, str] | None]:
-    """Of the closed shells of each building their union, and a note on beads; None if it is no solid.
+    """Union of each building's closed shells, with a note if beads were added; None if it is no solid.
 
     Faces keep their piece and surface.
 
@@ -76,7 +76,7 @@ class _Union:
 
     @classmethod
     def of(cls, shells: ShellTriangles, cuts: Sequence[ShellTriangles]) -> _Union | None:
-        """The union of closed shells, less what is cut out; None if one or the result is no manifold."""
+        """Union of closed shells minus the cuts; None if one of them or the result is not manifold."""
         pieces = np.unique(shells.piece)
         first = m3.Manifold.reserve_ids(4 * len(pieces))
         # boolean operations lose digits far from the origin, so coordinates are relative to a corner
@@ -297,7 +297,7 @@ def _contacts(first: Float, second: Float) -> list[Float]:
 
 
 def _bead(points: Float, *, reach: float) -> Any:
-    """A convex body around points (k, 3), ``reach`` metres larger on all sides."""
+    """A convex body around points (k, 3), enlarged by ``reach`` metres on all sides."""
     # rotated, so that its corners lie well off the planes through the points that walls and floors have
     turn = np.array([[0.762, -0.323, 0.561], [0.561, 0.762, -0.323], [-0.323, 0.561, 0.762]])
     star = np.vstack([turn, -turn]) * reach

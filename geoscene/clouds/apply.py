@@ -1,4 +1,4 @@
-"""Writes what was measured in a cloud into a map, as tags, and compares it with the tags there."""
+"""Write measurements from a point cloud into a map as tags, and compare them with existing tags."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def _with_buildings(
 
 
 def _parts(name: str, bodies: Sequence[Body], *, base: float, frame: Frame, turn: float) -> list[Area]:
-    """Areas of the bodies of a building besides its highest, as parts of it."""
+    """Areas of a building's bodies except the highest, as building parts."""
     areas = []
     for k, (polygon, roof) in enumerate(bodies, 1):
         tags = _with_height({"building:part": "yes"}, roof.top - base, roof=roof)
@@ -139,7 +139,7 @@ def _parts(name: str, bodies: Sequence[Body], *, base: float, frame: Frame, turn
 
 
 def check_unit(ratios: list[float]) -> None:
-    """Raise InputError if ratios of measured to tagged heights tell that feet were taken for metres."""
+    """Raise InputError if ratios of measured to tagged heights suggest feet instead of metres."""
     if len(ratios) < _LEAST_COMPARED:
         return
     middle = float(np.median(ratios))
@@ -179,7 +179,7 @@ def _with_roof(tags: Tags, roof: Roof, *, turn: float) -> Tags:
 def _with_trees(
     osm: OsmData, measured: CloudMeasurements, *, prefer_tags: bool
 ) -> tuple[OsmData, dict[str, int]]:
-    """The map with measured sizes of its trees and with measured trees added, and counts."""
+    """The map with measured sizes of its trees and with detected trees that it lacks; counts."""
     frame, found = measured.frame, measured.trees
     mapped = [k for k, point in enumerate(osm.points) if point.tags.get("natural") == "tree"]
     lonlat = np.array([(osm.points[k].lon, osm.points[k].lat) for k in mapped]).reshape(-1, 2)

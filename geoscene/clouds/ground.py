@@ -33,7 +33,7 @@ _EMPTY = 0.6
 
 
 class CloudGrid(NamedTuple):
-    """A lattice of cells.
+    """A regular grid of cells.
 
     x, y    : scene metres of the lower left corner
     columns : cells along x
@@ -163,7 +163,7 @@ def bridge(heights: Float, *, beyond: bool = True) -> Float:
 
 
 def _interpolate(heights: Float, places: NDArray[np.int64]) -> Float:
-    """Heights (rows, columns) on the Delaunay triangles over some cells (n, 2); NaN beside all triangles.
+    """Heights (rows, columns) on the Delaunay triangles of cells (n, 2); NaN outside of them.
 
     The triangles are burnt into the raster: SciPy's interpolator solves equations for each of them in threads
     that wait for one another, which takes many times as long on a busy machine.

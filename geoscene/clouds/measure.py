@@ -33,7 +33,7 @@ _NO_ROOF = (2, 3, 4, 5, 7, 9, 11, 17, 18)  # classes of ground, vegetation, nois
 
 
 class Work(NamedTuple):
-    """Inputs shared by all squares; the shift is added to all points."""
+    """Input of the measurements of all squares; the shift is added to all points."""
 
     spool: Spool
     footprints: Any
@@ -61,7 +61,7 @@ class _Objects(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CloudMeasurements:
-    """Measurements of roofs and trees in a point cloud.
+    """Measurements from a point cloud.
 
     frame     : of the scene
     buildings : table of the map before the measurement
@@ -284,7 +284,7 @@ def _objects_of(
 
 
 def _top_of_walls(polygon: Any, xyz: Float) -> float:
-    """The height z up to which points (n, 3) were seen on the walls of a footprint; NaN for too few."""
+    """Height z of the highest points (n, 3) on the walls of a footprint; NaN for too few points."""
     near = shapely.buffer(shapely.boundary(polygon), _INSET)
     shapely.prepare(near)
     z = xyz[shapely.contains_xy(near, xyz[:, 0], xyz[:, 1]), 2]

@@ -33,7 +33,7 @@ _PLY_TYPES = {
 
 
 class Chunk(NamedTuple):
-    """Points of a file.
+    """A chunk of a file's points.
 
     xyz   : (n, 3) float64 in the file's CRS; z in its unit
     klass : (n,) uint8 class of the ASPRS, 0 where the file has none

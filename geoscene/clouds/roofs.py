@@ -42,7 +42,7 @@ _DIRECTED = ("skillion", "saltbox")
 
 @dataclass(frozen=True, slots=True)
 class Roof:
-    """A roof as measured.
+    """A measured roof.
 
     top       : z of its highest point, metres
     height    : metres of the roof alone, 0 if flat
@@ -174,7 +174,7 @@ def _slope_of(xyz: Float) -> float:
 
 
 def _height_field(polygon: Any, spec: RoofSpec, *, xy: Float) -> Float | None:
-    """Share of the roof's height (n,) of a unit roof at places; NaN beside it.
+    """Height (n,) of a unit roof at places, as a share of its height; NaN outside.
 
     None if the footprint cannot have that shape.
     """
@@ -192,7 +192,7 @@ def _height_field(polygon: Any, spec: RoofSpec, *, xy: Float) -> Float | None:
 
 
 def _interpolate(corners: Float, xy: Float) -> Float:
-    """Heights (n,) of triangles (m, 3, 3) at places (n, 2), NaN beside all."""
+    """Heights (n,) of triangles (m, 3, 3) at places (n, 2); NaN outside."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     u, v = (b - a)[:, :2], (c - a)[:, :2]
     area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]

@@ -36,7 +36,7 @@ def agreement(high: Bools, built: Bools) -> Float:
 
 
 def _near_edge(built: Bools) -> Bools:
-    """Cells within 3 m of the outline of a mapped building: others do not tell the shift."""
+    """Mask of the cells within 3 m of the outline of a mapped building, which determine the shift."""
     from scipy.ndimage import binary_dilation, binary_erosion  # noqa: PLC0415 - slow to import
 
     steps = int(3.0 / CELL)

@@ -32,7 +32,7 @@ Square = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class SurveyPoints(Columns):
-    """Points as columns.
+    """Points of a survey, as columns.
 
     xyz   : (n, 3) float64, scene metres
     klass : (n,) uint8 class of the ASPRS, 0 if unknown
@@ -93,7 +93,7 @@ def spool_clouds(
     folder: Path,
     progress: Progress = silent,
 ) -> Spool:
-    """All points of clouds within bounds (xmin, ymin, xmax, ymax; scene metres), by square.
+    """Points of clouds within bounds (xmin, ymin, xmax, ymax; scene metres), sorted into squares.
 
     Raises InputError for a cloud whose CRS cannot be transformed to the scene's, and if no point lies within
     the bounds.
@@ -176,7 +176,7 @@ def _by_square(rows: NDArray[np.void]) -> list[tuple[Square, NDArray[np.void]]]:
 
 
 def _flush(held: dict[Square, list[NDArray[np.void]]], folder: Path) -> None:
-    """Append what is held to the files of the squares."""
+    """Append the buffered points to the files of the squares."""
     for (i, j), parts in held.items():
         with (folder / f"{i}_{j}.points").open("ab") as file:
             for part in parts:

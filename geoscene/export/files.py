@@ -37,7 +37,7 @@ class Summary:
 
     @classmethod
     def of(cls, path: Path, kind: str, **fields: Any) -> Summary:
-        """The summary of what was written to a path, with the number and size of the files there."""
+        """Summary of an export to a path, with the number and size of its files."""
         return cls(path, kind, *size_of(path), **fields)
 
 

@@ -1,4 +1,4 @@
-"""Export formats, one row each, and the function that writes them."""
+"""Registry of export formats, and the function that exports a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from geoscene.support.registry import Registry, load
 
 @dataclass(frozen=True, slots=True)
 class ExportFormat:
-    """One format.
+    """A row of the registry.
 
     title    : name for messages
     writer   : ``module:function`` within this package
@@ -129,7 +129,7 @@ def export_scene(
 
 
 def _relief_note(scene: Scene) -> str:
-    """Text on the number of walls with openings as geometry, and reasons for walls without."""
+    """Number of walls with openings as geometry, and why others have none."""
     counts = scene.manifest.get("relief", {}).get("facades", {})
     causes = {
         "small": "are too small for openings",

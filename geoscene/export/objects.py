@@ -196,7 +196,7 @@ def table_columns(
 
 
 def klass_name(code: int) -> str:
-    """``building`` for 14."""
+    """Name of a class code, such as ``building`` for 14."""
     return Class(code).name.lower()
 
 

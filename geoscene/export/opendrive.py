@@ -205,7 +205,7 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
 def _lane(
     number: int, kind: str, *, width: float, mark: str, flip: dict[int, int], speed: float | None = None
 ) -> str:
-    """A lane of constant width; ``flip`` gives the sign of the lane that it joins at each joint."""
+    """A lane of constant width; ``flip`` is the sign of the connected lane at each joint."""
     links = "".join(
         f'<{word} id="{flip[end] * number}"/>'
         for end, word in ((START, "predecessor"), (END, "successor"))
@@ -228,7 +228,7 @@ def _road_mark(kind: str) -> str:
 def _signals(
     road: Carriageway, k: int, *, controls: dict[int, list[tuple[float, str]]], left_hand: bool
 ) -> Iterator[str]:
-    """Signals and signs of each direction, on the side of the road that it uses."""
+    """Signals and signs of each direction, on its side of the road."""
     count = 0
     total = road.plan.total
     for edge in (road.edge, road.twin):

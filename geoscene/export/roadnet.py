@@ -182,7 +182,7 @@ def _joints(
 def _gaps(
     graph: RoadGraph, firsts: list[int], *, ends: dict[int, list[tuple[int, int]]], junctions: Bools
 ) -> Float:
-    """Metres (roads, 2) that each road is cut back at its ends, so that it clears its neighbours' sides.
+    """Metres (roads, 2) by which each road is shortened at its ends to clear its neighbours.
 
     Roads of half widths a and b that leave a node at an angle t meet (b + a cos t) / sin t from it.
     """

@@ -80,7 +80,7 @@ def bodies(points: Float, faces: NDArray[np.integer], *, shell: Ints) -> list[li
 
 
 def signed_volume(points: Float, faces: NDArray[np.integer]) -> float:
-    """Volume that faces enclose, positive where they are counter-clockwise seen from outside."""
+    """Volume enclosed by faces; positive if they are counter-clockwise seen from outside."""
     if not len(faces):
         return 0.0
     a, b, c = (points[faces[:, k]] - points[faces[0, 0]] for k in range(3))

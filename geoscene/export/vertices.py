@@ -1,4 +1,4 @@
-"""Vertices of a file that is written tile by tile, each once, also along the borders of tiles."""
+"""Unique vertices of a file that is written tile by tile, also across tile borders."""
 
 from __future__ import annotations
 

@@ -186,7 +186,7 @@ class Frame:
         return scale
 
     def scale_at(self, x: ArrayLike, y: ArrayLike) -> Float:
-        """`scale` at scene coordinates."""
+        """Point `scale` at scene coordinates."""
         return self.scale(*self.to_geographic(x, y))
 
     def convergence(self, lon_deg: ArrayLike, lat_deg: ArrayLike) -> Float:

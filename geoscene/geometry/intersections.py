@@ -135,7 +135,7 @@ def _turned_boxes(corners: Ints, owner: Ints) -> tuple[Ints, Ints]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _met(low: Ints, high: Ints, order: Ints, body: Ints, corners: Ints, faces: Ints) -> Ints:
-    """Pairs (k, 3) of triangles of one owner and of different bodies that are not apart, and their contact.
+    """Pairs of intersecting triangles of one owner and different bodies, and their relation: (k, 3).
 
     The first of a pair has the smaller number.
 
@@ -183,7 +183,7 @@ def _distances(first: Ints, second: Ints, same: Bools) -> Float:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meeting(a: int, b: int, corners: Ints, faces: Ints, planes: Float, same: Bools, turned: Bools) -> int:
-    """Kind of contact of two triangles.
+    """Relation of two triangles.
 
     planes       : (m, 4, 4) of all triangles, from `_find_planes`
     same, turned : (3, 3) room for the common corners
@@ -345,7 +345,7 @@ def _volume_sign(u: Ints, v: Ints, w: Ints) -> int:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sign(value: int | np.int64) -> int:
-    """1, 0 or -1."""
+    """Sign of a number: 1, 0 or -1."""
     return int(value > 0) - int(value < 0)
 
 

@@ -145,7 +145,7 @@ def unit(vector: Float) -> Float:
 
 
 def end_headings(line: Float, *, reach: float) -> tuple[float, float]:
-    """Headings in radians of the line's first and last part, each measured over the length ``reach``."""
+    """Headings in radians of the line's two ends, each averaged over the length ``reach``."""
     found = []
     for xy, sign in ((line[:, :2], 1.0), (line[::-1, :2], -1.0)):
         far = np.flatnonzero(np.hypot(*(xy - xy[0]).T) >= reach)
@@ -172,7 +172,7 @@ def curvatures(line: Float) -> Float:
 
 
 def directions(lines: NDArray[np.object_], at: Float, *, reach: ArrayLike) -> Float:
-    """Unit vectors (k, 2) along shapely lines (k,) at stations (k,), measured ``reach`` to both sides."""
+    """Unit vectors (k, 2) along shapely lines (k,) at stations (k,), averaged over ``reach`` both ways."""
     total = shapely.length(lines)
     back, ahead = (
         shapely.get_coordinates(shapely.line_interpolate_point(lines, np.clip(at + step, 0.0, total)))

@@ -21,7 +21,7 @@ NEAR = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """Results of `check_solids`, one row per solid.
+    """Result of `check_solids`, one row per solid.
 
     closed     : (n,) bool, every edge has exactly two faces after welding
     oriented   : (n,) bool, adjacent faces run along their common edge in opposite directions

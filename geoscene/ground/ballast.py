@@ -1,4 +1,4 @@
-"""Beds of ballast: level tops that stand above the ground, with slopes around them."""
+"""Ballast beds of railways: level tops above the ground, with slopes at their sides."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FADE = 15.0
 
 @dataclass(frozen=True, slots=True)
 class Beds:
-    """Beds of ballast.
+    """Ballast beds of railway tracks.
 
     tops : STRtree of the level tops, polygons in scene metres that do not overlap
     ends : STRtree of the places to which beds come down
@@ -39,7 +39,7 @@ class Beds:
         return cls(shapely.STRtree(tops), shapely.STRtree(ends))
 
     def height(self, xy: Float) -> Float:
-        """Metres (n,) by which beds stand above the ground at points (n, 2), by the place alone."""
+        """Height (n,) in metres of ballast beds above the ground at points (n, 2)."""
         z = np.zeros(len(xy))
         point, away = _distances(self.tops, xy, reach=SLOPE)
         np.maximum.at(z, point, HEIGHT * (1.0 - away / SLOPE))
@@ -56,6 +56,6 @@ class Beds:
 
 
 def _distances(tree: shapely.STRtree, xy: Float, *, reach: float) -> tuple[Ints, Float]:
-    """Points (k,), and metres (k,) to geometries of a tree; of points (n, 2) all that are in reach."""
+    """Points (k,) and their distances (k,) in metres to geometries of a tree, within ``reach``."""
     point, row = shapes_near(tree, xy, reach=reach)
     return point, shapely.distance(shapely.points(xy[point]), tree.geometries[row])

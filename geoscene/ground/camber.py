@@ -19,7 +19,7 @@ CAMBER = 0.025
 
 @dataclass(frozen=True, slots=True)
 class Kerbs:
-    """Sidewalks that stand above carriageways.
+    """Raised sidewalks beside carriageways.
 
     ends : STRtree of lines across roads at which they come down, as bridges and tunnels are level
     """
@@ -28,7 +28,7 @@ class Kerbs:
 
     @classmethod
     def of(cls, ends: Iterable[Any] = ()) -> Kerbs:
-        """Kerbs with such lines."""
+        """Kerbs along given lines."""
         return cls(shapely.STRtree(np.fromiter(ends, object)))
 
 
@@ -61,7 +61,7 @@ class Camber:
         return float(np.hypot(*(self.end - self.start)[within].T).sum())
 
     def height(self, xy: Float) -> Float:
-        """Metres (n,) by which the surface stands above the edges of its carriageway at points (n, 2).
+        """Height (n,) in metres of the surface above the edges of its carriageway at points (n, 2).
 
         0 on edges and outside. It depends on the place alone and has no steps.
         """
@@ -80,7 +80,7 @@ class Camber:
 
 @dataclass(frozen=True, slots=True)
 class Raised:
-    """Surfaces above the planned height of the ground: crowns of carriageways and beds of tracks.
+    """Surfaces above the planned height of the ground: cambered carriageways and ballast beds.
 
     They do not overlap.
     """

@@ -19,7 +19,7 @@ _ASIDE = 0.01
 def sea(
     coastlines: Sequence[Float], extent: Sequence[float], *, osm_id: Sequence[str] = ()
 ) -> tuple[NDArray[np.object_], list[Problem]]:
-    """The sea's polygons (n,) inside the extent, and what was repaired.
+    """Polygons (n,) of the sea within the extent, and repairs.
 
     coastlines : (k, 2) scene metres each, in the direction of the map: land left, sea right
     extent     : (xmin, ymin, xmax, ymax)
@@ -61,7 +61,7 @@ def _loose_ends(coastlines: Sequence[Float], box: Any) -> list[tuple[int, Float]
 
 
 def _extend(line: Any) -> Any:
-    """The line (two points) extended slightly past its end, so that it crosses what it touches."""
+    """A line (two points) extended slightly beyond its end, so that it crosses the touched line."""
     (x0, y0), (x1, y1) = line.coords
     length = max(line.length, _ASIDE)
     return shapely.LineString(

@@ -1,4 +1,4 @@
-"""Faces of the plane between noded segments, and which of them lie beside each other.
+"""Faces of the plane between noded segments, and their adjacency.
 
 Faces and rings come in the order, and begin at the vertex, that follow from the ranks of half-edges alone: as
 from GEOS's polygonizer, whose ranks are the order of lines.

@@ -1,4 +1,4 @@
-"""Foundations: how deep the walls of buildings reach so that no ground beside them lies lower."""
+"""Foundations: depth of the walls of buildings, so that no adjacent ground lies lower."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def foundation_heights(
     layers: Layers,
     levels: WaterLevels,
 ) -> Float:
-    """Height z (n,) of the lower end of each building's walls: 0.5 m below the lowest ground beside them.
+    """Height z (n,) of the lower end of each building's walls: 0.5 m below the adjacent ground.
 
     That is the lowest of the base, the ground up to 1 m outside the walls, and water up to 10 m away. Where
     none is lower than the base, as on level ground, the walls end at the base.

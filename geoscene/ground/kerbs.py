@@ -84,7 +84,7 @@ _KINDS = {"raised": RAISED, "lowered": LOWERED, "flush": FLUSH}
 
 
 def lowered_kerbs(surfaces: Layers, *, mapped: MappedKerbs | None = None) -> Layers:
-    """Rows for the parts of kerbs beside crossings, and for the ramps up from there and from driveways.
+    """Rows of lowered kerbs at crossings, and of the ramps at their ends and at driveways.
 
     They lie above the kerbs themselves and have their features. Kerbs are lowered at crossings, unless they
     are mapped otherwise.
@@ -156,7 +156,7 @@ def _meeting(shapes: NDArray[np.object_], bands: NDArray[np.object_]) -> tuple[I
 
 
 class Beside(NamedTuple):
-    """Layers that touch the vertices of triangles.
+    """Surfaces that touch the vertices of triangles.
 
     vertex : (k,) numbers of vertices
     row    : (k,) rows of the layers that touch them, -1 for the base

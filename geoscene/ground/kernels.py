@@ -1,4 +1,4 @@
-"""Compiled loops: where the segments of a tile meet, the rings that they bound, and what holds a point.
+"""Compiled loops: intersections of a tile's segments, their rings, and point location.
 
 They search, sort and choose in plain loops: numba compiles the general functions of NumPy for each type of
 argument, which made the first build wait half as long again.

@@ -10,7 +10,7 @@ from geoscene.sources.data import Tags
 
 @dataclass(frozen=True, slots=True)
 class GroundKind:
-    """One kind of ground.
+    """Class, material and priority of a kind of ground.
 
     klass    : `geoscene.classes.Class`
     material : name in `geoscene.classes.materials`, where no ``surface`` tag says otherwise

@@ -24,7 +24,7 @@ _WIDEST = 3000.0
 
 
 def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
-    """Land cover within the extent as `Layers`, and problems: what was repaired or dropped.
+    """Land cover within the extent as `Layers`, and repaired or dropped features as problems.
 
     Areas by `kinds.AREAS`, lines of water, rail and stone widened by their ``width`` or their kind's, and
     the sea behind coastlines. Roads and buildings are no land cover. A ``surface`` tag decides the
@@ -87,7 +87,7 @@ def _layers(
 
 
 def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
-    """Land cover drawn as areas that reach into the extent."""
+    """Land cover mapped as areas that intersect the extent."""
     found = [(area, kind) for area in osm.areas if (kind := area_kind(area.tags)) is not None]
     polygons = np.fromiter((area.geometry for area, _ in found), object)
     polygons = shapely.transform(polygons, lambda lonlat: _to_scene(frame, lonlat))

@@ -17,7 +17,7 @@ from geoscene.typing import Bools, Ints
 def snap_rounded(
     start: Ints, end: Ints, *, fresh: Bools, box: Sequence[int] | None = None
 ) -> tuple[Ints, Ints, Ints]:
-    """Segments divided at their crossings and common points, each piece once.
+    """Segments divided where they intersect (snap rounding), each piece once.
 
     start, end : (n, 2) int64, less than 2**28 from each other, of different places
     fresh      : (n,) bool, segments that do not follow the one before

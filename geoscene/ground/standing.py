@@ -1,4 +1,4 @@
-"""Heights of the surface that objects stand on: sidewalks and crowns included."""
+"""Height of the surface below objects, with sidewalks and cambered carriageways."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NO_FLOOR = (Class.WATER, Class.TUNNEL)
 
 
 def standing_height(plan: GroundPlan, height: Height | None, *, ground: Mesh | None = None) -> Height | None:
-    """Metres of z (n,) at which objects stand at places x, y (n,); ``height`` itself without kerbs.
+    """Height z (n,) of the surface below objects at x, y (n,); ``height`` itself without kerbs.
 
     On the ground of a tile it is that of its faces, save in water; elsewhere it is ``height``, on raised
     sidewalks higher by a kerb.
@@ -32,7 +32,7 @@ def standing_height(plan: GroundPlan, height: Height | None, *, ground: Mesh | N
 
     @functools.cache
     def floor() -> tuple[Float, Float]:
-        """Corners (m, 3, 3) of the faces to stand on, and their boxes (m, 4) in plan; few tiles need them."""
+        """Corners (m, 3, 3) of walkable faces, and their bounding boxes (m, 4) in plan."""
         faces = Mesh.empty() if ground is None else ground.take(~np.isin(ground.klass, _NO_FLOOR))
         corners = faces.vertices[faces.faces]
         return corners, np.hstack([corners[..., :2].min(axis=1), corners[..., :2].max(axis=1)])

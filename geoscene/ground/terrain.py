@@ -204,7 +204,7 @@ def open_terrain(
 
 
 def base_heights(footprints: Sequence[object] | NDArray[np.object_], height: Height | None) -> Float:
-    """The lowest ground (n,) along each footprint's outline, metres: where a building on a slope stands.
+    """Lowest ground (n,) along each footprint's outline, metres: base of a building on a slope.
 
     ``height`` (z of the ground at x, y; None if it is 0 everywhere) is sampled at the outline's vertices and
     at most 2 m apart between them. NaN for a footprint that is None or empty.
@@ -243,7 +243,7 @@ class _Raster:
 
 
 def gdal_name(path: Path) -> str:
-    """What GDAL calls the raster: a path, or one within a zip archive."""
+    """GDAL's name of a raster: a path, or a path within a zip archive."""
     if not path.exists():
         raise SourceNotFoundError(f"{path}: no such elevation file")
     if path.suffix.lower() != ".zip":

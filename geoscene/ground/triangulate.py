@@ -1,4 +1,4 @@
-"""Cells of the ground as triangles that meet edge to edge."""
+"""Conforming triangulation of the ground's cells."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Trees, street furniture, barriers."""
+"""Vegetation, street furniture, barriers, rooftop objects and overhead wires."""

@@ -100,7 +100,7 @@ class Barriers(Columns):
 
 
 def read_barriers(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Barriers, list[Problem]]:
-    """The mapped barriers within an extent, and problems: what was changed.
+    """Mapped barriers within an extent, and changed or dropped ones as problems.
 
     A line has its ``width`` or the default of its kind. It is open at gates on its nodes.
     """
@@ -215,7 +215,7 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
 
 
 def _touches_itself(shape: Any) -> bool:
-    """Whether rings of the shape touch in a point, where a solid would have an edge of four faces."""
+    """Whether rings of the shape touch in a point, which would be a non-manifold edge of a solid."""
     rings = shapely.get_rings(shapely.get_parts(shape))
     coordinates = np.concatenate([np.empty((0, 2)), *(shapely.get_coordinates(ring)[:-1] for ring in rings)])
     return len(np.unique(np.rint(coordinates / PRECISION), axis=0)) < len(coordinates)

@@ -89,7 +89,7 @@ _OF_FORM = {"broadleaved": "round", "needleleaved": "conical", "palm": "palm"}
 
 
 def habit_of(names: str, *, form: str) -> tuple[str, bool]:
-    """The habit of a tree, and whether its botanical names tell it; else it is the usual one of its form.
+    """Growth habit of a tree, and whether its botanical name gives it; else the usual one of its form.
 
     names : genus, species and cultivar, in one text
     """
@@ -170,7 +170,7 @@ def _crown(name: str, habit: Habit, *, nth: int) -> Mesh:
 
 
 def _fit(bodies: Sequence[Body]) -> list[Body]:
-    """The bodies, stretched together to reach from z = 0 (or where they begin) to 1 and to x, y = +-0.5."""
+    """The bodies, scaled together to z from 0 (or their lower end) to 1 and to x, y = +-0.5."""
     every = np.concatenate([points for points, _ in bodies])
     across = 0.5 / np.hypot(every[:, 0], every[:, 1]).max()
     low, high = max(every[:, 2].min(), 0.0), every[:, 2].max()
@@ -222,7 +222,7 @@ def _cluster(centre: Float, size: tuple[float, float], *, draw: Float) -> Body:
 
 @functools.cache
 def _icosahedron() -> Body:
-    """The regular icosahedron of radius 1 that stands on a corner."""
+    """Regular icosahedron of radius 1 with a vertex at the bottom."""
     ring = np.arange(5)
     level, flat = 1 / np.sqrt(5.0), 2 / np.sqrt(5.0)
     upper, lower = 2 * np.pi * ring / 5, 2 * np.pi * (ring + 0.5) / 5

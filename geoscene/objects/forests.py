@@ -1,4 +1,4 @@
-"""Trees of forests: stored as the ground they stand on, and placed when a tile is read."""
+"""Trees of forests: stored as the ground below them, and placed when a tile is read."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SHARES = {"needleleaved": 1.0, "coniferous": 1.0, "mixed": 0.5}
 
 @dataclass(frozen=True, slots=True)
 class Forests:
-    """Parameters of the trees of a scene's forests, beside their ground.
+    """Parameters from which forest trees are generated on their ground.
 
     feature : (k,) int64, forests with needle-leaved trees, by feature number, ascending
     needles : (k,) float64, their share of needle-leaved trees
@@ -68,7 +68,7 @@ class Forests:
 
 
 def forest_trees(ground: Mesh, forests: Forests, *, box: Sequence[float]) -> tuple[Trees, Float]:
-    """The trees of forests on a tile's ground, and the height z (n,) of the ground where they stand.
+    """Trees of forests on a tile's ground, and the height z (n,) of the ground below them.
 
     One in each square of 1 / density m2 where its trunk is on forest floor, half a metre or more from any
     other ground of the tile. Place, size and form are drawn from (seed, column, row) of a lattice over the

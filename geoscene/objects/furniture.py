@@ -101,7 +101,7 @@ class Furniture(Columns):
 def read_furniture(
     osm: OsmData, frame: Frame, *, plan: GroundPlan, left_hand: bool = False, relief: str = "off"
 ) -> tuple[Furniture, list[Problem]]:
-    """The street furniture on the map within the ground's extent, and what was moved or left out.
+    """Mapped street furniture within the ground's extent, and moved or dropped objects.
 
     No post stands on a carriageway, a crossing, a track or in the mouth of a tunnel:
 
@@ -226,7 +226,7 @@ def _sign(value: str) -> str:
 
 
 def _off_ground(tags: Tags) -> bool:
-    """Whether the object does not stand on the ground in the open."""
+    """Whether the object is not on the ground in the open."""
     layer = tags.get("layer", "0").lstrip("+")
     return (
         is_underground(tags)

@@ -1,4 +1,4 @@
-"""Shapes that stand on roofs in scenes with relief: chimneys, dormers, plant, tanks, antennas."""
+"""Shapes of rooftop objects in scenes with relief: chimneys, dormers, plant, tanks, antennas."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DORMER_DEPTH = 1.3
 
 @functools.cache
 def roof_shapes() -> dict[str, Mesh]:
-    """Shapes of roof objects by name; metres, x in the direction that they face, z up from the roof.
+    """Shapes of rooftop objects by name; metres, x in the direction of the front, z up from the roof.
 
     Chimneys and dormers have unit height, to be scaled: a dormer's underside rises from its front at x = 0
     to its back at x = `DORMER_DEPTH` and z = 1, as the roof does. Sizes are usual ones, assumed.

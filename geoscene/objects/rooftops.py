@@ -1,4 +1,4 @@
-"""Roof objects in scenes with full relief: chimneys, dormers, plant, tanks; and parapets."""
+"""Rooftop objects in scenes with full relief: chimneys, dormers, plant, tanks; and parapets."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ _ROOM = {
 
 @dataclass(frozen=True, slots=True)
 class Rooftops(Columns):
-    """Guessed roof objects of buildings, one row per row of `Buildings`.
+    """Inferred rooftop objects of buildings, one row per row of `Buildings`.
 
     kind    : (n,) str, of `geoscene.buildings.guesses.KINDS`
     parapet : (n,) metres above a flat roof, 0 for none
@@ -98,7 +98,7 @@ class Rooftops(Columns):
 
 
 def plan_rooftops(buildings: Buildings, *, centre: tuple[float, float]) -> Rooftops:
-    """Guesses of the roof objects of buildings by their kinds, sizes and region.
+    """Inferred rooftop objects of buildings by use, size and region.
 
     Parapets are on flat roofs of 30 m2 and more, 3 m above the ground, of buildings that would not usually
     have a pitched roof; chimneys and dormers on pitched roofs of houses.
@@ -174,7 +174,7 @@ _Item = tuple[str, float, float, float, float, float, float]
 def _on_building(
     corners: Float, normals: Float, *, under: Float, rooftops: Rooftops, row: int
 ) -> Iterator[_Item]:
-    """Roof objects of one building; ``under`` are the undersides of its parts."""
+    """Rooftop objects of one building; ``under`` are the undersides of its parts."""
     flat = normals[:, 2] > 0.9995
     draw = uniform_at(np.full(64, rooftops.seed[row]), np.arange(64), count=3)
     kind = str(rooftops.kind[row])

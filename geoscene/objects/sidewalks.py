@@ -1,4 +1,4 @@
-"""Puts street furniture with relief on sidewalks: shelters, stands with bicycles, guessed objects."""
+"""Placement of street furniture with relief on sidewalks: shelters, bicycle stands, inferred objects."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def with_guesses(
 
 
 def with_details(table: Furniture, sites: Sites, *, full: bool) -> Furniture:
-    """The table with bus shelters moved back from the road, and stands only where they have room.
+    """The table with bus shelters moved back from the road, and bicycle stands where space allows.
 
     full : bicycles lean on two thirds of the stands, drawn by the id and the number of each
     """

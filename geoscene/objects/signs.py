@@ -1,4 +1,4 @@
-"""Faces of traffic signs from tags: human-readable names and the codes of countries."""
+"""Faces of traffic signs from tags: human-readable names and national sign codes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def sign_codes() -> dict[str, dict[str, str]]:
 
 
 def sign_face(tags: Tags) -> str:
-    """What is drawn on the sign of a node, a word and perhaps text: ``limit 50``; empty if it is not mapped.
+    """Face of a node's sign, a keyword and perhaps text: ``limit 50``; empty if it is not mapped.
 
     The first of several signs on a post counts. Numbers come from brackets (``FI:361[40]``), from the code
     itself (``DE:274-30``) or from ``maxspeed``; names of places and streets from brackets or ``name``.

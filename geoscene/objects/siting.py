@@ -1,4 +1,4 @@
-"""Where posts and trunks can stand: off carriageways, crossings, tracks and tunnel mouths."""
+"""Sites for posts and trunks: off carriageways, crossings, tracks and tunnel mouths."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ UNUSABLE = (*_DRIVEN, Class.KERB, Class.BUILDING_PAD, Class.WATER)
 
 @dataclass(frozen=True, slots=True)
 class Sites:
-    """Where vehicles pass and where posts have room on a planned ground.
+    """Areas of vehicles, and free areas for posts, on a planned ground.
 
     plan   : the ground
     tracks : STRtree of the areas that rail vehicles sweep
@@ -62,7 +62,7 @@ class Sites:
         return np.isin(self.classes(xy), _DRIVEN)
 
     def nearest_clear(self, xy: Float, *, angles: Float | None = None) -> tuple[Float, Bools]:
-        """For points (n, 2) the nearest places to stand, `CLEARANCE` beyond the edge, and which were found.
+        """Nearest free places for points (n, 2), `CLEARANCE` beyond the edge, and a mask of those found.
 
         Points without a clear place within `FARTHEST` are returned as they are.
 

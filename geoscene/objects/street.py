@@ -1,4 +1,4 @@
-"""Street furniture of scenes with relief: more kinds that are mapped, and guesses of what is not mapped."""
+"""Street furniture of scenes with relief: further mapped kinds, and inferred objects."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def stands(tags: Tags, *, place: Float, heading: float, most: int) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class FurnitureGuesses(Columns):
-    """Where unmapped furniture may stand, before it is known what ground is there.
+    """Candidate places of unmapped furniture, before the ground below them is known.
 
     xy      : (n, 2) on a street's centre line, or the place to eat; scene metres
     toward  : (n, 2) unit vector to the side of the street; zero for tables, which stand where the sidewalk is
@@ -147,7 +147,7 @@ class FurnitureGuesses(Columns):
 
 
 def guess_furniture(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> FurnitureGuesses:
-    """Guessed street furniture along streets and before restaurants within an extent of a map.
+    """Candidate furniture along streets and at restaurants within an extent of a map.
 
     It is drawn by the OSM id of each street and the place on it, whatever else there is.
     """
@@ -308,7 +308,7 @@ def _at_kerbs(guesses: FurnitureGuesses, sites: Sites, *, rows: Ints) -> tuple[I
 
 
 def _at_fronts(guesses: FurnitureGuesses, sites: Sites, *, rows: Ints) -> tuple[Ints, Float, Float]:
-    """Rows of tables that stand beside their building where a sidewalk is near, the places, and headings."""
+    """Rows of tables beside their building where a sidewalk is near, the places, and headings."""
     start = guesses.xy[rows]
     reach = np.arange(0.0, 18.1, 0.5)
     turn = 2 * np.pi * np.arange(24) / 24
@@ -336,7 +336,7 @@ def _classes(sites: Sites, xy: Float) -> NDArray[np.uint8]:
 
 
 def _apart(xy: Float, *, taken: Taken, guesses: FurnitureGuesses) -> Bools:
-    """Whether points (n, 2) keep `_APART` from what stands there and from guesses of smaller draws."""
+    """Whether points (n, 2) keep a distance of `_APART` from objects and from earlier guesses."""
     points, free = shapely.points(xy), np.ones(len(xy), np.bool_)
     stand = shapely.STRtree(shapely.points(taken.xy))
     free[stand.query(points, predicate="dwithin", distance=_APART)[0]] = False
@@ -353,5 +353,5 @@ def _apart(xy: Float, *, taken: Taken, guesses: FurnitureGuesses) -> Bools:
 
 
 def usable(sites: Sites, xy: Float) -> Bools:
-    """Whether something can stand at points (n, 2)."""
+    """Whether points (n, 2) are free for an object."""
     return ~np.isin(sites.classes(xy), UNUSABLE)

@@ -228,7 +228,7 @@ def _stand() -> Mesh:
 
 
 def _bicycle(y: float) -> Mesh:
-    """A bicycle 1.75 m long that leans on a stand, in the direction x, beside the stand."""
+    """A bicycle 1.75 m long in direction x, leaning on a stand."""
     rear, front, crank = (-0.52, y, 0.34), (0.53, y, 0.34), (-0.08, y, 0.3)
     saddle, head = (-0.25, y, 0.9), (0.36, y, 0.9)
     tubes = [(rear, crank), (rear, saddle), (crank, saddle), (crank, head), (saddle, head), (head, front)]
@@ -241,7 +241,7 @@ def _bicycle(y: float) -> Mesh:
 
 
 def _wheel(x: float, y: float) -> Body:
-    """A tyre of 0.68 m that stands on the ground, with the plane xz: a ring of ten wedges of three sides."""
+    """A tyre of 0.68 m on the ground in the plane xz: a ring of ten wedges of three sides."""
     n = 10
     turn = 2 * np.pi * np.arange(n) / n
     ring = np.arange(n)

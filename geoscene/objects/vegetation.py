@@ -157,7 +157,7 @@ def read_trees(
 
 
 def clear_of(plan: GroundPlan, trees: Trees) -> tuple[Trees, list[Problem]]:
-    """The trees within the ground's extent that find a place, and what was left out, by id.
+    """Trees within the ground's extent on free places, and dropped ones, by id.
 
     A tree that is mapped on a carriageway, a crossing or a track is taken for imprecise and moves to the
     nearest clear place. Dropped are mapped trees in buildings or without such a place, and the trees that a

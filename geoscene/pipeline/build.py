@@ -133,5 +133,5 @@ def elevation_digests(dem: Sequence[str]) -> list[str]:
 
 
 def _with_companions(path: Path) -> list[Path]:
-    """A raster, and the files beside it from which GDAL may read its place (``.tfw``, ``.aux.xml``)."""
+    """A raster, and the files beside it from which GDAL may read its georeference."""
     return [path, *sorted(set(path.parent.glob(f"{glob.escape(path.stem)}.*")) - {path})]

@@ -171,7 +171,7 @@ def _counts(plan: BuildPlan, reports: Sequence[TileReport], *, problems: Sequenc
 
 
 def _relief(plan: BuildPlan, reports: Sequence[TileReport]) -> dict[str, Any]:
-    """Counts of the relief of the scene, by kind and source."""
+    """Relief of the scene, by kind and source."""
     furniture = plan.furniture
     parts, roofs, facades = Counter[str](), Counter[str](), Counter[str]()
     for report in reports:

@@ -110,7 +110,7 @@ _RAISED = 1.0  # metres, minimum height of an underside for a building to have n
 
 @dataclass(frozen=True, slots=True)
 class BuildPlan:
-    """Inputs of all tiles.
+    """Immutable plan of a build: the input of all tiles.
 
     frame     : frame of the scene
     terrain   : elevation model, or level ground
@@ -363,7 +363,7 @@ def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """What is planned of the whole map."""
+    """Plan of the whole map."""
 
     osm: OsmData
     frame: Frame
@@ -376,7 +376,7 @@ class _Place:
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """What is planned near a route, or everywhere; see `BuildPlan` for the columns.
+    """Plan near a route, or everywhere; see `BuildPlan` for the columns.
 
     shapes : of all features by kind
     """
@@ -399,7 +399,7 @@ class _Local:
 
 
 def _in_reach(place: _Place, reach: Reach | None) -> tuple[_Local, list[Problem]]:
-    """Surfaces, structures and objects of all tiles in reach, and what was repaired or dropped."""
+    """Surfaces, structures and objects of all tiles in range of the route, and problems."""
     if reach is None:
         return _plan_within(place, None, area=None)
     size = place.options.tile_size
@@ -418,7 +418,7 @@ def _in_reach(place: _Place, reach: Reach | None) -> tuple[_Local, list[Problem]
 
 
 def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tuple[_Local, list[Problem]]:
-    """What is planned within an area, or everywhere."""
+    """Plan of an area, or of everything."""
     osm, frame, extent, roads, options = place.osm, place.frame, place.extent, place.roads, place.options
     buildings, terrain = place.buildings, place.terrain
     footprints = buildings.footprint[: buildings.count]
@@ -631,7 +631,7 @@ def _together(polygons: NDArray[np.object_], first: NDArray[np.int64]) -> NDArra
 def _objects(
     osm: OsmData, frame: Frame, *, extent: Bounds, options: BuildOptions
 ) -> tuple[dict[str, tuple[Any, Float, int]], list[Problem]]:
-    """What is mapped of trees, furniture and barriers, by kind; nothing of kinds that are not asked for.
+    """Mapped trees, furniture and barriers, by kind; empty for kinds that the options exclude.
 
     These are a table of the objects before they are sited (of furniture: the guesses or None), boxes (n, 4)
     within which they will stand, and the count of their feature numbers.

@@ -1,4 +1,4 @@
-"""Tiles and features of a build along a route."""
+"""Area of a build along a route: tiles and features within the sensors' maximum range."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ class Reach:
 
     @classmethod
     def within(cls, area: Any) -> Reach:
-        """Reach that is an area, a shapely polygon in scene metres."""
+        """Features and tiles in an area, a shapely polygon in scene metres."""
         shapely.prepare(area)
         return cls(area, 0.0)
 
     def surroundings(self, tile_size: float, *, extent: Sequence[float]) -> Any:
-        """A polygon of squares around all that tables of features hold, and around most tiles in reach."""
+        """A polygon of squares around all features of the tables, and around most tiles in range."""
         far = self.metres + TABLE_MARGIN
         low, high = np.array(extent[:2]), np.array(extent[2:])
         box = np.array(shapely.bounds(self.line)) + far * np.array([-1, -1, 1, 1])
@@ -111,7 +111,7 @@ class Reach:
         shapes: Mapping[str, NDArray[np.object_]],
         beyond: Mapping[str, Float | float],
     ) -> list[Tile]:
-        """Tiles with a feature or ground in reach, sorted.
+        """Tiles with a feature or ground in range, sorted.
 
         rows   : of ``shapes`` in each tile by kind; shapes can extend beyond their tile, long walls and
                  bridges by far

@@ -135,7 +135,7 @@ def make_solids(plan: BuildPlan, tile: tuple[int, int], *, lod: int) -> tuple[Me
 
 @dataclass(frozen=True, slots=True)
 class TileSurroundings:
-    """Contents of a tile without its buildings.
+    """A tile's ground, structures and objects, without its buildings.
 
     mesh      : ground, barriers and structures, scene metres
     instances : trees and furniture, scene metres
@@ -152,7 +152,7 @@ class TileSurroundings:
 
 
 def make_ground(plan: BuildPlan, tile: tuple[int, int]) -> TileSurroundings:
-    """Build the tile's ground, objects and structures."""
+    """Build the ground, objects and structures of tile (i, j)."""
     i, j = tile
     height, problems = plan.height, list[Problem]()
 
@@ -269,7 +269,7 @@ def build_tile(
 
 
 def _facades(plan: BuildPlan, setting: FacadeSetting, *, solids: Mesh, problems: list[Problem]) -> Layout:
-    """The relief of the walls of a tile's buildings and what stands out of them, scene metres."""
+    """Relief of the walls of a tile's buildings and their projecting parts, scene metres."""
 
     def failed(row: int, error: Exception) -> None:
         problems.append(describe_unexpected(str(plan.buildings.osm_id[row]), error, kind="building"))
@@ -292,7 +292,7 @@ def _facades(plan: BuildPlan, setting: FacadeSetting, *, solids: Mesh, problems:
 def _roof_objects(
     plan: BuildPlan, solids: Mesh, *, lod: int, problems: list[Problem]
 ) -> tuple[ShapeInstances, dict[str, int]]:
-    """Roof objects of a tile's buildings, scene metres, and their number by shape."""
+    """Rooftop objects of a tile's buildings, scene metres, and their number by shape."""
     none = ShapeInstances.empty()
     if plan.rooftops is None or lod < 2:
         return none, {}

@@ -1,4 +1,4 @@
-"""All carriageways of a map, public or not: centre line, width, sidewalks, surface material."""
+"""Carriageways of a map, public or not: centre line, width, sidewalks, surface material."""
 
 from __future__ import annotations
 

@@ -48,6 +48,6 @@ def _by_size(part: NDArray[np.int32]) -> NDArray[np.int32]:
 
 
 def main_network(graph: RoadGraph) -> RoadGraph:
-    """The largest strongly connected component of the graph, within which a car can reach every street."""
+    """Largest strongly connected component: any of its streets can be reached from any other."""
     strong = find_components(graph).strong
     return graph.take((strong[graph.tail] == 0) & (strong[graph.head] == 0))

@@ -35,7 +35,7 @@ _OCTAGON = np.arange(8) * np.pi / 4 + np.pi / 8
 
 
 def cover_rows(osm: OsmData, roads: Carriageways, *, frame: Frame, guess: bool) -> SurfaceRows:
-    """Manhole covers, gullies and patches in carriageways.
+    """Manhole covers and gullies, flush with carriageways.
 
     Mapped are points tagged ``manhole`` or ``man_made=manhole``. Guessed are covers, gullies at kerbs and
     patches along streets of built-up areas: drawn by the ids of the street and of its first node, and by
@@ -120,7 +120,7 @@ def _guess_rows(roads: Carriageways, kind: str) -> SurfaceRows:
 
 
 def _beside(roads: Carriageways, road: Ints, *, along: Float, aside: Float) -> tuple[Float, Float]:
-    """Places (n, 2) beside centre lines, to the left where ``aside`` is positive, and directions (n, 2)."""
+    """Places (n, 2) beside centre lines, to the left for positive ``aside``, and directions (n, 2)."""
     line = roads.line[road]
     ahead = polylines.directions(line, along, reach=1.0)
     middle = shapely.get_coordinates(shapely.line_interpolate_point(line, along))

@@ -99,14 +99,14 @@ def graded_ground(
 
 
 def _beside_ramps(pieces: NDArray[np.object_], start: Float, *, end: Float, reach: float) -> Ints:
-    """Rows of the pieces of road that are not at height 0, and of those within ``reach`` metres of them."""
+    """Rows of the road pieces above or below the ground, and of those within ``reach`` metres."""
     ramps = pieces[np.maximum(np.abs(start[:, 2]), np.abs(end[:, 2])) > _LEVEL]
     return np.unique(shapely.STRtree(pieces).query(ramps, predicate="dwithin", distance=reach)[1])
 
 
 @dataclass(frozen=True, slots=True)
 class _Pieces:
-    """Pieces of road that ground is graded to, and those in reach of each square of a grid.
+    """Road pieces that the ground is graded to, indexed by squares of a grid.
 
     start, end  : (n, 3) metres
     half        : (n,) half of the width with shoulders

@@ -1,4 +1,4 @@
-"""Surfaces of junctions: the joint of the carriageways, its rounded corners, and its reach into each arm."""
+"""Surfaces of junctions: union of the carriageways, rounded corners, and extent along each arm."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def junction_reach(roads: Carriageways) -> tuple[Float, Ints]:
 
 @dataclass(frozen=True, slots=True)
 class _Arms:
-    """Ends of carriageways, grouped by junction, counter-clockwise within a group.
+    """Ends of carriageways, grouped by junction, counter-clockwise within a junction.
 
     group : (a,) int64 ascending
     road, end : (a,) int64 row of the carriageways, and 0 for its start or 1 for its end
@@ -248,7 +248,7 @@ def _corner(shapes: NDArray[np.object_], radius: Float) -> NDArray[np.object_]:
 
 
 def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]:
-    """Areas between each arm and the next one, as seen from the node."""
+    """Wedges between consecutive arms as seen from the node."""
     turn = np.linspace(0.0, 1.0, 9)
     angle = arms.angle[:, None] + between[:, None] * turn
     radius = (2.0 * reach + 60.0)[:, None]

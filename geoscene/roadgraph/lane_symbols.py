@@ -1,4 +1,4 @@
-"""Where symbols lie on lanes: arrows before junctions, bicycles, BUS, speed limits."""
+"""Placement of symbols on lanes: arrows before junctions, bicycles, BUS, speed limits."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def _symbols(
     enters: bool,
     left_hand: bool,
 ) -> Iterator[tuple[str, Any]]:
-    """Symbols of one direction of one stretch, each with the tag that it is from.
+    """Symbols of one direction of one stretch, each with its tag.
 
     side   : 0 along the line, 1 against it
     enters : traffic comes from outside the zone

@@ -1,4 +1,4 @@
-"""Symbols painted on lanes, from the tags of a way: turns, buses, bicycles, speed limits."""
+"""Lane markings of a street from the tags of its way: turns, buses, bicycles, limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class CycleLane:
 
 @dataclass(frozen=True, slots=True)
 class LaneUses:
-    """Paint on the lanes of a street. Pairs are (along the way, against it).
+    """Markings of the lanes of a street. Pairs are (along the way, against it).
 
     turns : of each lane from left to right, as seen in its direction, the arrows on it; () if not tagged
     bus   : numbers of the lanes for buses, counted in the same way
@@ -58,7 +58,7 @@ class LaneUses:
         return all(a == b for a, b in pairs)
 
     def __bool__(self) -> bool:
-        """Whether the street has any paint."""
+        """Whether any lane is marked."""
         return self != NO_USES
 
 
@@ -87,7 +87,7 @@ def _driven(street: Street, side: int) -> bool:
 
 
 def _of_direction(tags: Tags, key: str, *, street: Street, side: int) -> tuple[str, str]:
-    """Key and value of a tag on the lanes of one direction; "" without one.
+    """Key and value of a tag on the lanes of one direction; "" without it.
 
     Without a direction in the key, it is that of a one-way street.
     """

@@ -75,7 +75,7 @@ class LaneLayout(Columns):
 
 
 def lane_layout(along: Float, against: Float, *, two_way: Bools, width: Float) -> LaneLayout:
-    """The lanes of carriageways.
+    """Layout of the lanes of carriageways.
 
     along, against : (m,) lanes of each direction as mapped; where both are fractions, as in 1.5 and 1.5,
                      there is a lane that both share; other fractions are dropped

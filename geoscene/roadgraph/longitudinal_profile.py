@@ -313,7 +313,7 @@ def _mouth_distance(graph: RoadGraph, stations: Stations, *, kind: str, options:
 def _over_obstacles(
     graph: RoadGraph, stations: Stations, *, obstacles: Obstacles
 ) -> tuple[Ints, Float, Float, Float, Float]:
-    """Where bridges cross obstacles: (edge, metres along it, x, y, free height needed)."""
+    """Crossings of bridges over obstacles: (edge, metres along it, x, y, clearance needed)."""
     once = np.unique(stations.edge)
     once = once[graph.bridge[once]]
     lines = np.array([shapely.linestrings(graph.geometry[e][:, :2]) for e in once.tolist()], object)

@@ -57,7 +57,7 @@ class PaintedStretches(Columns):
     layout: LaneLayout
 
     def take(self, rows: ArrayLike | slice) -> PaintedStretches:
-        """The chosen rows."""
+        """Subset of the rows."""
         taken = Columns.take(self, rows)
         return replace(taken, layout=self.layout.take(rows))
 
@@ -131,7 +131,7 @@ def marking_rows(
 def _offsets(
     roads: Carriageways, stretches: PaintedStretches, *, left_hand: bool
 ) -> tuple[Ints, Float, Ints, NDArray[np.str_]]:
-    """Painted lines: row of the stretches, metres to the left of the centre line, style, tag that it is from.
+    """Painted lines: row of the stretches, offset in metres to the left, style, and tag.
 
     The tag is "" for lines between lanes and along edges.
     """
@@ -170,7 +170,7 @@ def _offsets(
 
 
 def _bus_borders(uses: LaneUses, lanes: tuple[int, int], *, count: int, left_hand: bool) -> set[int]:
-    """Numbers of the lines beside lanes for buses, counted from the kerb of the lanes along the line.
+    """Numbers of the lines beside bus lanes, counted from the kerb of the forward lanes.
 
     lanes : number of lanes along the line, and against it
     """

@@ -25,7 +25,7 @@ _REACH = 400.0
 
 @dataclass(frozen=True, slots=True)
 class Overlaps:
-    """Stations of bridges and tunnels that lie within another road beside them.
+    """Stations of bridges and tunnels within another road beside them.
 
     station : (k,) int64
     before, after, share : (k,) the other road's stations before and after its nearest point, and the share
@@ -47,7 +47,7 @@ class Overlaps:
 def find_overlaps(
     graph: RoadGraph, stations: Stations, *, crossing: tuple[Ints, Ints], room: float
 ) -> Overlaps:
-    """All stations of bridges and tunnels within carriageways that run beside them.
+    """Stations of bridges and tunnels within carriageways that run beside them.
 
     Roads of different layers lie over one another if they cross somewhere, or if the centre line of one runs
     within the other far enough from the fork to be parted in height. Otherwise, as at forks and in the same
@@ -109,7 +109,7 @@ def _heading(stations: Stations, row: Ints) -> Float:
 def _from_fork(
     graph: RoadGraph, stations: Stations, *, row: Ints, edge: Ints, other: Ints, along: Float, length: Float
 ) -> Float:
-    """Metres (k,) along roads from rows of stations to places on other edges; inf beyond the reach."""
+    """Distance (k,) along roads from stations to places on other edges; inf beyond ``reach``."""
     from scipy.sparse import csr_array  # noqa: PLC0415  (slow to import)
     from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 

@@ -228,7 +228,7 @@ def shortest_path(
     either_side: bool = True,
     u_turns: bool = False,
 ) -> RoadPath | None:
-    """The fastest or shortest path between two places on the graph, or None if there is none.
+    """Fastest or shortest path between two places on the graph; None if they are not connected.
 
     start, goal : (edge, offset), as `nearest_edge` gives them
     weight      : ``time`` at the speed limits, or ``length``

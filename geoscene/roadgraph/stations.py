@@ -124,7 +124,7 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
 
 
 def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, Ints, Float, Float]:
-    """Where one road runs over another: (upper edge, metres along it, lower edge, metres along it, margin).
+    """Grade-separated crossings: (upper edge, metres along it, lower edge, metres along it, margin).
 
     These are lines that cross in plan without a common node and differ in layer or in bridge or tunnel. The
     margin is the length in metres along the upper road that half the lower road's width takes up.

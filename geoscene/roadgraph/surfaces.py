@@ -124,7 +124,7 @@ def _beside(roads: Carriageways) -> Float:
 
 
 def _junction_reach(roads: Carriageways) -> Float:
-    """Maximum metres (n,) from each node to the outside of its junction; 0 without a junction."""
+    """Upper bound (n,) in metres from each node to the border of its junction; 0 without one."""
     reach = np.zeros(len(roads.node_xy))
     np.maximum.at(reach, roads.ends.ravel(), np.repeat(_beside(roads), 2) + JOINT)
     reach[np.bincount(roads.ends.ravel(), minlength=len(reach)) < 2] = 0.0

@@ -261,7 +261,7 @@ def _cycle_and_parking_width(tags: Tags) -> float:
 
 
 def tag_of_side(tags: Tags, key: str, *, side: str) -> str:
-    """Value of a tag such as ``cycleway`` on a side of the way, "" if there is none."""
+    """Value of a tag such as ``cycleway`` on a side of the way; "" without it."""
     return tags.get(f"{key}:{side}", tags.get(f"{key}:both", tags.get(key, "")))
 
 

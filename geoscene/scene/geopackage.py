@@ -37,7 +37,7 @@ _DATE = "2000-01-01T00:00:00.000Z"  # constant, so that the same scene gives the
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One kind of feature.
+    """A layer of features: geometry type and columns.
 
     name     : layer name
     geometry : (n,) shapely geometries in scene metres, plan or with heights
@@ -128,7 +128,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame, index
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Geometry type and columns of a layer of a GeoPackage.
+    """Geometry type and columns of a layer in a GeoPackage.
 
     geometry_type : as GDAL names it: ``Polygon``, ``MultiPolygon Z`` ...
     columns       : column name to type; object for text
@@ -139,7 +139,7 @@ class Schema:
 
 
 def read_schema(path: Path, name: str) -> Schema:
-    """The geometry type and the columns of a layer; raises SceneFormatError if there is no such layer."""
+    """Geometry type and columns of a layer; raises SceneFormatError if it is missing."""
     from pyogrio import read_info  # noqa: PLC0415  (0.3 s)
 
     with _reading(path, name):

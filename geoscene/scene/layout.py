@@ -77,7 +77,7 @@ class SceneFiles:
 
     @property
     def problems(self) -> Path:
-        """Table of what was repaired or dropped."""
+        """Table of repaired and dropped features."""
         return self._local("problems.csv")
 
     @property
@@ -165,7 +165,7 @@ class Scene(Previewed):
 
     @property
     def use(self) -> str:
-        """Use for which the scene was built, one of `geoscene.uses.USES`."""
+        """Purpose of the scene, one of `geoscene.uses.USES`."""
         return str(self.manifest.get("options", {}).get("use", "all"))
 
     def require(self, *parts: str) -> None:
@@ -197,7 +197,7 @@ class Scene(Previewed):
         return np.hstack([low, low + span]) * self.tile_size
 
     def tiles_at(self, xy: Float) -> Ints:
-        """Row (k,) in `tile_indices` of the tile of each point (k, 2), -1 beyond all tiles."""
+        """Row (k,) in `tile_indices` of the tile of each point (k, 2); -1 outside of all tiles."""
         boxes, row = self.tile_boxes, np.full(len(xy), -1, np.int64)
         point, tile = shapely.STRtree(shapely.box(*boxes.T)).query(shapely.points(xy))
         on = ((xy[point] >= boxes[tile, :2]) & (xy[point] < boxes[tile, 2:])).all(axis=1)
@@ -210,7 +210,7 @@ class Scene(Previewed):
         return {name: (int(a), int(b)) for name, (a, b) in self.manifest["layers"].items()}
 
     def table_length(self, layer: str) -> int:
-        """Number of rows of a layer's table, which holds the features within reach of a build's route."""
+        """Number of rows of a layer's table, which may be limited to a build's route."""
         return int(self.manifest["rows"].get(layer, 0))
 
     @functools.cached_property
@@ -251,7 +251,7 @@ class Scene(Previewed):
 
     @functools.cached_property
     def forests(self) -> Forests | None:
-        """Parameters of the trees of forests, None for a scene without forests."""
+        """Parameters from which forest trees are generated; None for a scene without forests."""
         document = self.manifest.get("forests")
         return None if document is None else Forests.from_json(document)
 
@@ -388,7 +388,7 @@ def changed_files(scene: Scene) -> list[Path]:
 
 @contextmanager
 def using(scene: Scene, *, known: type[Exception] = GeosceneError) -> Iterator[Scene]:
-    """Yield a scene; raise an unexpected error of the block as that of a damaged file, if there is one.
+    """Yield a scene; report an unexpected error of the block as a damaged file, if one is damaged.
 
     known : base class of errors that name their cause; they pass
 

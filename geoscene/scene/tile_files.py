@@ -180,7 +180,7 @@ def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:
 
 
 def read_shapes(path: Path) -> dict[str, Mesh]:
-    """The shapes that `write_shapes` wrote, in order; empty if there is no such file."""
+    """Shapes that `write_shapes` wrote, in order; empty without a file."""
     if not path.exists():
         return {}
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):

@@ -148,7 +148,7 @@ class Collector:
         return {i: (x, y) for i, x, y in places if i < 0}
 
     def joined(self, other: Collector) -> Collector:
-        """All objects of both; of objects with the same id those of the other."""
+        """Objects of both; of objects with the same id those of ``other``."""
         boxes = [bounds for bounds in (self.bounds, other.bounds) if bounds is not None]
         edges = list(zip(*boxes, strict=True))
         return Collector(
@@ -166,7 +166,7 @@ class Collector:
         )
 
     def finish(self) -> Elements:
-        """All objects, sorted by id, with node references resolved."""
+        """All objects, sorted by id, with resolved node references."""
         ids = np.frombuffer(self._node_id, np.int64) if self._node_id else np.empty(0, np.int64)
         keep = _last_of_each(ids)
         ids = ids[keep]

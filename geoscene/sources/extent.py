@@ -67,7 +67,7 @@ def checked_bounds(bounds: Bounds) -> Bounds:
 
 
 def locate(elements: Elements, bounds: Bounds | None) -> tuple[Elements, Bounds, list[Problem]]:
-    """The elements without nodes far from the map, the map's extent, and what was left out.
+    """Elements without nodes far from the map, the map's extent, and the removed elements.
 
     Longitudes of a map across 180° become continuous, those east of it over 180. The extent is that of
     ``bounds``, else that which the source states, else that of the nodes. Bounds that a source states are
@@ -119,7 +119,7 @@ def near_extent(areas: Sequence[Area], extent: Bounds) -> tuple[list[Area], list
 
 
 def close_together(areas: Sequence[Area]) -> tuple[list[Area], Bounds, list[Problem]]:
-    """The areas without small groups far from all others, their extent, and what was left out."""
+    """Areas without small groups far from all others, their extent, and the removed areas."""
     boxes = shapely.bounds(np.array([area.geometry for area in areas], object)).reshape(-1, 4)
     main = _main_part((boxes[:, :2] + boxes[:, 2:]) / 2)
     west, south = boxes[main, :2].min(axis=0).tolist()
@@ -149,7 +149,7 @@ def _continuous(elements: Elements, bounds: Bounds | None) -> Elements:
 
 
 def _stated_bounds(elements: Elements) -> Bounds | None:
-    """The bounds that the source states, beside its nodes; None if they circle the globe."""
+    """Bounds stated by the source; None if they span the globe."""
     if elements.bounds is None:
         return None
     west, south, east, north = elements.bounds
@@ -201,7 +201,7 @@ def _main_part(lonlat: Float) -> Bools:
 
 
 def _cut(stated: Bounds, found: Bounds) -> tuple[Bounds, list[Problem]]:
-    """Stated bounds cut 10 km beyond the nodes' extent (that extent if they do not meet), and the report."""
+    """Stated bounds, limited to 10 km beyond the nodes' extent, and a report."""
     dy = _EMPTY / METRES_PER_DEGREE
     dx = dy / max(float(np.cos(np.radians((found[1] + found[3]) / 2))), 1e-6)
     west, south = max(stated[0], found[0] - dx), max(stated[1], found[1] - dy)

@@ -137,7 +137,7 @@ def _check_schema(path: Path, schema: Any) -> None:
 
 
 def _footprint(name: str, shape: Any) -> tuple[Any, Problem | None]:
-    """A valid (multi)polygon or None, and the repair or the reason why it was dropped."""
+    """A valid (multi)polygon or None, and the repair or the reason for dropping it."""
     if shape is None:
         return None, Problem(name, "building", "dropped", "no-area", "geometry is null or no WKB")
     if not (np.abs(shapely.get_coordinates(shape)) <= (180, 90)).all():

@@ -122,7 +122,7 @@ def read_source(
 
 
 def credits_of(osm: OsmData) -> tuple[Credit, ...]:
-    """All sources of a map, with licence and attribution."""
+    """Sources of a map, with licence and attribution."""
     row = SOURCES[osm.kind]
     own = Credit(osm.kind, osm.source, osm.timestamp, row.licence, osm.attribution or row.attribution)
     return (own, *osm.added)

@@ -145,7 +145,7 @@ def _join(chains: Sequence[Ints]) -> list[list[Ints]]:
 
 
 def _union_of_rings(chains: Sequence[Ints], xy: Float) -> Any:
-    """The union of the areas that the rings enclose; empty if there is none."""
+    """Union of the areas enclosed by the rings; empty without any."""
     areas = []
     for group in _join(chains):
         segments = np.unique(np.concatenate([segments_of(chain) for chain in group]), axis=0)

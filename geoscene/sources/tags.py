@@ -118,7 +118,7 @@ def is_line(tags: Tags) -> bool:
 
 
 def is_open_area(tags: Tags) -> bool:
-    """Whether a way with these tags must be an area, so that it is a defect if it is open."""
+    """Whether a way with these tags must be closed, so that an open one is a defect."""
     if is_building(tags):
         return True
     found = area_tags(tags)

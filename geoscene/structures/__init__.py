@@ -1,4 +1,4 @@
-"""Bridges and tunnels."""
+"""Bridges and tunnels: solids, piers, linings, equipment and passages."""
 
 from geoscene.structures.ground_contact import find_openings as find_openings
 from geoscene.structures.ground_contact import ground_below as ground_below

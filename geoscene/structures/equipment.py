@@ -66,7 +66,7 @@ def lamps(table: Structures, k: int) -> Bodies:
 
 
 def _clear_of_ribs(table: Structures, k: int, *, stations: Float, reach: float) -> Bools:
-    """Whether bodies that reach so far along the line from stations (n,) stand clear of ribs and portals."""
+    """Whether bodies of length ``reach`` at stations (n,) are clear of ribs and portals."""
     form = rib_form(table, k)
     ribs = np.concatenate([stations_every(table, k, spacing=form.spacing)[0], mouths(table, k)])
     room = reach + max(form.width, PORTAL_WIDTH) / 2 + 0.05

@@ -1,4 +1,4 @@
-"""Bodies that stand or hang in tunnels: ribs, portals and equipment."""
+"""Bodies on the ground or walls of tunnels: ribs, portals and equipment."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Floa
 def find_openings(
     table: Structures, height: Height | None, *, area: Any | None = None
 ) -> NDArray[np.object_]:
-    """Areas (n,) over each tunnel piece without ground, as shapely polygons; None if there are none.
+    """Areas (n,) above each tunnel piece without ground, as shapely polygons; None without any.
 
     There the ground is not higher than the minimum roof over the tunnel's ceiling.
 

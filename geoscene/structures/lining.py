@@ -94,7 +94,7 @@ def read_lining(table: Structures, k: int) -> Lining:
 
 
 def _tidy(shape: shapely.Geometry) -> shapely.Geometry:
-    """A shape without parts and necks that are too narrow to stand on."""
+    """A shape without parts and necks that are too narrow to support a solid."""
     return shape.buffer(-0.05, join_style="mitre").buffer(0.05, join_style="mitre").intersection(shape)
 
 

@@ -74,7 +74,7 @@ class _Net:
 
 @dataclass(frozen=True, slots=True)
 class _Crossed:
-    """Features that paths may cross, and the rules for crossings.
+    """Obstacles that paths may cross, and the rules for each.
 
     height : height of the terrain at x, y; None for level ground at 0
     """
@@ -296,7 +296,7 @@ def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _C
 
 
 def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
-    """Height (v,) of the nearest road bridge or tunnel of the same layer beside a station, NaN if none."""
+    """Height (v,) of the nearest road bridge or tunnel of the same layer; NaN without one."""
     z, nearest = np.full(len(net.xy), np.nan), np.full(len(net.xy), np.inf)
     edges = np.flatnonzero(graph.bridge | graph.tunnel)
     if not len(edges):
@@ -332,7 +332,7 @@ def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
 
 
 def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float]:
-    """Least and greatest height (v,) of stations at crossings; NaN where there is no limit."""
+    """Lower and upper bounds (v,) on the height of stations at crossings; NaN without a bound."""
     graph, options = crossed.graph, crossed.options
     obstacles = find_obstacles(crossed.osm, crossed.frame)
     roads = edge_lines(graph)

@@ -1,4 +1,4 @@
-"""Piers of bridges."""
+"""Bridge piers: placement and shape."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def _above_ground(
 
 
 def _on_pieces(table: Structures, k: int, *, pieces: shapely.STRtree, shapes: NDArray[np.object_]) -> Bools:
-    """Whether each pier would stand on another bridge or over an open tunnel."""
+    """Whether each pier would be on another bridge or over an open tunnel."""
     blocked = np.zeros(len(shapes), np.bool_)
     hit, found = pieces.query(shapes, predicate="dwithin", distance=_FREE)
     for row, other in zip(hit.tolist(), found.tolist(), strict=True):

@@ -109,7 +109,7 @@ def part_outlines(
     free: Float,
     body: Float,
 ) -> NDArray[np.object_]:
-    """Outlines (n,) that keep out of the clearance of those beside them.
+    """Outlines (n,) reduced by the clearance of adjacent pieces.
 
     Mapped widths are rough: carriageways side by side overlap by a metre or two. Where they do, and one is
     higher but not enough for the other to pass below, each keeps the area nearer to its own line.
@@ -160,7 +160,7 @@ def areal(shape: shapely.Geometry, *, least: float = 0.0) -> shapely.MultiPolygo
 def _in_conflict(
     line: Float, other: Float, *, reach: float, needs: tuple[float, float], least: float
 ) -> list[shapely.Geometry]:
-    """Strips along a line where another runs beside it without enough height difference to pass.
+    """Strips along a line where another line is too near in plan and in height to pass.
 
     needs : metres that the line must be above the other to pass over it, and below it to pass under it
     """

@@ -24,7 +24,7 @@ MOUTH = 0.7
 
 @dataclass(frozen=True, slots=True)
 class TubeWalls:
-    """Where the walls of a piece are at stations of its line.
+    """Positions of the walls of a piece at stations of its line.
 
     at     : (n, 2) points on the line
     along  : (n, 2) unit vectors along it
@@ -80,7 +80,7 @@ def _outwards(along: Float) -> Float:
 
 
 def _metres_to_walls(table: Structures, k: int, *, points: Float, along: Float) -> Float:
-    """Metres (..., n, 2) from points (..., n, 2) to the walls at both sides, NaN where there is none.
+    """Distances (..., n, 2) in metres from points to the walls at both sides; NaN without a wall.
 
     along : (n, 2) unit vectors along the line
     """

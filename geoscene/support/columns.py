@@ -40,7 +40,7 @@ class Columns:
 
     @classmethod
     def concatenate(cls, tables: Sequence[Self]) -> Self:
-        """All rows of one or more tables, in order; fields that are not columns are the first table's."""
+        """Rows of one or more tables, in order; fields that are not columns are the first table's."""
         names = tables[0].columns()
         joined = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
         return replace(tables[0], **joined)

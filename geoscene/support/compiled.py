@@ -207,7 +207,7 @@ class _Files(caching.IndexDataCacheFile):
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Save machine code, and remove what was listed for older sources."""
+        """Save machine code, and remove entries of older sources."""
         code: bytes = self._dump(data)  # type: ignore[no-untyped-call]
         name = self._data_name_pattern.replace("{number:d}", hashlib.sha256(code).hexdigest()[:16])
         with self._open_for_write(self._data_path(name)) as file:  # type: ignore[no-untyped-call]
@@ -230,7 +230,7 @@ class _Files(caching.IndexDataCacheFile):
 
 
 class _Own:
-    """Of functions of the two packages alone; their code is fresh while no module that it uses changes."""
+    """Cache locator for our own functions; entries are stale once an imported module changes."""
 
     _py_file: str
 
@@ -254,14 +254,14 @@ class _Given(_Own, caching.UserProvidedCacheLocator):
 
 
 class _BesideSource(_Own, caching.InTreeCacheLocator):
-    """In ``__pycache__`` beside the module."""
+    """Cache locator for ``__pycache__`` beside the module."""
 
 
 class _OfUser(_Own, caching.UserWideCacheLocator):
     """In the user's cache directory, which begins with what an installation brings that is read-only."""
 
     def ensure_cache_path(self) -> None:
-        """Make the directory, and copy the code that lies beside the module into it once."""
+        """Create the directory, and copy the code beside the module into it once."""
         super().ensure_cache_path()  # type: ignore[no-untyped-call]
         folder, source = Path(self.get_cache_path()), Path(self._py_file)  # type: ignore[no-untyped-call]
         for brought in (source.parent / "__pycache__").glob(f"{source.stem}.*.nb[ic]"):

@@ -235,7 +235,7 @@ def _exit_interrupted(app: App, number: int) -> NoReturn:
 
 
 def _command(app: App) -> str:
-    """The command on the command line with the commands that it is nested in, each followed by a space."""
+    """The command with its parent commands, each followed by a space."""
     return "".join(f"{name} " for name in app.parse_commands(sys.argv[1:])[0])
 
 

@@ -35,13 +35,13 @@ Result = TypeVar("Result")
 
 @dataclass(slots=True)
 class _Worker(Generic[Task]):
-    """A process, and the task that it works on; None while it is idle."""
+    """A process and its current task; None while it is idle."""
 
     process: BaseProcess
     task: Task | None = None
 
     def end(self) -> str:
-        """Text on the end of the process."""
+        """Description of how the process ended."""
         self.process.join()
         code = self.process.exitcode or 0
         cause = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
@@ -99,7 +99,7 @@ def _context() -> BaseContext:
 
 
 def threads_of_libraries() -> int:
-    """Number of threads that Python does not know and that are in the way of a fork, 0 without ``/proc``.
+    """Number of native threads that make a fork unsafe; 0 without ``/proc``.
 
     They are those of pools, as of lazrs, Arrow or TBB. Those of OpenBLAS, which it ends before a fork and
     starts again when needed, do not count.

@@ -13,4 +13,4 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int, *, total: int) -> None:
-    """Report nothing."""
+    """A `Progress` that reports nothing."""

@@ -1,4 +1,4 @@
-"""Scenes and datasets in object storage: s3://, gs://, file:// and whatever else fsspec reaches.
+"""Scenes and datasets in object storage: s3://, gs://, file:// and other protocols of fsspec.
 
 Programs work on local files. What is read is fetched into a cache when it is needed; what is written is
 made in a local folder and then published, so that a folder in storage is complete or none.
@@ -56,7 +56,7 @@ def shown(path: Path) -> str:
 
 
 def cache_folder() -> Path:
-    """Folder of what is fetched and of what is to be published, in the user's home."""
+    """Folder of fetched files and of files to be published, in the user's home."""
     return Path.home() / ".cache" / "geoscene"
 
 
@@ -78,7 +78,7 @@ class StoredFolder:
         return data
 
     def listed(self, *, depth: int | None = None) -> dict[str, dict[str, Any]]:
-        """Names of files, with what the storage tells of each.
+        """Names of files, with their metadata in the storage.
 
         depth : of the folders, 1 for the files in the folder itself; all by default
         """

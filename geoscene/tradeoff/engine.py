@@ -57,7 +57,7 @@ class BuildCost:
 
 @dataclass(frozen=True, slots=True)
 class BuildRow:
-    """A build.
+    """Measured error and cost of a build.
 
     costs   : of each repetition
     error   : of the surface model in metres (``height_rms_m``, ``height_99_m``, ``height_max_m``), the shares
@@ -146,7 +146,7 @@ def _measure(read: Callable[[], OsmData], variant: BuildVariant, *, folder: Path
 
 
 def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> BuildCost:
-    """Build a scene in this process and return all that it cost."""
+    """Build a scene in this process and return its cost."""
     from geoscene.pipeline.build import build  # noqa: PLC0415 - part of the cost
 
     build(read(), out, options=options, overwrite=out.exists())
@@ -156,7 +156,7 @@ def _build(read: Callable[[], OsmData], *, options: BuildOptions, out: Path) -> 
 
 @dataclass(frozen=True, slots=True)
 class _Measures:
-    """Figures of a scene that are compared.
+    """Quantities of a scene that are compared.
 
     height : (rows, columns) of the highest face over each cell; NaN without one
     klass  : (rows, columns) class of that face

@@ -75,7 +75,7 @@ def _apart(points: Float, ground: Bools, *, box: Sequence[float]) -> Float:
 
 
 def _nearest(points: Float, *, sides: Float, apart: Float) -> Ints:
-    """Row (n,) of the point that represents the cell and kind of each point; cells have the given side."""
+    """Row (n,) of the representative point of each point's cell, of the same side and kind."""
     place = np.floor(points / sides[:, None])
     away = np.square(points - (place + 0.5) * sides[:, None]).sum(axis=1)
     columns = (*points.T, away, *place.T, apart)

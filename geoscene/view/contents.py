@@ -1,4 +1,4 @@
-"""Contents of a page: chosen layers with guessed looks, attributes, and bounding boxes of features."""
+"""Contents of a page: chosen layers with inferred appearance, attributes, and bounding boxes."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class PageContents:
         }, data
 
     def _busy(self) -> dict[str, list[float]]:
-        """The box of the tiles where things stand: the middle of all but bare ground, along either axis."""
+        """Bounding box of the tiles with objects: the middle of all but bare ground, along either axis."""
         weight = np.array([w for *_, w in self.tiles])
         low, high = (np.array([tile[k] for tile in self.tiles], float) for k in (1, 2))
         box = [low.min(axis=0), high.max(axis=0)]

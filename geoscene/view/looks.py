@@ -1,4 +1,4 @@
-"""Guessed looks of buildings in the page: colours of faces, and windows that the page draws on walls."""
+"""Inferred appearance of buildings in the page: colours of faces, and windows drawn on walls."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class FacadeLooks(Columns):
-    """Parameters of the windows drawn on the walls of buildings, one row each.
+    """Drawn windows of the walls of buildings, one row each.
 
     feature : (b,) int32, feature numbers
     base    : (b,) float32, z in scene metres from which storeys count
@@ -55,7 +55,7 @@ class FacadeLooks(Columns):
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """The looks of a scene's buildings.
+    """Appearance of a scene's buildings.
 
     facades : (n rows), by ascending feature number
     guesses : (n rows)
@@ -95,7 +95,7 @@ class Looks:
         return self.facades.take(np.isin(self.facades.feature, mesh.feature[mesh.klass == Class.BUILDING]))
 
     def told(self, features: FeatureAttributes) -> FeatureAttributes:
-        """The attributes with columns that say what is guessed of each building; null where it is mapped."""
+        """The attributes with columns of inferred values of each building; null for mapped ones."""
         if "buildings" not in features.layers:
             return features
         number = features.layers.index("buildings")
@@ -118,7 +118,7 @@ class Looks:
 
 
 def read_looks(scene: Scene) -> Looks:
-    """The looks of a scene's buildings."""
+    """Appearance of a scene's buildings."""
     xmin, ymin, xmax, ymax = scene.bounds
     lon, lat = scene.frame.to_geographic((xmin + xmax) / 2, (ymin + ymax) / 2)
     columns: dict[str, NDArray[Any]] = dict.fromkeys(_COLUMNS, np.empty(0, object))

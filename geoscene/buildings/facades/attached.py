@@ -1,4 +1,4 @@
-"""Parts that stand out from facades: balconies, cornices, awnings over shops and downpipes.
+"""Parts that project from facades: balconies, cornices, awnings over shops and downpipes.
 
 Each is a closed solid that ends 5 mm before the wall, so that it is a body of its own that touches nothing.
 """
@@ -46,7 +46,7 @@ _CLOTHS = np.array([[122, 44, 40], [38, 74, 60], [44, 62, 96], [196, 186, 160]],
 
 @dataclass(frozen=True, slots=True)
 class Attached:
-    """Solids that stand out of facades.
+    """Solids that project from facades.
 
     mesh    : in scene metres
     guessed : (m,) bool, faces of parts that the map does not have
@@ -59,7 +59,7 @@ class Attached:
 
 
 def attach(sheet: Sheet, at: Elevations, *, facing: Bools, guess: bool) -> Attached:
-    """The solids that stand out of the facades; windows behind balconies reach down to the floor.
+    """Solids that project from the facades; windows behind balconies extend to the floor.
 
     facing : (k,) whether walls face a street
     guess  : also parts that the map does not have

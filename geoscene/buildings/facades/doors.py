@@ -63,7 +63,7 @@ def _door_boxes(cells: FacadeCells, cell: Ints, *, middle: Float, size: Float) -
 
 
 def put_mapped_doors(sheet: Sheet, at: Elevations) -> dict[str, int]:
-    """Put doors at mapped entrances; returns how many were put and for how many there was no room."""
+    """Place doors at mapped entrances; returns the numbers placed and left out for lack of space."""
     walls, grids = at.walls, at.grids
     mine = at.setting.entrances.take(np.isin(at.setting.entrances.building, walls.feature))
     placed = 0

@@ -37,7 +37,7 @@ def obstacles(at: Elevations, wall: Ints, *, shape: NDArray[np.object_]) -> tupl
 
 
 def _bases(at: Elevations, building: Ints) -> Float:
-    """Height z (n,) of the bases of buildings, also of those out of reach of a route."""
+    """Height z (n,) of the bases of buildings, also of those outside the tiles of a route."""
     known = at.base[building]
     lacking = np.unique(building[np.isnan(known)])
     if not len(lacking):
@@ -59,7 +59,7 @@ class Fit:
         self._tree = shapely.STRtree(shapely.box(*low[:, :2].T, *high[:, :2].T))
 
     def _obstacles(self) -> tuple[Ints, Float]:
-        """Columns (p,), sorted, and the lower and upper height (p, 2) of what stands before them."""
+        """Columns (p,), sorted, and the height intervals (p, 2) of obstacles in front of them."""
         walls, cells = self._at.walls, self._at.cells
         first = np.unique(cells.upright, return_index=True)[1]
         of, middle = cells.wall[first], cells.middle[first]
@@ -105,7 +105,7 @@ class Fit:
         return fits
 
     def _free(self, cell: Ints, box: Float) -> Bools:
-        """Whether nothing stands before openings."""
+        """Whether openings have no obstacle in front of them."""
         column, span = self._column, self._span
         own = self._at.cells.upright[cell]
         begin, end = np.searchsorted(column, own), np.searchsorted(column, own, side="right")
@@ -173,7 +173,7 @@ def _enter(triangles: Float, *, low: Float, high: Float) -> Bools:
 
 
 class Sheet:
-    """Contents of each cell, while doors, shop fronts and windows are placed."""
+    """Contents of the facade cells while they are filled."""
 
     def __init__(self, at: Elevations) -> None:
         cells = at.cells

@@ -49,7 +49,7 @@ class Grids(Columns):
 
 @dataclass(frozen=True, slots=True)
 class FacadeCells:
-    """All cells of the walls, row by row from below.
+    """All cells of the walls, row by row from the bottom.
 
     wall, column, storey : (c,) int64; storeys count from the ground floor of the building
     middle : (c,) metres from the wall's left edge to the middle of the openings

@@ -38,7 +38,7 @@ _DRAWN = 0.65
 
 @dataclass(frozen=True, slots=True)
 class Chosen(Columns):
-    """Contents of each cell (c,).
+    """Kind of opening chosen for each cell (c,).
 
     kind   : (c,) int64: BLANK, WINDOW, SHOP, DOOR or GATE
     place  : (c, 4) left, lower, right and upper edge of the opening in the cell

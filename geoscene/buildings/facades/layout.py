@@ -35,7 +35,7 @@ _FRONT = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The relief of a tile's walls, and what was counted.
+    """Relief of a tile's walls, with counts.
 
     parts  : solids that stand out of the walls
     counts : walls with openings; walls that stay planes because their outline touches itself, they are small,
@@ -95,7 +95,7 @@ def wall_relief(
 
 
 def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Attached]:
-    """Contents of each cell, solids attached to walls, and counts of both."""
+    """Kind of opening of each cell, projecting solids, and the counts of both."""
     sheet, cells, styles, wall = Sheet(at), at.cells, at.styles, at.cells.wall
     facing = facing_street(at)
     _put_windows(sheet, at)

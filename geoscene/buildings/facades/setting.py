@@ -1,4 +1,4 @@
-"""Context of facades: styles, neighbouring buildings, streets, mapped entrances and shops."""
+"""Inputs of facades besides the walls: styles, neighbours, streets and mapped entrances."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def _is_entrance(tags: Tags) -> bool:
 
 
 def _size(tags: Tags) -> list[float]:
-    """Mapped width and height of an entrance, NaN where there is none that a door can have."""
+    """Mapped width and height of an entrance; NaN for sizes that no door has."""
     out = []
     for name, (least, most) in zip(("width", "height"), _SIZES, strict=True):
         value = parse_length(tags.get(f"door:{name}", tags.get(f"entrance:{name}", tags.get(name))))

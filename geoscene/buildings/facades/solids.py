@@ -90,7 +90,7 @@ def _rims(openings: Openings) -> Float:
 
 
 def outlines(mesh: Mesh, of_face: NDArray[np.int32], *, count: int) -> list[list[Ints] | None]:
-    """The rings of each wall (count,) as vertices of the mesh, seen from outside.
+    """Rings of each wall (count,) as vertices of the mesh, in the order seen from outside.
 
     None stands for an outline that touches itself, which cannot be cut in one way only.
 
