@@ -9,7 +9,7 @@ from helpers import ROOT
 
 def rows_of_page(column: int) -> list[set[str]]:
     """Names in a column of the table of layers, row by row."""
-    page = (ROOT / "docs" / "developers" / "architecture.md").read_text("utf-8")
+    page = (ROOT / "docs" / "architecture.md").read_text("utf-8")
     table = page.partition("| `geoscene` | `lidar` |\n")[2]
     lines = table.partition("\n\n")[0].splitlines()[1:]
     return [names for line in lines if (names := set(re.findall(r"`(\w+)`", line.split("|")[column])))]
