@@ -17,7 +17,7 @@ _BY_COLONS = re.compile(r":\s*(\w+)\s*=")
 
 @dataclass(slots=True)
 class Item:
-    """A name with parameters.
+    """A name with parameters, as read from text or TOML.
 
     name   : as in its registry, in lower case if it is known so
     values : by parameter; texts on the command line, values of any type in TOML files

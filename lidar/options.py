@@ -1,4 +1,4 @@
-"""Options of the commands of `lidar`: defaults, units, help and the recipe of a dataset stand here once."""
+"""Options of the commands of `lidar`: defaults, units, help and the recipe of a dataset, declared once."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ _WEATHER = Parameter(name="--weather", converter=_weather, n_tokens=1, accepts_k
 
 
 def chosen_stages(*groups: Iterable[NamedStage]) -> tuple[NamedStage, ...]:
-    """All stages in the order in which they act: weather, attacks, others."""
+    """All stages in order of application: weather, attacks, others."""
     from lidar.signal.registry import number_stages  # noqa: PLC0415
 
     return number_stages(chain.from_iterable(groups))
@@ -441,7 +441,7 @@ class DriveOptions:
         return chosen_stages(self.weather, self.attacks, self.stages)
 
     def recipe(self, scene: Scene) -> dict[str, Any]:
-        """All that the dataset's bytes depend on, as JSON; files with a digest of their contents."""
+        """Options and digests of inputs that determine the dataset's bytes, as JSON."""
         from lidar.sensors.rig.specs import load_rig, rig_digest  # noqa: PLC0415
 
         route, side = self.route or "random", self.side_in(scene)
@@ -480,7 +480,7 @@ _METRES = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0}
 
 @dataclass(frozen=True, slots=True)
 class AccuracyTarget:
-    """Errors that the sensors of a drive must not exceed; 0 where none is asked for.
+    """Maximum errors of the sensors of a drive; 0 without a limit.
 
     text    : as it was asked for
     metres  : error of ranges of scanners, and of depths of cameras

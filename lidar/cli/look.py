@@ -1,4 +1,4 @@
-"""Commands that show what was recorded: descriptions, players, figures and films."""
+"""Commands that present recorded data: descriptions, players, figures and films."""
 
 from __future__ import annotations
 

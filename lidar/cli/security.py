@@ -245,7 +245,7 @@ def verify(
     json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> int:
-    """Find files that were changed, lost or added, and with keys what was tampered with in signed data.
+    """Find changed, lost or added files, and with keys the manipulation of signed data.
 
     Without keys all files are compared with checksums.sha256. With keys the watermark, the signed hash chain
     or both are verified: files, frames, blocks of a ring by 10 degrees, points. Exits with 1 if anything is

@@ -1,1 +1,1 @@
-"""Datasets on disk."""
+"""Datasets on disk: layout, formats of files, layouts of other datasets, checksums."""

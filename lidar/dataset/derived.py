@@ -48,7 +48,7 @@ def copy_dataset(source: Path, out: Path, *, leave_out: set[Path]) -> None:
 def copy_folder(
     source: Path, out: Path, *, ignore: Callable[[str, list[str]], list[str]] | None = None
 ) -> None:
-    """Copy what is in a directory, but for the names that ``ignore`` returns of those in a folder.
+    """Copy a directory, except the names that ``ignore`` returns for each folder.
 
     Raises NotWrittenError, which names the first file that could not be copied.
     """

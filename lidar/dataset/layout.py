@@ -394,7 +394,7 @@ def remove_dataset(path: Path) -> None:
 
 
 def own_files(path: Path) -> Callable[[str], bool]:
-    """Whether a path relative to a dataset is that of a file which drives write; others may stand beside."""
+    """Whether a path relative to a dataset is that of a file which drives write."""
     sensors, top = _own_names(Paths(path))
     signed = Paths(path).chain.is_file()
 

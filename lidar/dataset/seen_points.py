@@ -55,7 +55,7 @@ class SceneReturns(Columns):
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """Points in an image.
+    """Visible points of a point cloud in an image.
 
     pixel : (n, 2) columns and rows; NaN for points that the camera does not image
     depth : (n,) metres, as in depth images

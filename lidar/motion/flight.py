@@ -89,7 +89,7 @@ def survey_flight(
 
 
 def dense_line(xy: Float) -> Float:
-    """A line (n, 2) with points every ten metres or closer, at which a flight looks at the ground."""
+    """A line (n, 2) with points at most ten metres apart, at which a flight samples the ground."""
     dense: Float = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(xy), _STEP))
     return dense
 

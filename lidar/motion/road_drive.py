@@ -183,7 +183,7 @@ def plan_road_drive(
 
 
 def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tuple[Float, list[Float]]:
-    """Scene metres (n, 2) of the path that `plan_road_drive` will plan, and of all routes that it will try.
+    """Path (n, 2) in scene metres that `plan_road_drive` will plan, and all routes that it may try.
 
     Raises RouteError as `plan_road_drive` does.
     """

@@ -282,7 +282,7 @@ def _check_sight(
     jobs: Sequence[tuple[Scanner | Camera, int]],
     around: RecordedSurroundings | None,
 ) -> None:
-    """Raise InputError for an attacker that no scanner sees in any of the frames."""
+    """Raise InputError for an attacker without a line of sight to any scanner in any frame."""
 
     def seen(scanner: Scanner, at: Situation) -> Seen:
         cloud = recorded_cloud(dataset, recording, form=form, scanner=scanner, frame=int(at.frame))

@@ -27,7 +27,7 @@ def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
 
 
 def read_foreign_past(path: Path, form: Format, *, source: Path, device: Sensor) -> Past:
-    """A point cloud of KITTI or nuScenes with the truth of earlier stages, if there were any."""
+    """A point cloud of KITTI or nuScenes with the ground truth of earlier stages, if any."""
     truth = foreign_truth(source, path.relative_to(source), form=form)
     return read_past(truth, read_foreign(path, form, device=device))
 

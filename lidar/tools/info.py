@@ -1,4 +1,4 @@
-"""Describes recorded data from their metadata: what was recorded, where from, and what is missing."""
+"""Description of recorded data from their metadata: contents, origin, missing parts."""
 
 from __future__ import annotations
 

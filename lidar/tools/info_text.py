@@ -93,7 +93,7 @@ def _state_rows(d: Mapping[str, Any], parents: Any) -> Iterator[tuple[str, str]]
 
 
 def _stage_text(stage: Mapping[str, Any]) -> str:
-    """Name of a stage, with what it is of and its parameters that are not the default."""
+    """Name of a stage, with its sensor and its parameters that differ from the default."""
     usual: dict[str, Any] = {"seed": None, "sensor": ""}
     with suppress(InputError):  # a stage of another version
         usual |= {f.name: f.default for f in fields(STAGES.find(stage["name"])) if f.name not in _TOLD}

@@ -40,7 +40,7 @@ _THRESHOLDS = np.linspace(0.05, 0.95, 91)
 
 @dataclass(frozen=True, slots=True)
 class Examples:
-    """Clusters with what they are.
+    """Labelled clusters for training.
 
     measures : (n, features) float32, as `lidar.tools.detection.features.features`
     kind     : (n,) row of `lidar.tools.detection.learned.CLASSES`

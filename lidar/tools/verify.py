@@ -1,4 +1,4 @@
-"""Verifies checksums, the watermark and the signed hash chain of datasets, and names what was changed."""
+"""Verification of checksums, watermark and signed hash chain of datasets."""
 
 from __future__ import annotations
 

@@ -253,7 +253,7 @@ def _parts_near_ego(track: Float, scene: Scene, *, ego: Trajectory, radius: floa
 
 
 def _hints(graph: RoadGraph, xy: Float, *, yaw: Float, foot: NDArray[np.bool_]) -> Float:
-    """Height (n,) of the nearest road in the direction of each position, NaN where there is none.
+    """Height (n,) of the nearest road in the direction of each position; NaN without one.
 
     foot : (n,) bool, pedestrian: roads in all directions count
     """

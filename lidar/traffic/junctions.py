@@ -1,4 +1,4 @@
-"""Junctions and their signals."""
+"""Junctions of the road graph: reservations, signal groups and their phases."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def passages(
 
 
 def _stops(graph: RoadGraph, edge: int) -> bool:
-    """Whether there is a stop sign where an edge leads up to a junction."""
+    """Whether a stop sign is at the end of an edge."""
     here = (graph.control_edge == edge) & (graph.control_kind == "stop")
     near = graph.length[edge] - graph.control_offset[here] < _LINE_REACH
     return edge >= 0 and bool(near.any() or graph.stop[graph.head[edge]])

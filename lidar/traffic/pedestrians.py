@@ -201,7 +201,7 @@ def _crossings(lanes: Lanes, walks: Sidewalks) -> dict[int, list[tuple[int, floa
 
 
 def _course(parts: list[Float], over: list[tuple[int, int]], *, pace: float, scale: float) -> TripCourse:
-    """The course along lines with their crossings, at an even pace."""
+    """Course along lines with their crossings, at constant speed."""
     line = np.concatenate(parts)
     ends = np.cumsum([len(p) for p in parts])
     along = polylines.stations(line)

@@ -213,7 +213,7 @@ def parked_vehicles(
 def _passable(
     road: shapely.Geometry, obstacles: NDArray[np.object_], *, lanes: Lanes, area: TrafficArea
 ) -> shapely.Geometry:
-    """The carriageways without buildings that stand on them; bridges and tunnels are kept."""
+    """Carriageways without buildings on them; bridges and tunnels are kept."""
     buildings = obstacles[shapely.area(obstacles) > _BUILDING_AREA]
     over = np.flatnonzero(area.near & (lanes.graph.bridge | lanes.graph.tunnel))
     free = shapely.buffer(area.lines[over], lanes.graph.width[over] / 2 * area.scale)

@@ -129,7 +129,7 @@ def simulate_ego(
 
 
 def has_traffic_control(ego: EgoTrip, graph: RoadGraph, *, plan: JunctionPlan) -> bool:
-    """Whether there are signals or stop signs along the ego's path."""
+    """Whether signals or stop signs are on the ego vehicle's path."""
     blocks = passages(ego, graph, plan=plan, routes={})
     return bool((blocks[:, 4] >= 0).any() or (blocks[:, 7] > 0).any())
 

@@ -237,7 +237,7 @@ def knots_on_ground(scene: Scene, tracks: RoadUserTracks, *, scale: float) -> Kn
 def poses_on_ground(
     scene: Scene, middle: Float, *, yaw: Float, hint: Float, axle: Float, track: Float, scale: float
 ) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
-    """Height (n,), pitch (nose down positive) and roll of bodies that stand on the ground on four wheels.
+    """Height (n,), pitch (nose down positive) and roll of bodies with four wheels on the ground.
 
     The last column (n,) is whether there is ground under the centre and under each wheel. A wheel without
     ground is at the height of the centre, a centre without ground at the height of the hint.
@@ -276,7 +276,7 @@ def _rate(values: Float) -> Float:
 
 
 def _course(middle: Float, yaw: Float) -> Float:
-    """Direction of motion (n,) in radians; the heading of the body where it stands."""
+    """Direction of motion (n,) in radians; the heading of the body while it is at rest."""
     d = np.gradient(middle, axis=0) if len(middle) > 1 else np.zeros_like(middle)
     moves = np.hypot(*d.T) > 0.02
     return np.where(moves, np.arctan2(d[:, 1], d[:, 0]), yaw)

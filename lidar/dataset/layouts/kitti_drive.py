@@ -51,7 +51,7 @@ Boxes = dict[int, dict[int, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class KittiDrive:
-    """A drive.
+    """A dataset as KITTI's layouts read it: one scanner, numbered cameras, boxes.
 
     clouds  : of the scanner; in KITTI's format if they were not recorded with all their columns
     cameras : streams of the cameras by their numbers, 0 to 3

@@ -14,7 +14,7 @@ from lidar.dataset.layouts.ros_topics import ODOMETRY
 
 
 def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
-    """Write ``drive.mcap`` and ``foxglove.json``; return the numbers of messages by what they are.
+    """Write ``drive.mcap`` and ``foxglove.json``; return the numbers of messages by type.
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """

@@ -24,7 +24,7 @@ _VERSION = 8
 
 
 def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
-    """Write ``metadata.yaml`` and ``drive.mcap``; return the numbers of messages by what they are.
+    """Write ``metadata.yaml`` and ``drive.mcap``; return the numbers of messages by type.
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """
@@ -99,7 +99,7 @@ def _about(drive: RosDrive) -> dict[str, str]:
 
 
 def message_counts(topics: list[Topic]) -> dict[str, int]:
-    """Numbers of messages by what they are, for the summary."""
+    """Numbers of messages by type, for the summary."""
     counts: Counter[str] = Counter()
     for topic in topics:
         if topic.counted:

@@ -170,12 +170,12 @@ def _farthest(xyz: Float, count: int, *, of: Bools | None = None) -> Float:
 
 
 def _mean(spacing: Float) -> float:
-    """Mean of what is finite."""
+    """Mean of the finite values."""
     known = spacing[np.isfinite(spacing)]
     return float(known.mean()) if len(known) else 0.0
 
 
 def _deviation(spacing: Float) -> float:
-    """Standard deviation of what is finite, as of a sample."""
+    """Sample standard deviation of the finite values."""
     known = spacing[np.isfinite(spacing)]
     return float(known.std(ddof=1)) if len(known) > 1 else 0.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True)
 class FilterTally:
-    """Returns of frames by what they are and whether a filter removes them.
+    """Counts of returns by true origin and by the filter's decision.
 
     frames, returns, removed : numbers
     weather      : returns of the weather; -1 if the truth is unknown
@@ -36,7 +36,7 @@ class FilterTally:
 
     @property
     def precision(self) -> float:
-        """Share of the weather in what is removed; nan if nothing is, or the truth is unknown."""
+        """Share of weather among removed returns; nan without any, or without ground truth."""
         return self.weather_removed / self.removed if self.removed and self.weather >= 0 else nan
 
     @property

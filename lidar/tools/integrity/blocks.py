@@ -63,7 +63,7 @@ def block_test(block: Ints, wrong: NDArray[np.bool_], *, error_rate: float, fals
 
 
 def _thresholds(bits: Ints, *, error_rate: float, chance: float) -> tuple[Ints, Float]:
-    """Least number of wrong bits that noise reaches with at most a chance, and the chance that it does."""
+    """Least number of wrong bits that noise exceeds with at most a probability, and that probability."""
     from scipy.special import bdtrc  # noqa: PLC0415  (0.2 s)
 
     sizes, row = np.unique(bits, return_inverse=True)

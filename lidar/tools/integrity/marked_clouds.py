@@ -1,4 +1,4 @@
-"""Clouds of signed data with the pulses that their watermark is of, whatever format they are in."""
+"""Point clouds of signed data, in any format, with the pulses of their watermark."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def _scanners(dataset: Dataset, options: MapOptions) -> list[str]:
 
 
 class _Read:
-    """Counts of what was read."""
+    """Counts of the returns that were read."""
 
     def __init__(self) -> None:
         self.points = 0

@@ -34,7 +34,7 @@ BACKGROUND = (16, 18, 24)
 
 @dataclass(frozen=True)
 class PictureView:
-    """Viewing direction of a picture; the distance follows from the bounds that it shows.
+    """Viewing direction of a picture; the distance follows from the visible bounds.
 
     azimuth_deg   : horizontal viewing direction, clockwise from the y axis (north)
     elevation_deg : downward angle of the viewing direction
@@ -64,7 +64,7 @@ def view_named(view: str | PictureView) -> PictureView:
 
 
 def camera_around(corners: Float, view: PictureView, *, size: tuple[int, int]) -> tuple[CameraSpec, Poses]:
-    """The nearest camera that sees all corners (n, 3)."""
+    """Nearest camera with all corners (n, 3) in view."""
     width, height = size
     a, e = math.radians(view.azimuth_deg), math.radians(view.elevation_deg)
     forward = np.array([math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), -math.sin(e)])

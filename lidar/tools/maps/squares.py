@@ -1,4 +1,4 @@
-"""Points sorted into squares of the plane, in files beside the map: what does not fit memory is on disk."""
+"""Points sorted into squares of the plane, in files beside the map, for maps larger than memory."""
 
 from __future__ import annotations
 

@@ -48,13 +48,13 @@ class Figures:
         return conditions | ({"detector": self.detector} if self.detector else {})
 
     def block(self, frame: Mapping[str, Any], *, seconds: float) -> tuple[str, str, int]:
-        """What tells the independent part of a drive that a frame is of."""
+        """Key of the independent part of a drive that a frame belongs to."""
         return self.run.drive.name, frame["sensor"], int(frame["seconds"] // seconds)
 
 
 @dataclass(frozen=True, slots=True)
 class Success:
-    """How often an attack succeeds in a setting.
+    """Success rate of an attack in a setting.
 
     scene    : of the drives; ``all`` for all of them
     attacked : frames that the attack changed
@@ -77,7 +77,7 @@ class Success:
 
 @dataclass(frozen=True, slots=True)
 class AttackDetection:
-    """How well a defence notices an attack in a setting.
+    """Detection rate of an attack by a defence in a setting.
 
     level    : ``frames`` or ``objects``
     genuine  : share of frames or objects without attack above the threshold
@@ -105,7 +105,7 @@ class AttackDetection:
 
 @dataclass(frozen=True, slots=True)
 class DetectorAccuracy:
-    """How well the detector finds road users without attack, from ``near`` to ``far`` metres away."""
+    """Recall and precision of the detector without attack, from ``near`` to ``far`` metres away."""
 
     setting: dict[str, str]
     scene: str
@@ -129,7 +129,7 @@ class DefenceCost:
 
 @dataclass(frozen=True, slots=True)
 class Matrix:
-    """The results."""
+    """Results of a matrix of attacks and defences."""
 
     success: list[Success]
     detection: list[AttackDetection]
@@ -421,7 +421,7 @@ def _latency(one: Figures, defence: str, *, threshold: float) -> float | None:
 def accuracies(
     frames: Sequence[tuple[Any, Mapping[str, Any]]], *, measure: Measure, known: dict[str, Any]
 ) -> Iterator[DetectorAccuracy]:
-    """How well a detector finds road users in frames without attack, each with its block.
+    """Accuracy of a detector in frames without attack, each with its block.
 
     known : fields of the rows that are not measured
     """

@@ -178,7 +178,7 @@ def is_attacked(frame: Mapping[str, Any]) -> bool:
 
 
 def _change(scans: RecordedScans, twin: RecordedScans, *, row: int) -> dict[str, Any]:
-    """What an attack did to the returns, the images and the fixes of a frame, against its twin without it."""
+    """Changes of an attack to a frame's returns, images and fixes, against the drive without it."""
     frame, other, name = scans.frame(row), twin.frame(row), scans.sensor.name
     placed = _place(_users(scans.dataset, name, frame=frame.number))
     truth, before = (
@@ -214,7 +214,7 @@ def _objects(frame: Observation, *, forged: Bools, matched: Ints) -> dict[str, A
 def _hidden(
     scans: RecordedScans, twin: RecordedScans, *, row: int, found: set[int], score: float
 ) -> dict[str, int]:
-    """How many road users an attack hides.
+    """Number of road users that an attack hides.
 
     found : numbers of the road users that the detector finds in spite of it
 

@@ -46,7 +46,7 @@ class Attack:
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """How the matrix is evaluated.
+    """Parameters of the evaluation of a matrix.
 
     detector : what reports road users, as for `lidar.tools.detection.registry.read_detector`; several are
                measured on the same drives and stand side by side

@@ -1,4 +1,4 @@
-"""Published results of attacks and defences, to stand beside measured ones.
+"""Published results of attacks and defences, for comparison with measured ones.
 
 They are of other detectors, sensors and data: bands to compare with, not values to reach.
 """

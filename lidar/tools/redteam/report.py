@@ -96,7 +96,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def words_of(setting: Mapping[str, str]) -> str:
-    """A setting in words."""
+    """Description of a setting."""
     return ", ".join(f"{name} {_value(name, text)}" for name, text in setting.items()) or "one setting"
 
 

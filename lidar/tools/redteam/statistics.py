@@ -1,4 +1,4 @@
-"""Rates with intervals."""
+"""Rates with confidence intervals."""
 
 from __future__ import annotations
 

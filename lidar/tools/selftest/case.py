@@ -1,4 +1,4 @@
-"""One extreme: what is measured, on how many samples, and the bound that must hold."""
+"""A case of the selftest: measurement, number of samples, and bound."""
 
 from __future__ import annotations
 

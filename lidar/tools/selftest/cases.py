@@ -1,4 +1,4 @@
-"""The table of extremes."""
+"""Cases of the selftest."""
 
 from __future__ import annotations
 

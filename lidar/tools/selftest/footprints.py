@@ -34,7 +34,7 @@ def house(number: int, shape: Any, **tags: str) -> Area:
 
 
 def built(areas: Sequence[Area]) -> tuple[Mesh, MeshVerdict, int]:
-    """Mesh and verdict of a map's buildings, and the number of areas of which nothing tells what became.
+    """Mesh and verdict of a map's buildings, and the number of areas without a result or a problem.
 
     Raises no error for any footprint.
     """

@@ -190,7 +190,7 @@ def write_hamlet(frame: Frame, path: Path, *, reach: float) -> None:
 
 
 def unbuilt_places(count: int) -> float:
-    """Scenes, in a local frame and in UTM, without two valid houses and a ground beside the crossing."""
+    """Number of scenes, in a local frame and in UTM, that lack a valid house or the ground."""
     lost, places = 0, list(PLACES.values())
     with tempfile.TemporaryDirectory() as folder:
         for k in range(count):

@@ -56,7 +56,7 @@ class GridDrive:
 
     @property
     def inputs(self) -> list[Path]:
-        """Files that it reads, but those within the scene."""
+        """Input files of the grid, except those within scenes."""
         options = self.options
         named: list[object] = [options.route, options.survey, options.rig, options.vehicle]
         if isinstance(options.traffic, TrafficFile):

@@ -1,1 +1,1 @@
-"""What each setting of a drive costs, and which error it causes, measured against an exact reference."""
+"""Cost and error of each setting of a drive, measured against an exact reference."""

@@ -133,7 +133,7 @@ def recommendations(comparison: SensorComparison) -> list[str]:
 
 
 def reference_text(comparison: SensorComparison) -> str:
-    """How far the reference has converged, and whether the sample is too small for errors at 99.9 %."""
+    """Convergence of the reference, with a warning if the sample is too small for errors at 99.9 %."""
     off = size_of(comparison.uncertainty, comparison.kind)
     where = "ranges at 99.9 %" if comparison.kind == "scanner" else "colours (rms)"
     text = (

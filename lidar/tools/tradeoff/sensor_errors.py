@@ -61,7 +61,7 @@ class SensorErrors:
         return ", ".join(filter(None, texts)) or "no errors are known"
 
     def beyond(self, asked: AccuracyTarget) -> list[str]:
-        """Those that are larger than what was asked for, in words."""
+        """Description of the errors that exceed a target."""
         lengths = {name: e for name, e in (self.ranges | self.depths).items() if e.value > asked.metres > 0}
         colours = {name: e for name, e in self.colours.items() if e.value > asked.levels > 0}
         return [

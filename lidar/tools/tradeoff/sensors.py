@@ -106,7 +106,7 @@ _Blocks = FrameSample[CameraSettings, Pixels, ImageError]
 
 @dataclass(frozen=True)
 class Method(Generic[S, M, E]):
-    """How the settings of a sensor are compared.
+    """Functions that compare the settings of a sensor.
 
     name       : of the sensor, with its preset or size
     reference  : what errors are measured against, in words

@@ -94,12 +94,12 @@ class SettingVariant(Generic[S]):
 
     @property
     def label(self) -> str:
-        """Names and values of what is changed; empty for the user's own settings."""
+        """Names and values of the changed settings; empty for the user's own."""
         return " ".join(f"{name}={value_text(value)}" for name, value in self.changes)
 
     @property
     def names(self) -> frozenset[str]:
-        """Names of what is changed."""
+        """Names of the changed settings."""
         return frozenset(name for name, _ in self.changes)
 
     @property
