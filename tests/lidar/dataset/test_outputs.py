@@ -672,7 +672,7 @@ def test_datasets_without_the_files_that_nuscenes_needs_are_refused(dataset, sce
         OPTIONS, rig="vlp16", duration=0.3, traffic=None, formats=("laz",), labels=(), deskew=""
     )
     drive(scene, tmp_path / "d", options=options)
-    with pytest.raises(DatasetError, match="`formats` pcd"):
+    with pytest.raises(DatasetError, match="--format pcd"):
         EXPORTERS["nuscenes"].export(open_dataset(tmp_path / "d"), tmp_path / "m")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "n"]
 
@@ -774,7 +774,7 @@ def test_kitti_exports_take_clouds_and_labels_of_kitti_as_they_are(dataset, tmp_
     labels = tmp_path / "kitti" / "sequences" / "00" / "labels" / "000007.label"
     assert labels.read_bytes() == (source / "top" / "labels" / "000007.label").read_bytes()
     shutil.rmtree(source / "top" / "velodyne")
-    with pytest.raises(DatasetError, match=r"`formats` pcd, .*kitti"):
+    with pytest.raises(DatasetError, match=r"--format pcd .*kitti"):
         EXPORTERS["kitti"].export(open_dataset(source), tmp_path / "none")
 
 
