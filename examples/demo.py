@@ -90,9 +90,9 @@ def main() -> None:
         write_png(pictures / "scene_oblique.png", scene_picture(world, view="oblique", size=(1600, 1000)))
 
         # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver in busy traffic.
-        say("driving for 35 seconds among cars, cyclists and pedestrians")
+        say("driving for 25 seconds among cars, cyclists and pedestrians")
         traffic = TrafficOptions(vehicles=30.0, cyclists=8.0, pedestrians=100.0, parked=0.9)
-        options = DriveOptions(route=ROUTE, duration=35.0, seed=3, traffic=traffic)
+        options = DriveOptions(route=ROUTE, duration=25.0, seed=3, traffic=traffic)
         summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
         say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
