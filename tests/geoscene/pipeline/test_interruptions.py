@@ -358,9 +358,13 @@ def test_task_that_kills_every_worker_ends_the_run():
 
 def test_second_build_into_the_same_directory_is_refused(tmp_path):
     process = started(tmp_path / "scene", 1)
-    done = subprocess.run(
-        build_words(tmp_path / "scene"), env=ENVIRONMENT, capture_output=True, text=True, check=False
-    )
+    process.send_signal(signal.SIGSTOP)
+    try:
+        done = subprocess.run(
+            build_words(tmp_path / "scene"), env=ENVIRONMENT, capture_output=True, text=True, check=False
+        )
+    finally:
+        process.send_signal(signal.SIGCONT)
     process.communicate(timeout=100)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "another process is writing it" in done.stderr
