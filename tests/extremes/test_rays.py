@@ -8,10 +8,9 @@ from hypothesis import strategies as st
 from geoscene.geometry.watertight import check_solids
 from lidar.errors import InputError
 from lidar.raycast import Caster
-from lidar.tools.selftest.cases import CASES
-from lidar.tools.selftest.meshes import ball, cuboid, prism_of_slivers, sheet
 from lidar.tools.selftest.rays import CASES as RAYS
-from lidar.tools.selftest.run import outcome
+from lidar.tools.selftest.rays import ball, cuboid, prism_of_slivers, sheet
+from lidar.tools.selftest.run import CASES, outcome
 
 
 @pytest.mark.parametrize("case", RAYS, ids=lambda case: case.name)

@@ -9,14 +9,13 @@ from helpers.programs import ENVIRONMENT, command
 
 from lidar.tools.selftest import run
 from lidar.tools.selftest.case import ExtremeCase
-from lidar.tools.selftest.cases import CASES, GROUPS
-from lidar.tools.selftest.regions import CASES as REGIONS
+from lidar.tools.selftest.run import CASES, GROUPS
 from lidar.tools.selftest.scale import CASES as SCALE
 
 PAGE = ROOT / "docs" / "measurements" / "extremes.md"
 
 
-@pytest.mark.parametrize("case", [*SCALE, *REGIONS], ids=lambda case: case.name)
+@pytest.mark.parametrize("case", SCALE, ids=lambda case: case.name)
 def test_scale_stays_within_the_bound(case):
     done = run.outcome(case, case.quick)
     assert done.error == ""
@@ -31,9 +30,10 @@ def broken(count):
     raise ValueError(f"no\nway in {count}")
 
 
+RAY = {"group": "rays", "bound": 1.0, "unit": "m", "of": "rays", "quick": 1, "full": 1}
 FAILING = (
-    ExtremeCase("rays", "too much", 1.0, "m", too_much, "rays", 1, 1, "nothing"),
-    ExtremeCase("rays", "an error", 1.0, "m", broken, "rays", 1, 1, "nothing"),
+    ExtremeCase("too much", too_much, "nothing", **RAY),
+    ExtremeCase("an error", broken, "nothing", **RAY),
 )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import shapely
 from shapely import affinity
 
 from geoscene.buildings import build_solids, read_buildings
+from geoscene.errors import GeosceneError
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
 from geoscene.geometry.watertight import MeshVerdict, validate_mesh
@@ -53,10 +55,10 @@ def _faults(areas: Sequence[Area]) -> float:
     return float((~verdict.ok).sum() + lost)
 
 
-def ring(count: int, *, area: float, wobble: float = 0.1) -> Any:
+def ring(count: int, *, area: float) -> Any:
     """A star-shaped polygon of ``count`` corners and an area in square metres."""
     angle = np.arange(count) / count * 2 * np.pi
-    radius = 1 + wobble * np.sin(7 * angle) if count > 20 else np.ones(count)
+    radius = 1 + 0.1 * np.sin(7 * angle) if count > 20 else np.ones(count)
     shape = shapely.Polygon(np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]))
     scale = float(np.sqrt(area / shape.area))
     return affinity.scale(shape, scale, scale, origin=(0, 0))
@@ -189,18 +191,17 @@ def _unsound(xml: str) -> float:
 
 def road_along_parallel(count: int) -> float:
     """Faults of scenes of a straight road along a parallel, whose map has no height."""
-    return sum(_unsound(_straight(lat)) for lat in np.linspace(-80, 80, count))
+    return sum(_unsound(street(5.0, lat, step=0.004)) for lat in np.linspace(-80, 80, count))
 
 
-def _straight(lat: float) -> str:
-    ends = "".join(f'<node id="{k}" lon="{5 + 0.004 * k}" lat="{lat}"/>' for k in (1, 2))
+def street(lon: float, lat: float, *, step: float) -> str:
+    """OSM elements of a street along a parallel, ``step`` degrees long."""
+    ends = "".join(f'<node id="{k}" lon="{lon + step * k}" lat="{lat}"/>' for k in (1, 2))
     return f'{ends}<way id="1"><nd ref="1"/><nd ref="2"/><tag k="highway" v="residential"/></way>'
 
 
 def lone_node(count: int) -> float:
     """Maps of nodes in one place, or of a way without length, that end otherwise than in one clear line."""
-    from geoscene.errors import GeosceneError  # noqa: PLC0415
-
     node = '<node id="1" lon="8.7" lat="49.4"><tag k="natural" v="tree"/></node>'
     twice = node + '<node id="2" lon="8.7" lat="49.4"/>'
     way = '<way id="1"><nd ref="1"/><nd ref="2"/><tag k="highway" v="residential"/></way>'
@@ -227,99 +228,60 @@ def accuracy_of_corners(count: int) -> float:
 
 
 _FAULTS = "no body passes with a fault; what cannot be built is in problems.csv"
+_GRID = "grid of 0.1 mm; corners within 2 mm of a straight wall are left out"
+
+_case = partial(ExtremeCase, group="footprints")
+_volume = partial(_case, bound=1e-3, unit="of the volume")
+_footprints = partial(_case, unit="footprints", of="footprints")
+_buildings = partial(_case, unit="buildings", of="buildings", quick=20, full=1000)
 
 CASES = (
-    ExtremeCase(
-        "footprints",
+    _volume(
         "volume of footprints of 3 to 100,000 corners",
-        1e-3,
-        "of the volume",
         many_corners,
-        "corners",
-        1000,
-        100_000,
-        "grid of 0.1 mm; corners within 2 mm of a straight wall are left out",
+        _GRID,
+        of="corners",
+        quick=1000,
+        full=100_000,
     ),
-    ExtremeCase(
-        "footprints",
-        "volume of footprints of 1 to 1e6 m²",
-        1e-3,
-        "of the volume",
-        areas,
-        "footprints",
-        7,
-        61,
-        "grid of 0.1 mm; corners within 2 mm of a straight wall are left out",
-    ),
-    ExtremeCase(
-        "footprints",
+    _volume("volume of footprints of 1 to 1e6 m²", areas, _GRID, of="footprints", quick=7, full=61),
+    _footprints(
         "corners off their place",
-        1e-4,
-        "m",
         accuracy_of_corners,
-        "footprints",
-        5,
-        1000,
         "grid of 0.1 mm",
+        bound=1e-4,
+        unit="m",
+        quick=5,
+        full=1000,
     ),
-    ExtremeCase(
-        "footprints",
+    _footprints(
         "1e-4 to 1 m², neither solid nor reported",
-        0,
-        "footprints",
         tiny_areas,
-        "footprints",
-        20,
-        1000,
         "below 0.5 m² they are dropped and reported as too small",
+        quick=20,
+        full=1000,
     ),
-    ExtremeCase(
-        "footprints",
-        "heights of 0 to 1e4 m, neither solid nor reported",
-        0,
-        "buildings",
-        heights,
-        "buildings",
-        20,
-        1000,
-        _FAULTS,
-    ),
-    ExtremeCase(
-        "footprints",
+    _buildings("heights of 0 to 1e4 m, neither solid nor reported", heights, _FAULTS),
+    _footprints(
         "spikes, bow ties, touching and nested rings, neither solid nor reported",
-        0,
-        "footprints",
         spoilt_rings,
-        "footprints",
-        40,
-        10_000,
         _FAULTS,
+        quick=40,
+        full=10_000,
     ),
-    ExtremeCase(
-        "footprints",
-        "terraced houses within ±5 cm, neither solid nor reported",
-        0,
-        "buildings",
-        touching_houses,
-        "buildings",
-        20,
-        1000,
-        _FAULTS,
+    _buildings("terraced houses within ±5 cm, neither solid nor reported", touching_houses, _FAULTS),
+    _case(
+        "nested parts of one building", nested_parts, _FAULTS, unit="faults", of="parts", quick=50, full=1000
     ),
-    ExtremeCase(
-        "footprints", "nested parts of one building", 0, "faults", nested_parts, "parts", 50, 1000, _FAULTS
-    ),
-    ExtremeCase("footprints", "roads along a parallel", 0, "faults", road_along_parallel, "maps", 1, 9, ""),
-    ExtremeCase(
-        "footprints",
+    _case("roads along a parallel", road_along_parallel, unit="faults", of="maps", quick=1, full=9),
+    _case(
         "maps of one node or a way without length",
-        0,
-        "maps",
         lone_node,
-        "maps",
-        3,
-        3,
         "refused with one line",
+        unit="maps",
+        of="maps",
+        quick=3,
+        full=3,
     ),
 )
 """Extremes of footprints, heights and roads."""

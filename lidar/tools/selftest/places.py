@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from geoscene.sources import read_osm
 from geoscene.typing import Float
 from lidar.raycast import Caster
 from lidar.tools.selftest.case import ExtremeCase
-from lidar.tools.selftest.meshes import directions, sheet
+from lidar.tools.selftest.rays import directions, sheet
 from lidar.world.world import World
 
 PLACES = {
@@ -60,43 +62,38 @@ def _points(rng: np.random.Generator, count: int, *, reach: float) -> Float:
     return rng.uniform(-reach, reach, (count, 2))
 
 
-def _round_trips(count: int, *, crs: str, reach: float) -> float:
-    worst = 0.0
+def _at_places(
+    count: int, *, seed: int, crs: str = "local"
+) -> Iterator[tuple[Frame, np.random.Generator, int]]:
+    """Frame and generator of each place, and its share of samples."""
     for k, (lon, lat) in enumerate(PLACES.values()):
-        frame = Frame.at(lon, lat, crs=crs)
-        xy = _points(np.random.default_rng([1, k]), count // len(PLACES), reach=reach)
+        yield Frame.at(lon, lat, crs=crs), np.random.default_rng([seed, k]), count // len(PLACES)
+
+
+def round_trips(count: int, *, crs: str) -> float:
+    """Largest change in metres of points within 50 km, a frame to degrees and back."""
+    worst = 0.0
+    for frame, rng, n in _at_places(count, seed=1, crs=crs):
+        xy = _points(rng, n, reach=5e4)
         back = np.column_stack(frame.from_geographic(*frame.to_geographic(*xy.T)))
         worst = max(worst, float(np.abs(back - xy).max()))
     return worst
 
 
-def local_round_trips(count: int) -> float:
-    """Largest change in metres of points within 50 km, local frame to degrees and back."""
-    return _round_trips(count, crs="local", reach=5e4)
-
-
-def utm_round_trips(count: int) -> float:
-    """Largest change in metres of points within 50 km, UTM or UPS to degrees and back."""
-    return _round_trips(count, crs="utm", reach=5e4)
-
-
 def utm_against_local(count: int) -> float:
     """Largest change in metres of points within 5 km, local frame to UTM or UPS and back."""
     worst = 0.0
-    for k, (lon, lat) in enumerate(PLACES.values()):
-        frame, utm = Frame.at(lon, lat), Frame.at(lon, lat, crs="utm")
-        xy = _points(np.random.default_rng([2, k]), count // len(PLACES), reach=5e3)
-        there = frame.to_crs(*xy.T, crs=utm.crs)
-        worst = max(worst, float(np.abs(np.column_stack(frame.from_crs(*there, crs=utm.crs)) - xy).max()))
+    for (frame, rng, n), place in zip(_at_places(count, seed=2), PLACES.values(), strict=True):
+        xy, crs = _points(rng, n, reach=5e3), Frame.at(*place, crs="utm").crs
+        there = frame.to_crs(*xy.T, crs=crs)
+        worst = max(worst, float(np.abs(np.column_stack(frame.from_crs(*there, crs=crs)) - xy).max()))
     return worst
 
 
-def _length_errors(count: int, *, crs: str, reach: float, scaled: bool) -> float:
-    """Largest error in millimetres of lengths of 1 km against geodesics, with or without the point scale."""
+def length_errors(count: int, *, crs: str, reach: float = 5e3, scaled: bool = False) -> float:
+    """Largest error in mm of lengths of 1 km against geodesics, with the point scale or taken as true."""
     worst = 0.0
-    for k, (lon, lat) in enumerate(PLACES.values()):
-        frame, rng = Frame.at(lon, lat, crs=crs), np.random.default_rng([3, k])
-        n = count // len(PLACES)
+    for frame, rng, n in _at_places(count, seed=3, crs=crs):
         start, angle = _points(rng, n, reach=reach), rng.uniform(0, 2 * np.pi, n)
         stop = start + 1000 * np.column_stack([np.cos(angle), np.sin(angle)])
         _, _, true = _EARTH.inv(*frame.to_geographic(*start.T), *frame.to_geographic(*stop.T))
@@ -105,27 +102,11 @@ def _length_errors(count: int, *, crs: str, reach: float, scaled: bool) -> float
     return worst
 
 
-def utm_lengths(count: int) -> float:
-    """Largest error in mm of 1 km in UTM or UPS, divided by its point scale, within 5 km."""
-    return _length_errors(count, crs="utm", reach=5e3, scaled=True)
-
-
-def local_lengths_of_a_town(count: int) -> float:
-    """Largest error in mm of 1 km in a local frame, taken as true, in a scene of 10 km."""
-    return _length_errors(count, crs="local", reach=5e3, scaled=False)
-
-
-def local_lengths_of_a_region(count: int) -> float:
-    """Largest error in mm of 1 km in a local frame, taken as true, in a scene of 100 km."""
-    return _length_errors(count, crs="local", reach=5e4, scaled=False)
-
-
 def lengths_on_high_ground(count: int) -> float:
     """Largest error in mm of 1 km in a local frame, taken as true, on ground at -430 and 5,000 m."""
     to_centre, worst = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True), 0.0
-    for k, (lon, lat) in enumerate(PLACES.values()):
-        frame, n = Frame.at(lon, lat), count // len(PLACES)
-        angle = np.random.default_rng([5, k]).uniform(0, 2 * np.pi, n)
+    for frame, rng, n in _at_places(count, seed=5):
+        angle = rng.uniform(0, 2 * np.pi, n)
         half = 500 * np.column_stack([np.cos(angle), np.sin(angle)])
         for z in (-430.0, 5000.0):
             here, there = (
@@ -134,11 +115,6 @@ def lengths_on_high_ground(count: int) -> float:
             )
             worst = max(worst, float(np.abs(np.linalg.norm(there - here, axis=1) - 1000).max() * 1000))
     return worst
-
-
-def utm_lengths_taken_as_true(count: int) -> float:
-    """Largest error in mm of 1 km in UTM or UPS, taken as true, within 5 km."""
-    return _length_errors(count, crs="utm", reach=5e3, scaled=False)
 
 
 def wrong_zones(count: int) -> float:
@@ -189,43 +165,38 @@ def write_hamlet(frame: Frame, path: Path, *, reach: float) -> None:
     path.write_text(f'<osm version="0.6">{"".join(nodes)}{"".join(ways)}</osm>')
 
 
+def _lost(count: int, stands: Callable[[int, Path], bool]) -> float:
+    """Number of scenes, by number and path of their files, that do not stand."""
+    with tempfile.TemporaryDirectory() as folder:
+        return float(sum(not stands(k, Path(folder) / f"{k}") for k in range(count)))
+
+
 def unbuilt_places(count: int) -> float:
     """Number of scenes, in a local frame and in UTM, that lack a valid house or the ground."""
-    lost, places = 0, list(PLACES.values())
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(count):
-            where = places[k * 4 % len(places)]
-            lost += not _stands(where, Path(folder) / f"{k}", crs=("local", "utm")[k % 2])
-    return float(lost)
-
-
-def _stands(lonlat: tuple[float, float], out: Path, *, crs: str) -> bool:
-    place = Frame.at(*lonlat)
-    write_hamlet(place, out.with_suffix(".osm"), reach=60.0)
-    options = BuildOptions(crs=crs, only=("buildings", "roads"))
-    scene = build(read_osm(out.with_suffix(".osm")), out, options=options)
-    checks = check_scene(scene)
-    x, y = scene.frame.from_geographic(*place.to_geographic(3.3, 1.7))
-    world = World.load(scene, region=(x - 1, y - 1, x + 1, y + 1), margin=1.0)
-    down = world.caster.cast([x, y, 50], np.array([[0.0, 0, -1]])).range[0]
-    return bool(checks["solids"] == 2 and not checks["broken"] and abs(down - 50) < 1)
+    places = list(PLACES.values())
+    return _lost(
+        count,
+        lambda k, out: _stands(Frame.at(*places[k * 4 % len(places)]), out, crs=("local", "utm")[k % 2]),
+    )
 
 
 def unbuilt_heights(count: int) -> float:
     """Scenes on elevation models at -430 and 5,000 m that are not whole, or do not tell errors of lengths."""
-    lost = 0
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(count):
-            height = (5000.0, -430.0)[k % 2]
-            lost += not _stands_at(height, Path(folder) / f"{k}", crs=("local", "utm")[k // 2 % 2])
-    return float(lost)
-
-
-def _stands_at(height: float, out: Path, *, crs: str) -> bool:
     place = Frame.at(-67.0, -18.1)
+
+    def stands(k: int, out: Path) -> bool:
+        return _stands(place, out, crs=("local", "utm")[k // 2 % 2], height=(5000.0, -430.0)[k % 2])
+
+    return _lost(count, stands)
+
+
+def _stands(place: Frame, out: Path, *, crs: str, height: float = 0.0) -> bool:
+    """Whether a hamlet is whole, on an elevation model if it is not at 0 m, and tells errors of lengths."""
     write_hamlet(place, out.with_suffix(".osm"), reach=60.0)
-    write_elevation(place, out.with_suffix(".tif"), height=height)
-    options = BuildOptions(crs=crs, only=("buildings", "roads"), dem=(str(out.with_suffix(".tif")),))
+    dem = (str(out.with_suffix(".tif")),) if height else ()
+    if height:
+        write_elevation(place, out.with_suffix(".tif"), height=height)
+    options = BuildOptions(crs=crs, only=("buildings", "roads"), dem=dem)
     scene = build(read_osm(out.with_suffix(".osm")), out, options=options)
     checks = check_scene(scene)
     x, y = scene.frame.from_geographic(*place.to_geographic(3.3, 1.7))
@@ -238,162 +209,107 @@ def _stands_at(height: float, out: Path, *, crs: str) -> bool:
 
 def write_elevation(frame: Frame, path: Path, *, height: float) -> None:
     """Write a raster of 1 km around a frame's origin: a slope of 1 in 1,000 through ``height`` there."""
+    lon, lat = (float(v) for v in frame.to_geographic(0.0, 0.0))
+    heights = height + (np.arange(101) - 50) * 0.01 * np.ones((101, 1))
+    write_raster(path, heights, lonlat=(lon, lat), step=1e-4)
+
+
+def write_raster(path: Path, heights: Float, *, lonlat: tuple[float, float], step: float) -> None:
+    """Write heights (rows, columns) as a raster about a place; ``step`` is in degrees."""
     import rasterio  # noqa: PLC0415 - slow to import
 
-    lon, lat = (float(v) for v in frame.to_geographic(0.0, 0.0))
-    side, step = 101, 1e-4
-    heights = height + (np.arange(side) - side // 2) * 0.01 * np.ones((side, 1))
-    corner = rasterio.Affine(step, 0.0, lon - side / 2 * step, 0.0, -step, lat + side / 2 * step)
-    shape = {"width": side, "height": side, "count": 1, "dtype": "float32"}
+    (rows, columns), (lon, lat) = heights.shape, lonlat
+    corner = rasterio.Affine(step, 0.0, lon - columns / 2 * step, 0.0, -step, lat + rows / 2 * step)
+    shape = {"width": columns, "height": rows, "count": 1, "dtype": "float32"}
     with rasterio.open(path, "w", driver="GTiff", crs="EPSG:4326", transform=corner, **shape) as raster:
         raster.write(heights.astype(np.float32), 1)
 
 
 def small_scenes(count: int) -> float:
     """Scenes of 10 m that are not built whole."""
-    lost, places = 0, list(PLACES.values())
-    with tempfile.TemporaryDirectory() as folder:
-        for k in range(count):
-            path = Path(folder) / f"{k}.osm"
-            write_hamlet(Frame.at(*places[k * 5 % len(places)]), path, reach=5.0)
-            scene = build(read_osm(path), path.with_suffix(""), options=BuildOptions(only=("roads",)))
-            lost += bool(check_scene(scene)["broken_surfaces"]) or not scene.tile_indices
-    return float(lost)
+    places = list(PLACES.values())
 
+    def stands(k: int, out: Path) -> bool:
+        path = out.with_suffix(".osm")
+        write_hamlet(Frame.at(*places[k * 5 % len(places)]), path, reach=5.0)
+        scene = build(read_osm(path), out, options=BuildOptions(only=("roads",)))
+        return bool(scene.tile_indices) and not check_scene(scene)["broken_surfaces"]
+
+    return _lost(count, stands)
+
+
+_PROJ = "PROJ's series and iterations"
+_LOCAL = "scale is 1 at the centre and grows as x² / 2R²"
+
+_place = partial(ExtremeCase, group="places")
+_trip = partial(_place, bound=1e-6, unit="m", of="points", quick=17_000, full=1_700_000)
+_length = partial(_place, unit="mm", of="lines", quick=17_000, full=1_700_000)
+_scene = partial(_place, unit="scenes", of="scenes")
 
 CASES = (
-    ExtremeCase(
-        "places",
-        "round trip, local frame to degrees, 100 km wide, 17 places",
-        1e-6,
-        "m",
-        local_round_trips,
-        "points",
-        17_000,
-        1_700_000,
-        "PROJ's series and iterations",
+    _trip(
+        "round trip, local frame to degrees, 100 km wide, 17 places", partial(round_trips, crs="local"), _PROJ
     ),
-    ExtremeCase(
-        "places",
-        "round trip, UTM or UPS to degrees, 100 km wide, 17 places",
-        1e-6,
-        "m",
-        utm_round_trips,
-        "points",
-        17_000,
-        1_700_000,
-        "PROJ's series and iterations",
+    _trip(
+        "round trip, UTM or UPS to degrees, 100 km wide, 17 places", partial(round_trips, crs="utm"), _PROJ
     ),
-    ExtremeCase(
-        "places",
-        "round trip, local frame to UTM or UPS, 10 km wide, 17 places",
-        1e-6,
-        "m",
-        utm_against_local,
-        "points",
-        17_000,
-        1_700_000,
-        "PROJ's series and iterations",
-    ),
-    ExtremeCase(
-        "places",
+    _trip("round trip, local frame to UTM or UPS, 10 km wide, 17 places", utm_against_local, _PROJ),
+    _length(
         "1 km in UTM or UPS by its point scale",
-        0.1,
-        "mm",
-        utm_lengths,
-        "lines",
-        17_000,
-        1_700_000,
+        partial(length_errors, crs="utm", scaled=True),
         "the scale of the line's middle stands for the line",
+        bound=0.1,
     ),
-    ExtremeCase(
-        "places",
+    _length(
         "1 km in UTM or UPS, taken as true",
-        6100.0,
-        "mm",
-        utm_lengths_taken_as_true,
-        "lines",
-        17_000,
-        1_700_000,
+        partial(length_errors, crs="utm"),
         "scale is 0.9996 amid a UTM zone, 0.994 at a pole; told by `geoscene build`, corrected in drives",
+        bound=6100.0,
     ),
-    ExtremeCase(
-        "places",
-        "1 km in a local frame, scene of 10 km",
-        1.0,
-        "mm",
-        local_lengths_of_a_town,
-        "lines",
-        17_000,
-        1_700_000,
-        "scale is 1 at the centre and grows as x² / 2R²",
-    ),
-    ExtremeCase(
-        "places",
+    _length("1 km in a local frame, scene of 10 km", partial(length_errors, crs="local"), _LOCAL, bound=1.0),
+    _length(
         "1 km in a local frame, scene of 100 km",
-        40.0,
-        "mm",
-        local_lengths_of_a_region,
-        "lines",
-        17_000,
-        1_700_000,
-        "scale is 1 at the centre and grows as x² / 2R²",
+        partial(length_errors, crs="local", reach=5e4),
+        _LOCAL,
+        bound=40.0,
     ),
-    ExtremeCase(
-        "places",
+    _length(
         "1 km in a local frame, ground at -430 and 5,000 m",
-        800.0,
-        "mm",
         lengths_on_high_ground,
-        "lines",
-        17_000,
-        1_700_000,
         "lengths are those on the ellipsoid: z / R, 785 mm per km at 5,000 m; told by builds and drives",
+        bound=800.0,
     ),
-    ExtremeCase(
-        "places",
+    _place(
         "UTM and UPS zones at their edges, wrong",
-        0,
-        "points",
         wrong_zones,
-        "points",
-        len(_ZONES),
-        len(_ZONES),
         "exceptions of Norway and Svalbard included",
+        unit="points",
+        of="points",
+        quick=len(_ZONES),
+        full=len(_ZONES),
     ),
-    ExtremeCase(
-        "places",
+    _place(
         "range to ground at -430, 0 and 5,000 m",
-        1e-10,
-        "m",
         heights,
-        "rays",
-        30_000,
-        3 * 10**6,
         "float64 plane of the face",
+        bound=1e-10,
+        unit="m",
+        of="rays",
+        quick=30_000,
+        full=3 * 10**6,
     ),
-    ExtremeCase(
-        "places",
+    _scene(
         "scenes built at 17 places, local and UTM or UPS, not whole",
-        0,
-        "scenes",
         unbuilt_places,
-        "scenes",
-        4,
-        2 * len(PLACES),
-        "",
+        quick=4,
+        full=2 * len(PLACES),
     ),
-    ExtremeCase(
-        "places",
+    _scene(
         "scenes on elevation models at -430 and 5,000 m, not whole or error of lengths not told",
-        0,
-        "scenes",
         unbuilt_heights,
-        "scenes",
-        1,
-        4,
-        "",
+        quick=1,
+        full=4,
     ),
-    ExtremeCase("places", "scenes of 10 m, not whole", 0, "scenes", small_scenes, "scenes", 1, 5, ""),
+    _scene("scenes of 10 m, not whole", small_scenes, quick=1, full=5),
 )
 """Extremes of places."""

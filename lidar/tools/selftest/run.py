@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,21 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import unknown_name
 from lidar.errors import BackendError, InputError
 from lidar.raycast.library import library
+from lidar.tools.selftest import footprints, places, rays, scale, statistics, times
 from lidar.tools.selftest.case import ExtremeCase
-from lidar.tools.selftest.cases import CASES, GROUPS
+
+CASES: tuple[ExtremeCase, ...] = (
+    *rays.CASES,
+    *places.CASES,
+    *footprints.CASES,
+    *times.CASES,
+    *statistics.CASES,
+    *scale.CASES,
+)
+"""All cases, by group."""
+
+GROUPS = tuple(dict.fromkeys(case.group for case in CASES))
+"""Names of the groups of cases."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,18 +147,15 @@ def markdown(done: Sequence[Outcome]) -> str:
 
 def document(done: Sequence[Outcome]) -> dict[str, Any]:
     """The outcomes and the machine as JSON."""
-    rows = []
-    for one in done:
-        case = asdict(one.case)
-        del case["measure"], case["quick"], case["full"]
-        rows.append(
-            case
-            | {
-                "samples": one.count,
-                "measured": None if np.isnan(one.measured) else one.measured,
-                "ok": one.ok,
-                "error": one.error,
-                "seconds": round(one.seconds, 3),
-            }
-        )
+    rows = [
+        {name: getattr(one.case, name) for name in ("group", "name", "bound", "unit", "of", "limit")}
+        | {
+            "samples": one.count,
+            "measured": None if np.isnan(one.measured) else one.measured,
+            "ok": one.ok,
+            "error": one.error,
+            "seconds": round(one.seconds, 3),
+        }
+        for one in done
+    ]
     return {"machine": machine(), "cases": rows}

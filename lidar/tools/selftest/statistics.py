@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -19,8 +20,7 @@ from lidar.sensors.physics.range_error import signal_sigma, stretch_sigma
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.sensors.rig.specs import ImuSpec
-from lidar.tools.selftest.case import ExtremeCase
-from lidar.tools.selftest.meshes import BATCH, batches
+from lidar.tools.selftest.case import BATCH, ExtremeCase, batches
 
 SIGMAS = 5.0
 """Bound of a statistic's deviation from its expectation: exceeded by chance once in 1.7 million."""
@@ -64,8 +64,11 @@ def _correlation(pairs: Iterable[tuple[Float, Float]]) -> float:
     return abs(total) / float(np.sqrt(count))
 
 
-def _streams(count: int, first: tuple[object, ...], *, second: tuple[object, ...]) -> float:
-    """Correlation of two generators whose words differ, also one deviate apart."""
+_RANGES = "top", 0, "range noise"
+
+
+def between_streams(count: int, *, first: tuple[object, ...] = _RANGES, second: tuple[object, ...]) -> float:
+    """Correlation of two streams whose words differ, also one deviate apart."""
 
     def pairs(lag: int) -> Iterable[tuple[Float, Float]]:
         one, two = generator(0, *first), generator(0, *second)
@@ -74,21 +77,6 @@ def _streams(count: int, first: tuple[object, ...], *, second: tuple[object, ...
             yield a[lag:], b[: len(b) - lag]
 
     return max(_correlation(pairs(lag)) for lag in (0, 1))
-
-
-def between_sensors(count: int) -> float:
-    """Correlation of two sensors' streams."""
-    return _streams(count, ("left", 0, "range noise"), second=("right", 0, "range noise"))
-
-
-def between_frames(count: int) -> float:
-    """Correlation of successive frames' streams."""
-    return _streams(count, ("top", 0, "range noise"), second=("top", 1, "range noise"))
-
-
-def between_purposes(count: int) -> float:
-    """Correlation of a frame's streams of two purposes."""
-    return _streams(count, ("top", 0, "range noise"), second=("top", 0, "detection"))
 
 
 def between_many_frames(count: int) -> float:
@@ -154,7 +142,7 @@ def _deviates(*words: object) -> Deviates:
     return lambda _, echoes: rng.standard_normal(len(echoes))
 
 
-def _noisy_ranges(count: int, *, settings: ScannerSettings, sigma: float, cosine: float = 1.0) -> float:
+def noisy_ranges(count: int, *, settings: ScannerSettings, sigma: float, cosine: float = 1.0) -> float:
     """Moments of measured minus true ranges over their expected deviation."""
     pulses = firings(_SENSOR, 0)
 
@@ -173,22 +161,17 @@ def _noisy_ranges(count: int, *, settings: ScannerSettings, sigma: float, cosine
     return _moments(samples())
 
 
-def constant_range_noise(count: int) -> float:
-    """Moments of the range noise of a data sheet."""
-    return _noisy_ranges(count, settings=ScannerSettings(range_noise="constant"), sigma=_SENSOR.range_sigma)
-
-
 def signal_range_noise(count: int) -> float:
     """Moments of the range noise that depends on the received power."""
     power = float(receive(_SENSOR, _echoes(1, apparent=_APPARENT))[0])
     sigma = float(np.hypot(_SENSOR.range_sigma, signal_sigma(max(power, 1.0), _SENSOR.weak_sigma)))
-    return _noisy_ranges(count, settings=ScannerSettings(range_noise="signal"), sigma=sigma)
+    return noisy_ranges(count, settings=ScannerSettings(range_noise="signal"), sigma=sigma)
 
 
 def slant_range_noise(count: int) -> float:
     """Moments of the range noise of pulses on a surface at 60 degrees."""
     sigma = float(stretch_sigma(_AWAY, 0.5, divergence=_SENSOR.divergence[1]))
-    return _noisy_ranges(count, settings=ScannerSettings(stretch=True), sigma=sigma, cosine=0.5)
+    return noisy_ranges(count, settings=ScannerSettings(stretch=True), sigma=sigma, cosine=0.5)
 
 
 def detection_rate(count: int) -> float:
@@ -236,33 +219,34 @@ def gnss_processes(count: int) -> float:
 
 _LIMIT = "5 standard errors: one statistic exceeds them by chance once in 1.7 million"
 
-
-def _row(name: str, measure: Callable[[int], float], *, full: int = 10**8) -> ExtremeCase:
-    return ExtremeCase("statistics", name, SIGMAS, "σ", measure, "samples", 100_000, full, _LIMIT)
-
+_case = partial(ExtremeCase, group="statistics", of="samples", quick=100_000)
+_row = partial(_case, limit=_LIMIT, bound=SIGMAS, unit="σ", full=10**8)
+_CONSTANT = ScannerSettings(range_noise="constant")
 
 CASES = (
     _row("normal deviates by number: moments 1 to 4", counter_normals),
     _row("uniform deviates by number: 1,000 bins", counter_uniforms),
     _row("normal deviates of frames: moments 1 to 4", stream_normals),
-    _row("correlation between sensors", between_sensors),
-    _row("correlation between frames", between_frames),
-    _row("correlation between purposes", between_purposes),
+    _row(
+        "correlation between sensors",
+        partial(between_streams, first=("left", *_RANGES[1:]), second=("right", *_RANGES[1:])),
+    ),
+    _row("correlation between frames", partial(between_streams, second=("top", 1, "range noise"))),
+    _row("correlation between purposes", partial(between_streams, second=("top", 0, "detection"))),
     _row("largest of the correlations between 100 frames", between_many_frames),
     _row("correlation between seeds", between_seeds),
     _row("correlation between successive numbers", between_numbers),
-    ExtremeCase(
-        "statistics",
+    _case(
         "deviates that depend on the order of frames, as of workers",
-        0,
-        "deviates",
         between_workers,
-        "samples",
-        100_000,
-        10**7,
         "each frame has a generator of its own",
+        unit="deviates",
+        full=10**7,
     ),
-    _row("range noise, constant: moments 1 to 4", constant_range_noise),
+    _row(
+        "range noise, constant: moments 1 to 4",
+        partial(noisy_ranges, settings=_CONSTANT, sigma=_SENSOR.range_sigma),
+    ),
     _row("range noise by signal: moments 1 to 4", signal_range_noise),
     _row("range noise on a slant: moments 1 to 4", slant_range_noise),
     _row("share of detected echoes near the threshold", detection_rate),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta
 from fractions import Fraction
+from functools import partial
 
 import numpy as np
 
@@ -15,22 +16,7 @@ from lidar.sensors.rig.specs import GnssSpec
 from lidar.tools.selftest.case import ExtremeCase
 
 _DAY = 86_400
-_RATES = (
-    "0.1",
-    "0.3",
-    "1",
-    "3",
-    "7",
-    "9.97",
-    "10",
-    "12.5",
-    "19.98",
-    "23.976",
-    "29.97",
-    "59.94",
-    "70",
-    "99.9",
-)
+_RATES = (0.1, 0.3, 1.0, 3.0, 7.0, 9.97, 10.0, 12.5, 19.98, 23.976, 29.97, 59.94, 70.0, 99.9)
 _MOUNT = Mount((0.0, 0.0, 1.5), (0.0, 0.0, 0.0, 1.0))
 
 
@@ -38,9 +24,9 @@ def frame_starts(count: int) -> float:
     """Largest error in nanoseconds of the starts of a day's frames."""
     worst, rng = Fraction(0), np.random.default_rng(1)
     for rate in _RATES:
-        exact = Fraction(rate)
+        exact = Fraction(str(rate))
         for frame in rng.integers(0, int(_DAY * exact) + 1, count // len(_RATES)).tolist():
-            start, _ = frame_window_ns(frame, float(rate), start_ns=0)
+            start, _ = frame_window_ns(frame, rate, start_ns=0)
             worst = max(worst, abs(frame * 10**9 / exact - start))
     return float(worst)
 
@@ -49,9 +35,9 @@ def epoch_times(count: int) -> float:
     """Largest error in nanoseconds of the epochs of a day of receivers."""
     worst = Fraction(0)
     for rate in _RATES:
-        at = epochs(GnssSpec("gnss", _MOUNT, rate_hz=float(rate)), _DAY * 10**9)
+        at = epochs(GnssSpec("gnss", _MOUNT, rate_hz=rate), _DAY * 10**9)
         for row in np.linspace(0, len(at) - 1, count // len(_RATES)).astype(int).tolist():
-            worst = max(worst, abs(row * 10**9 / Fraction(rate) - int(at[row])))
+            worst = max(worst, abs(row * 10**9 / Fraction(str(rate)) - int(at[row])))
     return float(worst)
 
 
@@ -74,42 +60,30 @@ def lost_leap_seconds(count: int) -> float:
 
 _FLOOR = "times are whole nanoseconds"
 
+_case = partial(ExtremeCase, group="time")
+_day = partial(_case, bound=1, unit="ns", quick=1300, full=130_000)
+
 CASES = (
-    ExtremeCase(
-        "time",
-        "starts of the frames of 24 h",
-        1,
-        "ns",
-        frame_starts,
-        "frames",
-        1300,
-        130_000,
-        _FLOOR,
-    ),
-    ExtremeCase(
-        "time", "epochs of a receiver in 24 h", 1, "ns", epoch_times, "epochs", 1300, 130_000, _FLOOR
-    ),
-    ExtremeCase(
-        "time",
+    _day("starts of the frames of 24 h", frame_starts, _FLOOR, of="frames"),
+    _day("epochs of a receiver in 24 h", epoch_times, _FLOOR, of="epochs"),
+    _case(
         "GPS time from 1980 to 2100",
-        0.5,
-        "µs",
         gps_times,
-        "moments",
-        2000,
-        100_000,
         "doubles of LAS, less 1e9 s",
+        bound=0.5,
+        unit="µs",
+        of="moments",
+        quick=2000,
+        full=100_000,
     ),
-    ExtremeCase(
-        "time",
+    _case(
         "leap seconds that GPS time does not count",
-        0,
-        "leap seconds",
         lost_leap_seconds,
-        "leap seconds",
-        len(LEAPS),
-        len(LEAPS),
         "drives across one are refused",
+        unit="leap seconds",
+        of="leap seconds",
+        quick=len(LEAPS),
+        full=len(LEAPS),
     ),
 )
 """Extremes of time."""
