@@ -38,7 +38,7 @@ from lidar.signal.registry import read_stages
 from lidar.signal.weather.read import read_weather
 from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.detection.forest import read_forest
-from lidar.tools.integrity.digest_files import read_digests, read_links
+from lidar.tools.integrity.digests import read_digests, read_links
 from lidar.tools.integrity.keys import read_signer
 from lidar.tools.maps.selection import _polygons
 from lidar.tools.redteam.plan import read_plan

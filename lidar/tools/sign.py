@@ -8,38 +8,26 @@ from pathlib import Path
 
 import numpy as np
 
-from geoscene.support.digests import file_sha256
-from geoscene.support.files import delete_leftovers, exclusive, json_bytes, write_atomically, write_json
+from geoscene.support.files import delete_leftovers, exclusive, write_atomically, write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset
-from lidar.dataset.formats import FORMATS, Format, format_of
+from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset
 from lidar.dataset.provenance import derived_from
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.signable import signed_files
-from lidar.errors import DatasetError, FormatError, InputError, LidarError
+from lidar.errors import DatasetError, InputError
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
 from lidar.simulation.record_clouds import write_clouds
 from lidar.simulation.recording import Recording
-from lidar.tools.integrity.digest_files import FrameDigests, Link, frame_file, links_bytes
+from lidar.tools.integrity.chain import write_chain
 from lidar.tools.integrity.keys import Signer
-from lidar.tools.integrity.merkle import (
-    START,
-    BlockDigests,
-    block_digests,
-    link,
-    signed_message,
-)
 from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey
 from lidar.tools.rerecord import recording_again
-
-SCHEMA = 1
-"""Version of the files in the folder ``integrity``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,38 +80,38 @@ def sign_dataset(
     if dataset.manifest["frames_done"] != dataset.frames:
         raise DatasetError(f"{source}: the drive was not finished; finish it first")
     if out is None:
-        if watermark is not None:
+        if watermark is not None or signer is None:
             raise InputError("`watermark` changes clouds; give a directory to write to with `out`")
         chain = Paths(source).chain
         if chain.exists() and not overwrite:
             raise DatasetError(f"{source}: is signed already; set `overwrite` to sign it again")
         with exclusive(source.resolve()):
             delete_leftovers(source)
-            summary, data = _chain(dataset, signer, summary=SignSummary(source), progress=progress)
+            frames, files, data = write_chain(dataset, signer, progress=progress)
             known = {chain.relative_to(source).as_posix(): hashlib.sha256(data).digest()}
             add_to_checksums(source, below=Paths(source).integrity.name, known=known)
             write_atomically(chain, data)  # last: it marks signed data
-        return summary
+        return SignSummary(source, frames=frames, files=files)
     out = Path(out)
     check_target(out, source=source, overwrite=overwrite)
     with complete_folder(out) as part:
-        summary = SignSummary(part)
+        summary = SignSummary(out)
         if watermark is None:
             copy_dataset(source, part, leave_out={Paths(part).integrity})
         else:
-            summary = _mark(dataset, summary, watermark=watermark, progress=progress)
-        summary, data = _chain(open_dataset(part), signer, summary=summary, progress=progress)
-        if data:
+            marked, rms = _mark(dataset, part, watermark=watermark, progress=progress)
+            summary = replace(summary, marked=marked, rms=rms)
+        if signer is not None:
+            frames, files, data = write_chain(open_dataset(part), signer, progress=progress)
+            summary = replace(summary, frames=frames, files=files)
             write_atomically(Paths(part).chain, data)
         write_checksums(part)
-    return replace(summary, path=out)
+    return summary
 
 
-def _mark(
-    dataset: Dataset, summary: SignSummary, *, watermark: WatermarkKey, progress: Progress
-) -> SignSummary:
-    """Copy a dataset with a watermark in its clouds, in all their formats."""
-    recipe, out = dataset.manifest["recipe"], summary.path
+def _mark(dataset: Dataset, out: Path, *, watermark: WatermarkKey, progress: Progress) -> tuple[int, float]:
+    """Copy a dataset with a watermark in its clouds, in all formats; their number, and metres moved (rms)."""
+    recipe = dataset.manifest["recipe"]
     if "watermark" in recipe:
         raise DatasetError(f"{dataset.path}: has a watermark already; sign the original")
     recording = recording_again(dataset, out)
@@ -141,7 +129,12 @@ def _mark(
         for scanner in scanners(rig_of(recipe["rig"]))
         for frame in range(len(dataset.sample_times(scanner.name)))
     ]
-    clouds = {path for job in jobs for name, path in recording.paths(*job).items() if not _kept(name)}
+    clouds = {
+        path
+        for job in jobs
+        for name, path in recording.paths(*job).items()
+        if name not in ("boxes", "truth") and not name.startswith("labels ")  # these stay as they are
+    }
     leave_out = clouds | {Paths(out).manifest, Paths(out).journal, Paths(out).integrity}
     copy_dataset(dataset.path, out, leave_out=leave_out)
     squares = points = 0.0
@@ -153,12 +146,7 @@ def _mark(
     recipe = recipe | {"watermark": watermark.step}
     parents = derived_from(dataset.path, dataset.manifest, by="sign")
     write_json(Paths(out).manifest, dataset.manifest | {"recipe": recipe} | parents)
-    return replace(summary, marked=len(jobs), rms=float(np.sqrt(squares / max(points, 1))))
-
-
-def _kept(name: str) -> bool:
-    """Whether files of a frame, named as by `Recording.paths`, stay as they are with a watermark."""
-    return name in ("boxes", "truth") or name.startswith("labels ")
+    return len(jobs), float(np.sqrt(squares / max(points, 1)))
 
 
 def _mark_frame(
@@ -183,71 +171,3 @@ def _mark_frame(
     cloud = replace(cloud, xyz=xyz, range=cloud.range + longer)
     write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=table.get("velocity"))
     return moved
-
-
-def blocks_in(path: Path, *, rate_hz: float) -> BlockDigests | None:
-    """Digests of the blocks of a cloud; None for another file, or one that cannot be read."""
-    try:
-        table = format_of(path).read(path)
-    except (LidarError, OSError, ValueError):
-        return None
-    return block_digests(table, rate_hz=rate_hz)
-
-
-def frame_rate(dataset: Dataset, sensor: str) -> float:
-    """Frames of a sensor a second, by which clouds in the world frame are cut; 0 if unknown."""
-    return float(dataset.sensors().get(sensor, {}).get("rate_hz", 0.0))
-
-
-def frame_digests(folder: Path, names: list[str], *, rate_hz: float) -> FrameDigests:
-    """Digests of the files of a frame."""
-    sha256 = {name: file_sha256(folder / name) for name in names}
-    found = {name: _cloud_blocks(folder / name, rate_hz=rate_hz) for name in names}
-    return FrameDigests(sha256, {name: blocks for name, blocks in found.items() if blocks is not None})
-
-
-def _cloud_blocks(path: Path, *, rate_hz: float) -> BlockDigests | None:
-    try:
-        format_of(path)
-    except (FormatError, InputError):
-        return None
-    if path.parent.name in ("boxes", "signals"):
-        return None
-    return blocks_in(path, rate_hz=rate_hz)
-
-
-def _chain(
-    dataset: Dataset, signer: Signer | None, *, summary: SignSummary, progress: Progress
-) -> tuple[SignSummary, bytes]:
-    """Write the hash chain over the files of a dataset; the bytes of the signature, empty without a key."""
-    if signer is None:
-        return summary, b""
-    signer.sign(b"")  # a key that cannot sign is refused before anything is written
-    files, folder = signed_files(dataset), Paths(dataset.path).integrity
-    folder.mkdir(exist_ok=True)
-    Paths(dataset.path).chain.unlink(missing_ok=True)
-    heads: dict[str, tuple[int, bytes]] = {}
-    total, done = sum(map(len, files.frames.values())), 0
-    for sensor, frames in files.frames.items():
-        rate_hz, head, links = frame_rate(dataset, sensor), START, list[Link]()
-        times = dataset.sample_times(sensor).tolist()
-        for frame in sorted(frames):
-            progress("sign", done, total=total)
-            time_ns = times[frame] if frame < len(times) else -1
-            digests = frame_digests(dataset.path, frames[frame], rate_hz=rate_hz)
-            write_atomically(frame_file(folder, sensor, frame=frame), digests.to_bytes())
-            head = link(head, sensor=sensor, frame=frame, time_ns=time_ns, root=digests.root)
-            links.append(Link(frame, time_ns, digests.root, head))
-            done += 1
-        write_atomically(folder / f"{sensor}.csv", links_bytes(links))
-        heads[sensor] = len(links), head
-    tables = {name: file_sha256(dataset.path / name) for name in files.others}
-    document = {
-        "schema": SCHEMA,
-        "algorithm": signer.algorithm,
-        "sensors": {name: {"frames": frames, "head": head.hex()} for name, (frames, head) in heads.items()},
-        "files": {name: sha256.hex() for name, sha256 in tables.items()},
-        "signature": signer.sign(signed_message(heads, tables)).hex(),
-    }
-    progress("sign", total, total=total)
-    return replace(summary, frames=total, files=files.count), json_bytes(document)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,58 +9,17 @@ from typing import Any
 import numpy as np
 
 from geoscene.scene.layout import SceneFiles
-from geoscene.support.digests import digest, file_sha256
+from geoscene.support.digests import digest
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
-from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, differences, read_checksums
-from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
-from lidar.dataset.signable import is_truth, signed_files
+from lidar.dataset.layout import Dataset, Paths, open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
-from lidar.tools.integrity.blocks import SECTORS
-from lidar.tools.integrity.digest_files import FrameDigests, Link, frame_file, read_digests, read_links
+from lidar.tools.integrity.chain import ChainReport, Finding, block_text, verify_chain
 from lidar.tools.integrity.keys import Signer
-from lidar.tools.integrity.marked_clouds import MarkedCloud, cloud_files
-from lidar.tools.integrity.merkle import START, link, signed_message
+from lidar.tools.integrity.marked_clouds import cloud_files
 from lidar.tools.integrity.tampering import NOISE, FrameVerdict, Place, frame_verdict
 from lidar.tools.integrity.watermark import SPREAD, WatermarkKey
-from lidar.tools.sign import SCHEMA, blocks_in, frame_rate
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that is not as it was signed.
-
-    what   : happened, such as ``changed``, ``missing``, ``added``
-    place  : path of the file, or name of the sensor
-    detail : more about it, one line
-    blocks : (k,) of a cloud that differ: ring times 36 plus sector
-    sensor, frame : of the file; empty and None for one of no frame
-    """
-
-    what: str
-    place: str
-    detail: str = ""
-    blocks: tuple[int, ...] = ()
-    sensor: str = ""
-    frame: int | None = None
-
-    def to_text(self) -> str:
-        """One line."""
-        return f"{self.place}: {self.what}" + (f" ({self.detail})" if self.detail else "")
-
-
-@dataclass(frozen=True)
-class ChainReport:
-    """Comparison with the signed hash chain.
-
-    frames, files : that were compared
-    """
-
-    algorithm: str
-    frames: int
-    files: int
-    findings: tuple[Finding, ...]
 
 
 @dataclass(frozen=True)
@@ -227,7 +183,7 @@ def verify_dataset(
         raise InputError(f"`noise` {noise:g}: give 0 to 1 metre")
     if not 0 < false_alarms <= 100:
         raise InputError(f"`false_alarms` {false_alarms:g}: give more than 0 and at most 100 blocks a cloud")
-    chain = None if signer is None else _chain_report(dataset, signer, progress=progress)
+    chain = None if signer is None else verify_chain(dataset, signer, progress=progress)
     marks = None
     if watermark is not None:
         marks = _watermark_report(
@@ -275,21 +231,6 @@ def _check_lost(folder: Path, name: str) -> None:
         )
 
 
-def block_text(blocks: Ints, *, world: bool, most: int = 4) -> str:
-    """Rings and directions of blocks in words.
-
-    world : of a cloud in the world frame, whose sectors are parts of a turn in time
-    """
-    ring, sector = np.divmod(blocks, SECTORS)
-    step = 360 // SECTORS
-    words = []
-    for r, s in zip(ring.tolist(), sector.tolist(), strict=True):
-        turn = f"part {s + 1} of {SECTORS}" if world else f"{s * step - 180} to {(s + 1) * step - 180} deg"
-        words.append(f"ring {r} {turn}")
-    more = f" and {len(words) - most} more" if len(words) > most else ""
-    return "; ".join(words[:most]) + more
-
-
 def _watermark_report(
     dataset: Dataset, watermark: WatermarkKey, *, noise: float, false_alarms: float, progress: Progress
 ) -> WatermarkReport:
@@ -308,184 +249,15 @@ def _watermark_report(
             detail = "" if what == "missing" else str(error).removeprefix(f"{file.path}: ")
             found.findings.append(Finding(what, file.place, detail, **where))
             continue
-        _check_coarseness(cloud, watermark)
+        if cloud.step >= (least := (1 - SPREAD) * watermark.step / 2):  # no bit can be read
+            raise InputError(
+                f"{file.place}: coordinates are multiples of {cloud.step:g} m; a watermark with a step of"
+                f" {watermark.step:g} m needs less than {least:g} m"
+            )
         found.add(verdict)
         if len(verdict.blocks.tampered):
-            blocks = tuple(verdict.blocks.tampered.tolist())
-            forged = int(verdict.forged.sum())
-            found.frames.append(
-                MarkedFrame(
-                    file.place,
-                    **where,
-                    blocks=blocks,
-                    forged=forged,
-                    places=verdict.places,
-                    absent=verdict.absent,
-                )
-            )
+            blocks, forged = tuple(verdict.blocks.tampered.tolist()), int(verdict.forged.sum())
+            marks = file.place, file.sensor, file.frame, blocks, forged, verdict.places, verdict.absent
+            found.frames.append(MarkedFrame(*marks))
     progress("watermark", len(jobs), total=len(jobs))
     return found
-
-
-def _check_coarseness(cloud: MarkedCloud, watermark: WatermarkKey) -> None:
-    """Raise InputError for coordinates that are rounded so much that no bit can be read."""
-    least = (1 - SPREAD) * watermark.step / 2
-    if cloud.step >= least:
-        raise InputError(
-            f"{cloud.place}: coordinates are multiples of {cloud.step:g} m; a watermark with a step of"
-            f" {watermark.step:g} m needs less than {least:g} m"
-        )
-
-
-def _chain_report(dataset: Dataset, signer: Signer, *, progress: Progress) -> ChainReport:
-    path = Paths(dataset.path).chain
-    if not path.is_file():
-        raise DatasetError(f"{dataset.path}: is not signed; lidar sign --chain signs it")
-    with reading_file(path):
-        text = path.read_text("utf-8")
-        document = json.loads(text)
-        if document["schema"] != SCHEMA:
-            raise DatasetError(f"{path}: schema version {document['schema']}, this program reads {SCHEMA}")
-        heads = {
-            name: (int(entry["frames"]), bytes.fromhex(entry["head"]))
-            for name, entry in document["sensors"].items()
-        }
-        tables = {name: bytes.fromhex(sha256) for name, sha256 in document["files"].items()}
-        signature, algorithm = bytes.fromhex(document["signature"]), str(document["algorithm"])
-    if algorithm != signer.algorithm:
-        raise InputError(f"{dataset.path}: is signed with {algorithm}; the key is for {signer.algorithm}")
-    findings: list[Finding] = []
-    written = json.dumps(document, indent=2, ensure_ascii=False) + "\n"
-    if text != written or not signer.verifies(signed_message(heads, tables), signature):
-        detail = "signed with another key, or the list of signed files was changed"
-        findings.append(Finding("signature is not valid", path.relative_to(dataset.path).as_posix(), detail))
-    files = signed_files(dataset)
-    findings += _tables_found(dataset, tables, present=files.others)
-    frames = 0
-    for sensor, head in heads.items():
-        found, count = _frames_found(
-            dataset, sensor, head=head, files=files.frames.get(sensor, {}), progress=progress
-        )
-        findings, frames = findings + found, frames + count
-    return ChainReport(algorithm, frames, files.count, tuple(findings))
-
-
-def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[str]) -> list[Finding]:
-    """Differences of files of no frame."""
-    found = [Finding("added", name) for name in present if name not in signed]
-    for name, sha256 in signed.items():
-        path = _inside(dataset, name)
-        if path is None or not path.is_file():
-            found.append(Finding("missing", name))
-        elif file_sha256(path) != sha256:
-            found.append(Finding("changed", name))
-    return found
-
-
-def _inside(dataset: Dataset, name: str) -> Path | None:
-    """A file of the dataset; None for a path that leads out of it."""
-    path = Path(name)
-    return None if path.is_absolute() or ".." in path.parts else dataset.path / path
-
-
-def _frames_found(
-    dataset: Dataset,
-    sensor: str,
-    *,
-    head: tuple[int, bytes],
-    files: dict[int, list[str]],
-    progress: Progress,
-) -> tuple[list[Finding], int]:
-    """Differences of the frames of a sensor, and the number of frames that were compared."""
-    place, integrity = f"integrity/{sensor}.csv", Paths(dataset.path).integrity
-    try:
-        links = read_links(integrity / f"{sensor}.csv")
-    except LidarError as error:
-        return [Finding("signed list cannot be read", place, str(error), sensor=sensor)], 0
-    found, signed = list[Finding](), dict[int, FrameDigests]()
-    if broken := _broken_link(links, sensor, head=head):
-        found.append(Finding("signed list was changed", place, broken, sensor=sensor))
-    for entry in links:
-        path = frame_file(integrity, sensor, frame=entry.frame)
-        where: dict[str, Any] = {"sensor": sensor, "frame": entry.frame}
-        name = path.relative_to(dataset.path).as_posix()
-        try:
-            digests = signed[entry.frame] = read_digests(path)
-        except LidarError as error:
-            found.append(Finding("signed digests cannot be read", name, str(error), **where))
-            continue
-        if digests.root != entry.root:
-            found.append(Finding("signed digests were changed", name, **where))
-    rate_hz = frame_rate(dataset, sensor)
-    differing = _files_found(dataset, sensor, signed=signed, files=files, rate_hz=rate_hz, progress=progress)
-    return [*found, *differing], len(links)
-
-
-def _broken_link(links: list[Link], sensor: str, *, head: tuple[int, bytes]) -> str:
-    """Description of the place where a chain is broken; empty if it leads to the signed last link."""
-    former = START
-    for entry in links:
-        former = link(former, sensor=sensor, frame=entry.frame, time_ns=entry.time_ns, root=entry.root)
-        if former != entry.link:
-            return f"from frame {entry.frame} on"
-    if (len(links), former) != head:
-        return f"{len(links)} of {head[0]} frames, or another last link"
-    return ""
-
-
-def _files_found(
-    dataset: Dataset,
-    sensor: str,
-    *,
-    signed: dict[int, FrameDigests],
-    files: dict[int, list[str]],
-    rate_hz: float,
-    progress: Progress,
-) -> Iterator[Finding]:
-    """Files of a sensor's frames that are missing, were added, changed, or hold another frame."""
-    frame_of = {
-        (Path(name).parent.as_posix(), sha256): frame
-        for frame, digests in signed.items()
-        for name, sha256 in digests.sha256.items()
-    }
-    known = Counter(sha256 for digests in signed.values() for sha256 in digests.sha256.values())
-    for frame, names in files.items():
-        own = signed[frame].sha256 if frame in signed else {}
-        for name in names:
-            if name not in own and not is_truth(Path(name)):
-                yield Finding("added", name, sensor=sensor, frame=frame)
-    for done, (frame, digests) in enumerate(signed.items()):
-        progress(f"verify {sensor}", done, total=len(signed))
-        for name, sha256 in digests.sha256.items():
-            where: dict[str, Any] = {"sensor": sensor, "frame": frame}
-            path = _inside(dataset, name)
-            if path is None or not path.is_file():
-                yield Finding("missing", name, **where)
-                continue
-            got = file_sha256(path)
-            if got == sha256:
-                continue
-            other = frame_of.get((Path(name).parent.as_posix(), got))
-            if other is not None and known[got] == 1:
-                yield Finding("replaced", name, f"holds frame {other}", **where)
-                continue
-            yield _change(path, name, digests=digests, rate_hz=rate_hz, where=where)
-    progress(f"verify {sensor}", len(signed), total=len(signed))
-
-
-def _change(
-    path: Path, name: str, *, digests: FrameDigests, rate_hz: float, where: dict[str, Any]
-) -> Finding:
-    """Describe the differences in a file of a frame."""
-    before = digests.blocks.get(name)
-    if before is None:
-        return Finding("changed", name, **where)
-    after = blocks_in(path, rate_hz=rate_hz)
-    if after is None:
-        return Finding("changed", name, "cannot be read as a cloud any more", **where)
-    blocks = before.changed(after)
-    if not len(blocks):
-        detail = "no block of points differs: the header, or the order of points"
-        return Finding("changed", name, detail, **where)
-    text = block_text(blocks, world=path.suffix in (".laz", ".las"))
-    return Finding("changed", name, text, tuple(blocks.tolist()), **where)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hmac
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from geoscene.errors import need
 from lidar.errors import InputError
@@ -14,23 +14,12 @@ _SHORTEST = 16
 """Bytes of a secret at least; an attacker tries 2^127 of them on average."""
 
 
-class Signer(Protocol):
-    """A key that signs, or only verifies."""
-
-    @property
-    def algorithm(self) -> str:
-        """Its name in signed documents."""
-
-    def sign(self, message: bytes) -> bytes:
-        """The signature of a message; raises InputError if the key can only verify."""
-
-    def verifies(self, message: bytes, signature: bytes) -> bool:
-        """Whether the signature is of this message and key."""
-
-
 @dataclass(frozen=True)
 class Hmac:
-    """HMAC-SHA-256 with a shared secret: who can verify can also sign."""
+    """HMAC-SHA-256 with a shared secret: who can verify can also sign.
+
+    algorithm : name in signed documents
+    """
 
     secret: bytes
     algorithm: str = "hmac-sha256"
@@ -67,6 +56,10 @@ class Ed25519:
         except invalid:
             return False
         return True
+
+
+Signer = Hmac | Ed25519
+"""A key that signs, or only verifies."""
 
 
 def read_secret(path: Path) -> bytes:

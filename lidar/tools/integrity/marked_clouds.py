@@ -40,14 +40,10 @@ _FEW = 20
 class MarkedCloud:
     """A cloud as its file says it is.
 
-    place  : of the file in the directory
-    xyz    : (n, 3) metres, sensor frame
-    step   : metres that coordinates are multiples of; 0 if they are of none
+    xyz   : (n, 3) metres, sensor frame
+    step  : metres that coordinates are multiples of; 0 if they are of none
     """
 
-    place: str
-    sensor: str
-    frame: int
     xyz: NDArray[np.floating]
     cells: WatermarkCells
     step: float
@@ -75,7 +71,7 @@ class MarkedCloudFile:
         if self.form.frame == "sensor":
             cloud = table_cloud(cloud_points(path))
             cells = cells_of(cloud, sensor=self.sensor, frame=self.frame)
-            return MarkedCloud(self.place, self.sensor, self.frame, cloud.xyz, cells, coarseness(cloud.xyz))
+            return MarkedCloud(cloud.xyz, cells, coarseness(cloud.xyz))
         table = self.form.read(path)
         if missing := [name for name in ("ring", "gps_time") if name not in table]:
             raise FormatError(f"{path}: lacks {', '.join(missing)}")
@@ -83,7 +79,7 @@ class MarkedCloudFile:
         if not np.isfinite(world).all() or not np.isfinite(table["gps_time"]).all():
             raise FormatError(f"{path}: damaged (coordinates that are not numbers)")
         xyz, cells = self.geometry.in_sensor(world, table, name=self.sensor, frame=self.frame)
-        return MarkedCloud(self.place, self.sensor, self.frame, xyz, cells, coarseness(world))
+        return MarkedCloud(xyz, cells, coarseness(world))
 
 
 def cloud_files(dataset: Dataset) -> Iterator[MarkedCloudFile]:

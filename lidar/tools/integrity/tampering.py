@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.graphs import components
 from geoscene.typing import Float, Ints
-from lidar.tools.integrity.blocks import SECTORS, BlockTest, block_of, block_test
-from lidar.tools.integrity.linkage import linked_clusters
+from lidar.tools.integrity.digests import SECTORS, block_of
 from lidar.tools.integrity.watermark import CHAINED, Decoded, WatermarkCells, WatermarkKey, earlier
 
 NOISE = 0.001
@@ -39,6 +38,67 @@ _ABSENT = 0.4
 
 _WIDEST = 170.0
 """Degrees of a gap that is filled with the directions of removed returns."""
+
+_NEAREST = 8
+"""Nearest points, with itself, to which each one is linked first; they join almost all cells."""
+
+_AT_ONCE = 1_000_000
+"""Pairs of points whose distances are computed at once; two cells with more get a tree."""
+
+
+@dataclass(frozen=True)
+class BlockTest:
+    """Which blocks of a frame have more wrong bits than noise explains.
+
+    block  : (b,) number, see `block_of`
+    bits   : (b,) bits in it
+    wrong  : (b,) wrong ones, or of coordinates off the lattice
+    least  : (b,) wrong bits from which a block is tampered with
+    chance : (b,) probability that noise alone makes as many: the block's false-alarm rate
+    """
+
+    block: Ints
+    bits: Ints
+    wrong: Ints
+    least: Ints
+    chance: Float
+
+    @property
+    def tampered(self) -> Ints:
+        """The blocks (k,) with at least as many wrong bits."""
+        return self.block[self.wrong >= self.least]
+
+
+def block_test(block: Ints, wrong: NDArray[np.bool_], *, error_rate: float, false_alarms: float) -> BlockTest:
+    """The test of a frame's blocks.
+
+    block        : (n,) of each return
+    wrong        : (n, k) bits that count as wrong, k of each return
+    error_rate   : share of bits that noise makes wrong
+    false_alarms : blocks a frame that may be reported without tampering, on average at most
+    """
+    numbers, row = np.unique(block, return_inverse=True)
+    bits = wrong.shape[1] * np.bincount(row, minlength=len(numbers))
+    count = np.bincount(row, weights=wrong.sum(axis=1), minlength=len(numbers)).astype(np.int64)
+    least, chance = _thresholds(bits, error_rate=error_rate, chance=false_alarms / max(len(numbers), 1))
+    return BlockTest(numbers, bits, count, least, chance)
+
+
+def _thresholds(bits: Ints, *, error_rate: float, chance: float) -> tuple[Ints, Float]:
+    """Least number of wrong bits that noise exceeds with at most a probability, and that probability."""
+    from scipy.special import bdtrc  # noqa: PLC0415  (0.2 s)
+
+    sizes, row = np.unique(bits, return_inverse=True)
+    least, found = np.zeros(len(sizes), np.int64), np.ones(len(sizes))
+    pending = np.ones(len(sizes), bool)
+    k = 0
+    while pending.any():
+        k += 1
+        tail = np.where(k <= sizes, bdtrc(k - 1, np.maximum(sizes, k), error_rate), 0.0)
+        done = pending & (tail <= chance)
+        least[done], found[done] = k, tail[done]
+        pending &= ~done
+    return least[row], found[row]
 
 
 @dataclass(frozen=True)
@@ -233,3 +293,67 @@ def _clusters(xyz: NDArray[np.floating], ring: NDArray[np.integer]) -> Ints:
     beside = linked_clusters(np.column_stack([turn, 0.9 * ring, away / _DEPTH]), p=np.inf)
     rows, groups = np.arange(n), np.append(n + near, n + near.max() + 1 + beside)
     return components(np.append(rows, rows), groups, count=int(groups.max()) + 1)[:n]
+
+
+def linked_clusters(points: NDArray[np.floating], *, p: float) -> Ints:
+    """Cluster (n,) of each point: those within a distance of 1 are linked, chains of links make a cluster.
+
+    points : (n, d), n > 0
+    p      : of the Minkowski norm: 2 for Euclid's distance, infinity for the greatest coordinate's
+
+    A list of all links would grow with the square of the density. Here points fall into cells so small that
+    all of a cell are linked; links to nearest points join cells, and where these do not, all distances
+    between the points of two cells tell.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (0.2 s)
+
+    points = points.astype(np.float64)
+    n, axes = points.shape
+    side = (1 - 1e-9) / axes ** (1 / p)
+    corner, cell = np.unique(np.floor(points / side), axis=0, return_inverse=True)
+    cell = cell.reshape(n)
+    away, near = (column.reshape(n, -1) for column in cKDTree(points).query(points, k=min(_NEAREST, n), p=p))
+    row, place = np.nonzero(away <= 1)
+    cluster = components(cell[row], cell[near[row, place]], count=len(corner))
+    beside = cKDTree(corner).query_pairs(np.ceil(1 / side), p=np.inf, output_type="ndarray")
+    members = _Members(cell)
+    while len(beside := beside[cluster[beside[:, 0]] != cluster[beside[:, 1]]]):
+        beside = beside[np.argsort(members.size[beside].prod(axis=1), kind="stable")]
+        ends = np.cumsum(members.size[beside].prod(axis=1))
+        most = int(np.searchsorted(ends, _AT_ONCE, side="right"))
+        if most:
+            pair, one, other = members.pairs(beside[:most])
+            apart = np.linalg.norm(points[one] - points[other], ord=p, axis=1)
+            met = beside[np.unique(pair[apart <= 1])]
+        else:
+            most = 1
+            first, second = (points[members.of(number)] for number in beside[0])
+            met = beside[: int(cKDTree(first).query(second, p=p)[0].min() <= 1)]
+        cluster = components(*cluster[met].T, count=len(corner))[cluster]
+        beside = beside[most:]
+    return cluster[cell]
+
+
+class _Members:
+    """The points of each cell.
+
+    size : (m,) points of each
+    """
+
+    def __init__(self, cell: Ints) -> None:
+        self.size = np.bincount(cell)
+        self._rows = np.argsort(cell, kind="stable")
+        self._first = np.cumsum(self.size) - self.size
+
+    def of(self, number: int) -> Ints:
+        """The points of a cell."""
+        return self._rows[self._first[number] :][: self.size[number]]
+
+    def pairs(self, cells: NDArray[np.integer]) -> tuple[Ints, Ints, Ints]:
+        """All pairs of points of pairs (k, 2) of cells: row of ``cells``, and both points."""
+        counts = self.size[cells].prod(axis=1)
+        pair = np.repeat(np.arange(len(cells)), counts)
+        number = np.arange(len(pair)) - np.repeat(np.cumsum(counts) - counts, counts)
+        one, other = np.divmod(number, self.size[cells[pair, 1]])
+        first = self._first[cells[pair]]
+        return pair, self._rows[first[:, 0] + one], self._rows[first[:, 1] + other]

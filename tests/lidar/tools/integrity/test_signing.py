@@ -14,8 +14,8 @@ from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.errors import DatasetError, InputError
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
+from lidar.tools.integrity.digests import block_digests, merkle_root
 from lidar.tools.integrity.keys import Hmac, read_secret, read_signer
-from lidar.tools.integrity.merkle import block_digests, merkle_root
 from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset
 from lidar.tools.verify import verify_dataset

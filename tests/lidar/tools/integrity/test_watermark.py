@@ -11,8 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from geoscene.support.graphs import components
 from lidar.errors import InputError
-from lidar.tools.integrity.linkage import linked_clusters
-from lidar.tools.integrity.tampering import frame_verdict
+from lidar.tools.integrity.tampering import frame_verdict, linked_clusters
 from lidar.tools.integrity.watermark import WatermarkCells, WatermarkKey, bit_error_rate
 
 MARK = WatermarkKey(b"0123456789abcdef")
