@@ -28,13 +28,13 @@ import lidar.sensors.rig.specs
 import lidar.simulation.drive
 import lidar.simulation.frames
 import lidar.tools.tradeoff.compare
-import lidar.tools.tradeoff.costs
-import lidar.tools.tradeoff.ladders
+import lidar.tools.tradeoff.pick
 import lidar.tools.tradeoff.search
+import lidar.tools.tradeoff.sensors
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
-from lidar.tools.tradeoff.images import coarse
+from lidar.tools.tradeoff.bench import coarse
 from lidar.traffic.populate import TrafficOptions
 
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
@@ -180,17 +180,17 @@ def folder(inputs, tmp_path, monkeypatch):
         "tradeoff",
         lambda *args, **more: builds(*args, **more | {"settings": ("lod",)}),
     )
-    plan, peaks = lidar.tools.tradeoff.search.plan_drive, lidar.tools.tradeoff.costs.peaks
+    plan, peaks = lidar.tools.tradeoff.search.plan_drive, lidar.tools.tradeoff.sensors.peaks
     camera = lidar.sensors.rig.specs._camera
     monkeypatch.setattr(
         lidar.tools.tradeoff.search,
         "plan_drive",
         lambda scene, options, **more: plan(scene, replace(options, duration=0.2), **more),
     )
-    monkeypatch.setattr(lidar.tools.tradeoff.ladders, "RAYS", (1, 7, 19, 127))
+    monkeypatch.setattr(lidar.tools.tradeoff.pick, "RAYS", (1, 7, 19, 127))
     # each takes a process: one stands for all
     monkeypatch.setattr(
-        lidar.tools.tradeoff.costs,
+        lidar.tools.tradeoff.sensors,
         "peaks",
         lambda *of, variants: peaks(*of, variants=variants[:1]) * len(variants),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
@@ -16,11 +16,7 @@ from lidar.sensors.rig.specs import load_rig
 from lidar.simulation import drive as pipeline
 from lidar.simulation.plan import DrivePlan, sensors_of
 from lidar.tools.tradeoff.errors import ErrorEstimate
-from lidar.tools.tradeoff.pick import PERCENT, Pick
-from lidar.tools.tradeoff.sensor_errors import SensorErrors, kinds_of, stated
-
-if TYPE_CHECKING:
-    from lidar.tools.tradeoff.ladders import Kind
+from lidar.tools.tradeoff.pick import PERCENT, Kind, Pick, SensorErrors, kinds_of, stated
 
 _CHECKED = 10
 """Frames of each sensor that are checked after a drive."""

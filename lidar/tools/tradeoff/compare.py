@@ -18,8 +18,7 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan, plan_drive, schedule
 from lidar.tools.tradeoff.bench import EXACT, FAST, Bench, bench_of, returns_of
-from lidar.tools.tradeoff.comparison import SensorComparison
-from lidar.tools.tradeoff.errors import percentile
+from lidar.tools.tradeoff.errors import SensorComparison, percentile
 from lidar.tools.tradeoff.sensors import compare_sensor
 from lidar.tools.tradeoff.variants import CAMERA_VALUES, SCANNER_VALUES, WORLD_VALUES, noiseless
 

@@ -1,19 +1,28 @@
-"""Differences between two simulations of the same pulses, with intervals."""
+"""Differences between two simulations of the same pulses or pixels, with intervals; rows of comparisons."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.drawing.figures import metres
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 
 RESAMPLES = 200
 """Bootstrap samples of an interval."""
+
+Kind = Literal["scanner", "camera"]
+
+TAILS: dict[Kind, str] = {"scanner": "range_99.9_m", "camera": "rgb_rms"}
+"""The figure of an error by which settings of a kind of sensor are ranked."""
+
+LOST = 0.001
+"""Share of missed and extra returns beyond which a setting does not keep any error at 99.9 %."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +62,10 @@ class ErrorEstimate:
     def from_json(cls, figures: Mapping[str, float]) -> ErrorEstimate:
         """The figures of `to_json`, all finite; raises KeyError, TypeError or ValueError for others."""
         return cls(float(figures["value"]), float(figures["low"]), float(figures["high"]))
+
+    def to_text(self, size: Callable[[float], str] = metres) -> str:
+        """The value with its interval, each as text by ``size``."""
+        return f"{size(self.value)} ({size(self.low)} to {size(self.high)})"
 
     def __add__(self, other: ErrorEstimate) -> ErrorEstimate:
         """The sum, with the ends of both."""
@@ -115,15 +128,16 @@ def percentile(values: Float, share: float) -> float:
     return float(np.quantile(values, share, method="higher")) if len(values) else 0.0
 
 
-Statistic = Callable[[Sequence[FrameDifferences]], float]
+Statistic = Callable[[Sequence[Any]], float]
+"""A figure of the differences of frames: of `FrameDifferences`, or of `ImageError`."""
 
 
 def _of_all(name: str, figure: Callable[[Float], float]) -> Statistic:
     return lambda frames: figure(np.concatenate([getattr(f, name) for f in frames]))
 
 
-def _share(name: str) -> Statistic:
-    return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(f.returns for f in frames))
+def _share(name: str, *, of: str = "returns") -> Statistic:
+    return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(getattr(f, of) for f in frames))
 
 
 def _chamfer(frames: Sequence[FrameDifferences]) -> float:
@@ -174,7 +188,7 @@ class ImageError:
     pixels: int
 
 
-def _rgb(figure: Callable[[NDArray[np.int64]], float]) -> Callable[[Sequence[ImageError]], float]:
+def _rgb(figure: Callable[[NDArray[np.int64]], float]) -> Statistic:
     return lambda frames: figure(np.sum([f.levels for f in frames], axis=0))
 
 
@@ -187,23 +201,15 @@ def _rms_of_counts(counts: NDArray[np.int64]) -> float:
     return float(np.sqrt((counts * np.arange(256.0) ** 2).sum() / max(1, counts.sum())))
 
 
-def _of_depth(figure: Callable[[Float], float]) -> Callable[[Sequence[ImageError]], float]:
-    return lambda frames: figure(np.concatenate([f.depth for f in frames]))
-
-
-def _of_pixels(name: str) -> Callable[[Sequence[ImageError]], float]:
-    return lambda frames: sum(getattr(f, name) for f in frames) / max(1, sum(f.pixels for f in frames))
-
-
-IMAGE_STATISTICS: dict[str, Callable[[Sequence[ImageError]], float]] = {
+IMAGE_STATISTICS: dict[str, Statistic] = {
     "rgb_rms": _rgb(_rms_of_counts),
     "rgb_99.9": _rgb(_level(0.999)),
     "rgb_max": _rgb(_level(1.0)),
-    "depth_rms_m": _of_depth(rms),
-    "depth_99.9_m": _of_depth(lambda v: percentile(v, 0.999)),
-    "depth_max_m": _of_depth(lambda v: percentile(v, 1.0)),
-    "depth_missing": _of_pixels("missing"),
-    "class_changes": _of_pixels("changed"),
+    "depth_rms_m": _of_all("depth", rms),
+    "depth_99.9_m": _of_all("depth", lambda v: percentile(v, 0.999)),
+    "depth_max_m": _of_all("depth", lambda v: percentile(v, 1.0)),
+    "depth_missing": _share("missing", of="pixels"),
+    "class_changes": _share("changed", of="pixels"),
 }
 """Figures of an error of images, over all sampled frames: levels of 255, metres, shares of the pixels."""
 
@@ -211,7 +217,7 @@ E = TypeVar("E")
 
 
 def estimates(
-    frames: Sequence[E], *, seed: int, statistics: Mapping[str, Callable[[Sequence[E]], float]]
+    frames: Sequence[Any], *, seed: int, statistics: Mapping[str, Statistic]
 ) -> dict[str, ErrorEstimate]:
     """All figures of an error, with intervals by resampling frames; none without frames."""
     return resample(
@@ -244,3 +250,55 @@ def median(values: Sequence[float], *, seed: int) -> ErrorEstimate:
     picks = np.random.default_rng(seed).integers(0, len(data), (RESAMPLES, len(data)))
     low, high = np.percentile(np.median(data[picks], axis=1), [2.5, 97.5])
     return ErrorEstimate(float(np.median(data)), float(low), float(high))
+
+
+@dataclass(frozen=True, slots=True)
+class VariantRow:
+    """A measured variant.
+
+    error  : combined: only this setting differs from what the user asked for; see `STATISTICS` and
+             `IMAGE_STATISTICS`
+    alone  : only this setting differs from the reference; empty for the user's own settings and combinations
+    cost   : CPU seconds (``cpu_s``) and bytes (``bytes``) per simulated second, peak memory
+             (``memory_bytes``)
+    note   : that changes have no effect on the sample, or change the model
+    choice : whether it can be recommended: each change has an effect, and the world stays the same
+    """
+
+    label: str
+    error: dict[str, ErrorEstimate]
+    alone: dict[str, ErrorEstimate]
+    cost: dict[str, ErrorEstimate]
+    note: str = ""
+    choice: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class SensorComparison:
+    """The rows of a sensor.
+
+    sensor    : name on the rig, with its preset or size
+    reference : what errors are measured against, in words
+    residual  : difference between the reference and one with another number of rays: its own uncertainty
+    rows      : the user's own settings come first
+    samples   : number of pulses or pixels compared
+    frames    : number of frames that they are from
+    """
+
+    sensor: str
+    reference: str
+    residual: dict[str, ErrorEstimate]
+    rows: tuple[VariantRow, ...]
+    samples: int
+    frames: int
+    kind: Kind = "scanner"
+
+    @property
+    def tail(self) -> str:
+        """The figure of an error by which the rows are ranked."""
+        return TAILS[self.kind]
+
+    @property
+    def uncertainty(self) -> float:
+        """Metres or levels (see `tail`) by which the reference may be off."""
+        return self.residual[self.tail].value

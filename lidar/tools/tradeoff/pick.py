@@ -1,16 +1,177 @@
-"""Settings that were picked for a drive, and the errors and costs to expect of them."""
+"""Numbers of rays to choose from for a drive, those that were picked, their errors and costs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
+from geoscene.drawing.figures import levels, metres, share
+from lidar.options import AccuracyTarget, DriveOptions
+from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.errors import ErrorEstimate
-from lidar.tools.tradeoff.sensor_errors import SensorErrors
+from lidar.tools.tradeoff.errors import LOST, ErrorEstimate
+
+Kind = Literal["scanners", "cameras"]
+
+RAYS = (1, 7, 13, 19, 37, 61, 91, 127, 169, 217, 331, 499, 665)
+"""Numbers of rays per pulse to choose from, the cheapest first.
+
+Poses, precision and the second trace are none of the choice, as they save a few percent at most.
+"""
+
+SUPERSAMPLES = (1, 2, 3, 4, 6, 8)
+"""Rays along each side of a pixel to choose from.
+
+Images without shadows or detail are none of the choice, as they save a quarter and err by 9 levels and more.
+"""
+
+EXPOSED = ((1, 5), (2, 9), (3, 17))
+"""Rays along each side of a pixel, and moments, to choose from if the exposure of a camera takes time."""
 
 PERCENT = 99.9
 """Percent of the returns whose error is stated where no accuracy says another."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ladder:
+    """Settings to choose from for the scanners or the cameras of a rig, the cheapest first.
+
+    sensors : all of the kind
+    names   : of the settings that differ; empty if none is to be picked, and the only row is the drive's own
+    rows    : values of these settings
+    """
+
+    kind: Kind
+    sensors: tuple[Scanner | Camera, ...]
+    names: tuple[str, ...]
+    rows: tuple[tuple[int, ...], ...]
+
+    def values(self, row: int) -> dict[str, int]:
+        """The settings of a row, by name."""
+        return dict(zip(self.names, self.rows[row], strict=True))
+
+
+def ladders_of(
+    options: DriveOptions, sensors: Sequence[Scanner | Camera], *, free: Sequence[Kind]
+) -> dict[Kind, Ladder]:
+    """Ladders of the kinds of sensors of a drive; settings are picked for those in ``free``.
+
+    The settings of the drive's fidelity level are among the rows.
+    """
+    settings = options.recording_settings
+    scanner, camera = settings.scanner, settings.camera
+    found: dict[Kind, Ladder] = {}
+    if scanners := tuple(s for s in sensors if isinstance(s, Scanner)):
+        rays = tuple((count,) for count in sorted({*RAYS, scanner.rays}))
+        found["scanners"] = Ladder("scanners", scanners, ("rays",), rays)
+    cameras = [s for s in sensors if isinstance(s, Camera)]
+    if any(s.spec.exposure_ns for s in cameras):
+        shots = sorted({*EXPOSED, (camera.supersample, camera.blur)}, key=lambda v: (v[0] ** 2 * v[1], v))
+        found["cameras"] = Ladder("cameras", tuple(cameras), ("supersample", "blur"), tuple(shots))
+    elif cameras:
+        sides = tuple((side,) for side in sorted({*SUPERSAMPLES, camera.supersample}))
+        found["cameras"] = Ladder("cameras", tuple(cameras), ("supersample",), sides)
+    return {
+        kind: ladder if kind in free else replace(ladder, names=(), rows=((),))
+        for kind, ladder in found.items()
+    }
+
+
+def settings_of_rows(ladders: Mapping[Kind, Ladder], rows: Mapping[Kind, int]) -> dict[str, int]:
+    """Values of all settings that are picked, by name."""
+    return {name: value for kind, row in rows.items() for name, value in ladders[kind].values(row).items()}
+
+
+def label_of(settings: Mapping[str, int]) -> str:
+    """Settings as text, as in ``rays=7``."""
+    return " ".join(f"{name}={value}" for name, value in settings.items())
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Errors by name of the sensor; of some sensors, or none, of each kind.
+
+    percent : of the returns or pixels for which ranges and depths are stated
+    ranges  : of scanners, metres
+    depths  : of cameras, metres
+    colours : of cameras, levels of 255, rms
+    lost    : of scanners, missed and extra returns over all, where they are more than `errors.LOST`
+    """
+
+    percent: float
+    ranges: dict[str, ErrorEstimate] = field(default_factory=dict)
+    depths: dict[str, ErrorEstimate] = field(default_factory=dict)
+    colours: dict[str, ErrorEstimate] = field(default_factory=dict)
+    lost: dict[str, ErrorEstimate] = field(default_factory=dict)
+
+    def to_json(self, prefix: str) -> dict[str, Any]:
+        """The errors that there are, such as ``expected_error_m``, for a prefix."""
+        found: dict[str, Any] = {"percent": self.percent}
+        for kind, name in _KEYS.items():
+            if errors := getattr(self, kind):
+                found[f"{prefix}_{name}"] = {sensor: error.to_json() for sensor, error in errors.items()}
+        return found
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any], prefix: str) -> SensorErrors:
+        """The errors of `to_json`; raises KeyError, TypeError or ValueError for others."""
+        every = {
+            kind: {
+                sensor: ErrorEstimate.from_json(error)
+                for sensor, error in document.get(f"{prefix}_{name}", {}).items()
+            }
+            for kind, name in _KEYS.items()
+        }
+        return cls(float(document["percent"]), **every)
+
+    def to_text(self, are: str) -> str:
+        """All of them, in one line; ``are`` is the verb: are, or should be."""
+        below = f"{self.percent:g} % of the"
+        texts = [
+            f"{below} range errors {are} below {_list_all(self.ranges)}" if self.ranges else "",
+            f"{below} depth errors {are} below {_list_all(self.depths)}" if self.depths else "",
+            f"colour errors (rms) {are} {_list_all(self.colours, size=levels)}" if self.colours else "",
+            f"missed and extra returns {are} {_list_all(self.lost, size=share)}" if self.lost else "",
+        ]
+        return ", ".join(filter(None, texts)) or "no errors are known"
+
+    def beyond(self, asked: AccuracyTarget) -> list[str]:
+        """Description of the errors that exceed a target."""
+        lengths = {name: e for name, e in (self.ranges | self.depths).items() if e.value > asked.metres > 0}
+        colours = {name: e for name, e in self.colours.items() if e.value > asked.levels > 0}
+        return [
+            *(f"{name} has {error.to_text()}" for name, error in lengths.items()),
+            *(f"{name} has {error.to_text(levels)}" for name, error in colours.items()),
+        ]
+
+
+_KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels", "lost": "lost"}
+
+
+def _list_all(errors: Mapping[str, ErrorEstimate], *, size: Callable[[float], str] = metres) -> str:
+    return ", ".join(f"{error.to_text(size)} for {name}" for name, error in errors.items())
+
+
+def stated(
+    errors: Mapping[str, Mapping[str, ErrorEstimate]], *, percent: float, kinds: Collection[str]
+) -> SensorErrors:
+    """Of all figures of sensors, by their names, those of some kinds: ranges, depths and colours."""
+    names = {"ranges": f"range_{percent:g}_m", "depths": f"depth_{percent:g}_m", "colours": "rgb_rms"}
+    found = {
+        kind: {sensor: figures[name] for sensor, figures in errors.items() if name in figures}
+        for kind, name in names.items()
+        if kind in kinds
+    }
+    lost = {sensor: errors[sensor]["lost"] for sensor in found.get("ranges", {}) if "lost" in errors[sensor]}
+    return SensorErrors(percent, **found, lost={s: share for s, share in lost.items() if share.value > LOST})
+
+
+def kinds_of(asked: AccuracyTarget | None) -> tuple[str, ...]:
+    """Kinds of errors that are stated for an accuracy, or for a drive for which none was asked."""
+    if asked is None:
+        return ("ranges", "colours")
+    return (("ranges", "depths") if asked.metres else ()) + (("colours",) if asked.levels else ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +222,7 @@ class Pick:
     @property
     def label(self) -> str:
         """The settings, as in ``rays=7``; empty if none was to be picked."""
-        return " ".join(f"{name}={value}" for name, value in self.settings.items())
+        return label_of(self.settings)
 
     def to_text(self) -> str:
         """The settings, and the errors and costs to expect, in one line."""
@@ -70,11 +231,10 @@ class Pick:
         if self.cost is None:
             return f"{text}; as picked before for this dataset"
         cost = self.cost
-        count = f"{cost.threads} worker{'s' * (cost.threads > 1)}"
         return (
             f"{text}; it takes {cost.cpu_s.value:.3g} CPU s per simulated second, which is"
-            f" {cost.speed:.2g} x real time with {count}, planning ({cost.planning[1]:.2g} CPU s) and loading"
-            f" ({cost.loading:.2g}) included"
+            f" {cost.speed:.2g} x real time with {workers_text(cost.threads)}, planning"
+            f" ({cost.planning[1]:.2g} CPU s) and loading ({cost.loading:.2g}) included"
         )
 
     def costs(self) -> dict[str, Any]:
@@ -87,3 +247,8 @@ class Pick:
             "planning_cpu_s": round(self.cost.planning[1], 3),
             "expected_loading_cpu_s": round(self.cost.loading, 3),
         }
+
+
+def workers_text(threads: int) -> str:
+    """A number of workers as text."""
+    return f"{threads} worker{'s' * (threads > 1)}"

@@ -1,28 +1,25 @@
-"""The report of a comparison of settings: terminal tables, plots, HTML page and JSON."""
+"""The report of a comparison of settings: recommendations, terminal tables, plots, HTML page and JSON."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
+from functools import partial
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
 from geoscene.drawing.charts import Axes, ChartPoint, scatter
-from geoscene.drawing.figures import metres, share, size
+from geoscene.drawing.figures import levels, metres, share, size
 from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.files import write_atomically, write_json
 from lidar.tools.tradeoff.compare import DriveTradeoff
-from lidar.tools.tradeoff.comparison import (
-    Kind,
-    SensorComparison,
-    VariantRow,
-    pareto,
-    ranked_error,
-    recommendations,
-    reference_text,
-    size_of,
-)
-from lidar.tools.tradeoff.errors import ErrorEstimate
+from lidar.tools.tradeoff.errors import LOST, ErrorEstimate, Kind, SensorComparison, VariantRow
+
+TARGETS: dict[Kind, tuple[float, ...]] = {"scanner": (0.001, 0.01, 0.1), "camera": (1.0, 3.0, 10.0)}
+"""Errors for which a setting is recommended: metres at 99.9 %, and levels of 255 rms."""
+
+_ENOUGH = 10_000
+"""Pulses from which an error at 99.9 % is that of ten or more."""
 
 _RANKED: dict[Kind, str] = {
     "scanner": "range error at 99.9 %",
@@ -59,9 +56,84 @@ _CAMERA_ERRORS: dict[str, tuple[str, Callable[[float], str]]] = {
 }
 
 
+def size_of(error: float, kind: Kind) -> str:
+    """An error by which settings are ranked."""
+    return metres(error) if kind == "scanner" else levels(error)
+
+
+def ranked_error(comparison: SensorComparison, row: VariantRow) -> float:
+    """The error by which a row is ranked: the upper end of its interval.
+
+    inf if more than `LOST` of the returns are missed or extra.
+    """
+    if "missed" in row.error and row.error["missed"].value + row.error["extra"].value > LOST:
+        return inf
+    return row.error[comparison.tail].high
+
+
+def pareto(comparison: SensorComparison) -> list[VariantRow]:
+    """Choices of which no other is both cheaper and at least as exact, the cheapest first.
+
+    Settings that miss or add more than `LOST` of the returns are left out.
+    """
+    best: list[VariantRow] = []
+    ranked = [
+        (row.cost["cpu_s"].value, ranked_error(comparison, row), row) for row in comparison.rows if row.choice
+    ]
+    for _, error, row in sorted(ranked, key=lambda r: r[:2]):
+        if error < (ranked_error(comparison, best[-1]) if best else inf):
+            best.append(row)
+    return best
+
+
+def recommendation(comparison: SensorComparison, target: float) -> str:
+    """A sentence with the cheapest setting whose interval ends within an error, or the nearest one."""
+    kind, rows = comparison.kind, pareto(comparison)
+    wanted = f"For {size_of(target, kind)} {'at 99.9 %' if kind == 'scanner' else 'rms'}"
+    if not rows:
+        return f"{wanted} no setting is enough: all miss or add more than {share(LOST)} of the returns."
+    fit = [row for row in rows if ranked_error(comparison, row) <= target]
+    row = (fit or rows[-1:])[0]
+    cost, error = row.cost["cpu_s"], row.error[comparison.tail]
+    verdict = (
+        "the cheapest setting is" if fit else "no setting that was compared is sure to be enough; nearest is"
+    )
+    text = (
+        f"{wanted} {verdict} {row.label}: {size_of(error.value, kind)}, {size_of(error.high, kind)} at the"
+        f" upper end of the 95 % interval, at {cost.value:.3g} CPU s per simulated second."
+    )
+    if fit and comparison.uncertainty > target:
+        text += f" The reference is certain to {size_of(comparison.uncertainty, kind)} only."
+    return text
+
+
+def recommendations(comparison: SensorComparison) -> list[str]:
+    """A sentence for each of `TARGETS`."""
+    return [recommendation(comparison, target) for target in TARGETS[comparison.kind]]
+
+
+def reference_text(comparison: SensorComparison) -> str:
+    """Convergence of the reference, with a warning if the sample is too small for errors at 99.9 %."""
+    off = size_of(comparison.uncertainty, comparison.kind)
+    where = "ranges at 99.9 %" if comparison.kind == "scanner" else "colours (rms)"
+    text = (
+        f"Reference: {comparison.reference} change {where} by {off}: errors below that cannot be told from"
+        " the reference's own."
+    )
+    if comparison.kind == "scanner" and comparison.samples < _ENOUGH:
+        text += (
+            f" {comparison.samples:,} pulses are few for errors at 99.9 %, whose intervals are too narrow:"
+            f" compare {_ENOUGH:,} (`pulses`)."
+        )
+    return text
+
+
 def columns_of(comparison: SensorComparison) -> list[Column[VariantRow]]:
     """Columns of the table of a sensor."""
     kind, tail = comparison.kind, comparison.tail
+
+    def error(row: VariantRow, *, name: str, text: Callable[[float], str]) -> str:
+        return row.error[name].to_text(text) if name == tail else text(row.error[name].value)
 
     def alone(row: VariantRow) -> str:
         return size_of(row.alone[tail].value, kind) if row.alone else ""
@@ -69,28 +141,15 @@ def columns_of(comparison: SensorComparison) -> list[Column[VariantRow]]:
     return [
         Column("setting", lambda row: row.label),
         *(
-            _error_column(head, name, text=text, interval=name == tail)
+            Column(head, partial(error, name=name, text=text))
             for head, (name, text) in (_SCANNER_ERRORS if kind == "scanner" else _CAMERA_ERRORS).items()
         ),
         Column("alone 99.9 %" if kind == "scanner" else "alone RGB rms", alone),
-        Column("CPU s/s", lambda row: _with_interval(row.cost["cpu_s"], text=lambda v: f"{v:.3g}")),
+        Column("CPU s/s", lambda row: row.cost["cpu_s"].to_text(lambda v: f"{v:.3g}")),
         Column("memory", lambda row: size(row.cost["memory_bytes"].value)),
         Column("bytes/s", lambda row: size(row.cost["bytes"].value)),
         Column("note", lambda row: row.note),
     ]
-
-
-def _error_column(
-    head: str, name: str, *, text: Callable[[float], str], interval: bool
-) -> Column[VariantRow]:
-    """The column of a figure of combined errors, with its interval where settings are ranked by it."""
-    if interval:
-        return Column(head, lambda row: _with_interval(row.error[name], text=text))
-    return Column(head, lambda row: text(row.error[name].value))
-
-
-def _with_interval(figure: ErrorEstimate, *, text: Callable[[float], str]) -> str:
-    return f"{text(figure.value)} ({text(figure.low)} to {text(figure.high)})"
 
 
 def headline(comparison: SensorComparison) -> str:
@@ -188,11 +247,11 @@ def write_report(found: DriveTradeoff, out: Path) -> None:
 def pareto_plot(comparison: SensorComparison) -> bytes:
     """A PNG: error against CPU time.
 
-    Settings that miss or add too many returns are not drawn, see `comparison.ranked_error`.
+    Settings that miss or add too many returns are not drawn, see `ranked_error`.
     """
     kind, best = comparison.kind, pareto(comparison)
     choices = [row for row in comparison.rows if row.choice]
-    drawn = [row for row in choices if math.isfinite(ranked_error(comparison, row))]
+    drawn = [row for row in choices if isfinite(ranked_error(comparison, row))]
     points = []
     for row in drawn:
         cost, error = row.cost["cpu_s"], row.error[comparison.tail]

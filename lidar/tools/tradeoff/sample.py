@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, nan
@@ -23,7 +23,16 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.frame_loop import chunks
 from lidar.simulation.plan import DrivePlan
-from lidar.tools.tradeoff.bench import EXACT, FAST, Bench, chosen_pulses, returns_of
+from lidar.tools.tradeoff.bench import (
+    EXACT,
+    FAST,
+    Bench,
+    blocks_of_frame,
+    chosen_pulses,
+    image_error,
+    pixels,
+    returns_of,
+)
 from lidar.tools.tradeoff.errors import (
     IMAGE_STATISTICS,
     ErrorEstimate,
@@ -32,10 +41,7 @@ from lidar.tools.tradeoff.errors import (
     percentile,
     resample,
 )
-from lidar.tools.tradeoff.images import blocks_of_frame, image_error, pixels
 from lidar.tools.tradeoff.variants import camera_reference, noiseless, scanner_reference
-
-SensorSettings = ScannerSettings | CameraSettings
 
 _SCREENED, _SCREENS, _COMPARED = 6000, (1, 19, 61), 120
 """Pulses of a frame that are screened, their numbers of rays, and how many of the hardest and of the others
@@ -54,7 +60,8 @@ class DriveSample:
     The sample is empty at first and grows; its frames are spread evenly over the drive. The same drive has
     the same sample.
 
-    other : whether it takes other frames than a small sample of the same drive without this
+    settings : of the sensors, which are scanners or cameras alone
+    other    : whether it takes other frames than a small sample of the same drive without this
     """
 
     def __init__(
@@ -62,7 +69,7 @@ class DriveSample:
         plan: DrivePlan,
         sensors: Sequence[Scanner | Camera],
         *,
-        settings: Sequence[SensorSettings],
+        settings: Sequence[Any],
         other: bool = False,
         progress: Progress,
     ) -> None:
@@ -126,10 +133,8 @@ class DriveSample:
     def _frame_errors(self, bench: Bench, sensor: Scanner | Camera, *, frame: int) -> list[Any]:
         """Errors of each of the settings in a frame."""
         if isinstance(sensor, Scanner):
-            scanning = [one for one in self.settings if isinstance(one, ScannerSettings)]
-            return scanner_errors(bench, sensor, frame=frame, settings=scanning)
-        imaging = [one for one in self.settings if isinstance(one, CameraSettings)]
-        return camera_errors(bench, sensor, frame=frame, settings=imaging, blocks=self._blocks)
+            return scanner_errors(bench, sensor, frame=frame, settings=self.settings)
+        return camera_errors(bench, sensor, frame=frame, settings=self.settings, blocks=self._blocks)
 
 
 def sensors_with(sensors: Sequence[Scanner | Camera], *, kinds: Collection[str]) -> list[Scanner | Camera]:
@@ -289,12 +294,11 @@ def camera_errors(
     truth = pixels(shot, chosen, world=whole, settings=exact)
     world = bench.world(camera, frame, backend=FAST, settings=near)
 
-    def errors() -> Iterator[ImageError]:
-        for one in settings:
-            found = pixels(shot, chosen, world=world, settings=replace(one, camera_noise=False))
-            yield image_error(replace(found, depth=counts_to_depth(depth_to_counts(found.depth))), truth)
+    def error(one: CameraSettings) -> ImageError:
+        found = pixels(shot, chosen, world=world, settings=replace(one, camera_noise=False))
+        return image_error(replace(found, depth=counts_to_depth(depth_to_counts(found.depth))), truth)
 
-    return list(errors())
+    return [error(one) for one in settings]
 
 
 def image_figures(frames: Sequence[ImageError], *, camera: Camera) -> dict[str, float]:

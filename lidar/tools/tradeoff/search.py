@@ -24,10 +24,20 @@ from lidar.simulation.plan import DrivePlan, plan_drive
 from lidar.simulation.record import record_frame
 from lidar.tools.tradeoff.bench import spread_frames
 from lidar.tools.tradeoff.errors import ErrorEstimate, median
-from lidar.tools.tradeoff.ladders import Kind, Ladder, label_of, ladders_of, settings_of_rows
-from lidar.tools.tradeoff.pick import PERCENT, Pick, PickCost
-from lidar.tools.tradeoff.sample import DriveSample, SensorSettings, sensors_with
-from lidar.tools.tradeoff.sensor_errors import error_text, kinds_of, stated
+from lidar.tools.tradeoff.pick import (
+    PERCENT,
+    Kind,
+    Ladder,
+    Pick,
+    PickCost,
+    kinds_of,
+    label_of,
+    ladders_of,
+    settings_of_rows,
+    stated,
+    workers_text,
+)
+from lidar.tools.tradeoff.sample import DriveSample, sensors_with
 from lidar.world.thread_worlds import Worlds
 
 SAMPLES = (12, 24, 48, 96)
@@ -63,12 +73,8 @@ class Search:
         """The sample of a kind of sensors, of all rows of its ladder."""
         if kind not in self._samples:
             ladder, own = self.ladders[kind], self.plan.options.recording_settings
-            values: list[dict[str, Any]] = [ladder.values(row) for row in range(len(ladder.rows))]
-            rows: list[SensorSettings]
-            if kind == "scanners":
-                rows = [replace(own.scanner, **changed) for changed in values]
-            else:
-                rows = [replace(own.camera, **changed) for changed in values]
+            settings: Any = own.scanner if kind == "scanners" else own.camera
+            rows = [replace(settings, **ladder.values(row)) for row in range(len(ladder.rows))]
             sensors = sensors_with(ladder.sensors, kinds=self.kinds)
             self._samples[kind] = DriveSample(self.plan, sensors, settings=rows, progress=self.progress)
         return self._samples[kind]
@@ -196,7 +202,7 @@ def _out_of_reach(accuracy: AccuracyTarget, error: ErrorEstimate, *, figure: str
     if figure == "rgb_rms":
         return (
             f"`accuracy` {accuracy.text}: no number of rays is sure to reach {levels(accuracy.levels)};"
-            f" {label} comes nearest with {error_text(error, size=levels)}: give"
+            f" {label} comes nearest with {error.to_text(levels)}: give"
             f" {levels(_round_up(error.high))} or more"
         )
     what, of = ("number of rays", "returns") if figure.startswith("range") else ("image", "depths")
@@ -204,7 +210,7 @@ def _out_of_reach(accuracy: AccuracyTarget, error: ErrorEstimate, *, figure: str
     length, smaller = accuracy.text.split("@")[0].split(",")[0], _smaller(accuracy.percent)
     return (
         f"`accuracy` {accuracy.text}: no {what} is sure to reach {metres(accuracy.metres)} at"
-        f" {accuracy.percent:g} % of the {of}; {nearest} nearest with {error_text(error)}: give"
+        f" {accuracy.percent:g} % of the {of}; {nearest} nearest with {error.to_text()}: give"
         f" {metres(_round_up(error.high))} or more, or a smaller share, as in {length}@{smaller:g}"
     )
 
@@ -234,7 +240,7 @@ def find_affordable(search: Search, *, budget: str, pace: float, workers: int) -
         speed = slowest(search.cost(rows).record, workers)
         raise InputError(
             f"`budget` {budget}: even {label} is simulated at {speed:.2g} x real time with"
-            f" {workers_text(workers)}; give more time"
+            f" {workers_text(threads(workers))}; give more time"
         )
     while True:
         raised = [
@@ -256,12 +262,6 @@ def slowest(cost: ErrorEstimate, workers: int) -> float:
 def threads(workers: int) -> int:
     """Number of threads that work at a time."""
     return min(workers, os.cpu_count() or 1)
-
-
-def workers_text(workers: int) -> str:
-    """A number of workers as text."""
-    count = threads(workers)
-    return f"{count} worker{'s' * (count > 1)}"
 
 
 def pick_by_sample(
@@ -324,6 +324,7 @@ def _over_budget(
     workers = search.plan.options.workers
     return (
         f"`accuracy` {asked.text} takes {needed}, simulated at"
-        f" {slowest(search.cost(rows).record, workers):.2g} x real time with {workers_text(workers)}, and"
-        f" `budget` {wanted.budget} allows {allowed}, with which {errors.to_text('should be')}"
+        f" {slowest(search.cost(rows).record, workers):.2g} x real time with"
+        f" {workers_text(threads(workers))}, and `budget` {wanted.budget} allows {allowed}, with which"
+        f" {errors.to_text('should be')}"
     )

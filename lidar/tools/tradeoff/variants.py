@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from geoscene.relief import RELIEFS
 from lidar.grammar import value_text
@@ -69,11 +69,11 @@ SAMPLES = 16
 BLURRED, MOMENTS = 4, 64
 """Rays along each side of a pixel, and samples of the exposure, of the reference of a blurred image."""
 
-S = TypeVar("S", ScannerSettings, CameraSettings)
+Settings = ScannerSettings | CameraSettings
 
 
 @dataclass(frozen=True, slots=True)
-class SettingVariant(Generic[S]):
+class SettingVariant:
     """One row of a comparison of settings of a scanner or a camera.
 
     changes : name and value of each setting that is changed; empty for the user's own settings
@@ -85,8 +85,8 @@ class SettingVariant(Generic[S]):
     """
 
     changes: tuple[tuple[str, Any], ...]
-    used: S
-    alone: S
+    used: Any
+    alone: Any
     world: WorldSettings
     alone_world: WorldSettings
     scene: int = 0
@@ -114,7 +114,7 @@ class SettingVariant(Generic[S]):
 
 
 @dataclass(frozen=True, slots=True)
-class Basis(Generic[S]):
+class Basis:
     """Settings of which variants are made.
 
     used  : the user's, without random effects
@@ -123,8 +123,8 @@ class Basis(Generic[S]):
     built : relief of the scene, of `geoscene.relief.RELIEFS`
     """
 
-    used: S
-    exact: S
+    used: Settings
+    exact: Settings
     world: WorldSettings = WHOLE
     built: str = "off"
 
@@ -135,7 +135,7 @@ class Basis(Generic[S]):
 
     def variant(
         self, changes: Iterable[tuple[str, Any]] = (), *, scene: int = 0, traffic: bool = True
-    ) -> SettingVariant[S]:
+    ) -> SettingVariant:
         """The variant with some settings changed."""
         changes = tuple(changes)
         values = dict(changes)
@@ -172,11 +172,8 @@ class Basis(Generic[S]):
         return ", ".join(f"{name}={value_text(self.value(name))}" for name in shown)
 
 
-_Any = TypeVar("_Any", ScannerSettings, CameraSettings, WorldSettings)
-
-
-def _change(settings: _Any, values: Mapping[str, Any]) -> _Any:
-    """Settings with those values that they have."""
+def _change(settings: Any, values: Mapping[str, Any]) -> Any:
+    """Settings of a sensor or the world with those values that they have."""
     own = {f.name for f in fields(settings)}
     return replace(settings, **{name: value for name, value in values.items() if name in own})
 
@@ -228,8 +225,8 @@ def coarser(settings: CameraSettings) -> CameraSettings:
 
 
 def variants_of(
-    basis: Basis[S], *, compared: Sequence[str] = (), scenes: Sequence[str] = (), traffic: bool = False
-) -> list[SettingVariant[S]]:
+    basis: Basis, *, compared: Sequence[str] = (), scenes: Sequence[str] = (), traffic: bool = False
+) -> list[SettingVariant]:
     """The user's settings, these with one setting changed, and combinations of cheap ones.
 
     compared : names of settings; all by default
@@ -260,14 +257,12 @@ def variants_of(
     return [row for row in rows if _fewer_rays(row.used, basis.exact) or not row.changes]
 
 
-def _fewer_rays(one: S, exact: S) -> bool:
+def _fewer_rays(one: Settings, exact: Settings) -> bool:
     """Whether settings of a scanner have fewer rays than the reference; true of cameras."""
-    if isinstance(one, ScannerSettings) and isinstance(exact, ScannerSettings):
-        return one.rays < exact.rays
-    return True
+    return isinstance(one, CameraSettings) or isinstance(exact, CameraSettings) or one.rays < exact.rays
 
 
-def without_each(basis: Basis[S], variant: SettingVariant[S]) -> Iterator[tuple[str, SettingVariant[S]]]:
+def without_each(basis: Basis, variant: SettingVariant) -> Iterator[tuple[str, SettingVariant]]:
     """Each change of a variant, as text, and the variant without it."""
     for k, (name, value) in enumerate(variant.changes):
         rest = variant.changes[:k] + variant.changes[k + 1 :]

@@ -19,13 +19,12 @@ from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_bud
 from lidar.simulation.drive import DriveSummary, drive
 from lidar.simulation.plan import plan_drive
 from lidar.tools.sweep import sweep
-from lidar.tools.tradeoff import ladders, search
+from lidar.tools.tradeoff import pick, search
 from lidar.tools.tradeoff.accuracy import CheckedDrive, SpotCheck, driven, pick_settings
 from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns, resample
-from lidar.tools.tradeoff.ladders import Ladder, settings_of_rows
+from lidar.tools.tradeoff.pick import Ladder, SensorErrors, settings_of_rows, stated
 from lidar.tools.tradeoff.sample import DriveSample, SampledError, range_figures, sampled_error
 from lidar.tools.tradeoff.search import DriveCost, find_accurate, find_affordable, pace_of
-from lidar.tools.tradeoff.sensor_errors import SensorErrors, stated
 
 DRIVE = DriveOptions(route="random", rig="vlp16", duration=0.5, seed=3, formats=("pcd",))
 
@@ -314,8 +313,8 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
 def quick():
     """Smaller samples, so that a search takes a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladders, "RAYS", (1, 7, 61))
-        patch.setattr(ladders, "SUPERSAMPLES", (1, 3))
+        patch.setattr(pick, "RAYS", (1, 7, 61))
+        patch.setattr(pick, "SUPERSAMPLES", (1, 3))
         measure_little(patch)
         yield
 

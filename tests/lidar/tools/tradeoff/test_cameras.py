@@ -8,12 +8,10 @@ import pytest
 from lidar.options import DriveOptions, TradeoffOptions
 from lidar.sensors.camera.settings import PLAIN
 from lidar.simulation.plan import plan_drive
-from lidar.tools.tradeoff.bench import FAST, bench_of
+from lidar.tools.tradeoff.bench import FAST, Pixels, bench_of, blocks_of_frame, image, image_error, pixels
 from lidar.tools.tradeoff.compare import compare_settings
-from lidar.tools.tradeoff.comparison import recommendation
 from lidar.tools.tradeoff.errors import IMAGE_STATISTICS, estimates
-from lidar.tools.tradeoff.images import Pixels, blocks_of_frame, image, image_error, pixels
-from lidar.tools.tradeoff.report import document, write_report
+from lidar.tools.tradeoff.report import document, recommendation, write_report
 
 RIG = """
 name = "front"

@@ -15,17 +15,18 @@ from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.simulation.plan import plan_drive
 from lidar.tools.tradeoff.bench import bench_of, chosen_pulses, spread_frames
 from lidar.tools.tradeoff.compare import compare_settings, scene_label
-from lidar.tools.tradeoff.comparison import SensorComparison, VariantRow, pareto, recommendation
-from lidar.tools.tradeoff.costs import costs, frame_cost
 from lidar.tools.tradeoff.errors import (
     STATISTICS,
     ErrorEstimate,
     PulseReturns,
+    SensorComparison,
+    VariantRow,
     estimates,
     frame_error,
     median,
 )
-from lidar.tools.tradeoff.report import document, write_report
+from lidar.tools.tradeoff.report import document, pareto, recommendation, write_report
+from lidar.tools.tradeoff.sensors import costs, frame_cost
 from lidar.tools.tradeoff.variants import Basis, next_step, noiseless, scanner_reference, variants_of
 from lidar.world.settings import PLAIN as WHOLE
 from lidar.world.settings import WorldSettings
@@ -275,7 +276,7 @@ def test_rows_of_the_world_are_timed_in_their_own_world(scene, monkeypatch):
         used.append(variant.world.reach)
         return frame_cost(bench, sensor, variant=variant, frame=frame)
 
-    monkeypatch.setattr("lidar.tools.tradeoff.costs.frame_cost", counted)
+    monkeypatch.setattr("lidar.tools.tradeoff.sensors.frame_cost", counted)
     found = costs(bench, scanner, variants=variants, repetitions=3, progress=silent)
     assert used == [inf, *[inf, 25.0] * 3]
     assert all(f["cpu_s"].value > 0 and f["memory_bytes"].value > 2**20 for f in found)
