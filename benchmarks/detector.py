@@ -19,7 +19,8 @@ from pathlib import Path
 from geoscene.scene.layout import SceneFiles
 from lidar.dataset.layout import Paths
 from lidar.tools.detection.registry import MODEL
-from lidar.tools.redteam.evaluate import DetectorAccuracy, accuracies
+from lidar.tools.redteam.evaluate import accuracies
+from lidar.tools.redteam.matrix import DetectorAccuracy
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure
 
@@ -130,7 +131,7 @@ def _accuracy(detector: str, drives: list[Path], figures: Path) -> list[Detector
         case = AttackCase(drive, None, figures / f"{drive.name}.json", (), MEASURE.score, detector)
         figures.mkdir(parents=True, exist_ok=True)
         rows = measure_drive(case)["frames"]
-        frames += [((drive.name, int(frame["seconds"] // MEASURE.block)), frame) for frame in rows]
+        frames += [f | {"block": (drive.name, int(f["seconds"] // MEASURE.block))} for f in rows]
     return list(accuracies(frames, measure=MEASURE, known={"setting": {}, "scene": "all"}))
 
 

@@ -24,15 +24,28 @@ from lidar.dataset.layout import Dataset
 from lidar.dataset.png import write_png
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.random_streams import generator
-from lidar.tools.defences.calibration import Calibration, Joint, calibration_text, tail_of
-from lidar.tools.defences.fusion import FUSED, fuse_verdicts, fused_threshold, joint_of
-from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.reading import RecordedScans, read_scans
-from lidar.tools.defences.registry import NamedDefence
-from lidar.tools.defences.run import Judged, able, judged_frames
-from lidar.tools.defences.scores import FALSE_ALARMS, LEVELS, Score, SuspicionCounts, score
-from lidar.tools.defences.truth import FrameTruth, attack_truth
-from lidar.tools.defences.verdict import Verdict
+from lidar.tools.defences.calibration import (
+    FUSED,
+    Calibration,
+    Joint,
+    calibration_text,
+    fuse_verdicts,
+    fused_threshold,
+    joint_of,
+    tail_of,
+)
+from lidar.tools.defences.defence import Verdict
+from lidar.tools.defences.observation import RecordedScans, read_scans
+from lidar.tools.defences.registry import Judged, NamedDefence, able, judged_frames
+from lidar.tools.defences.scores import (
+    FALSE_ALARMS,
+    LEVELS,
+    FrameTruth,
+    Score,
+    SuspicionCounts,
+    attack_truth,
+    score,
+)
 from lidar.tools.detection import RULES, Detector
 
 _MARK = "defend.json"
@@ -42,6 +55,7 @@ _NAMES = rf"{_MARK}|(frames|objects)\.csv|[^/]+/[^/]+/(\d{{6,}}\.npz|\w+/\d{{6,}
 """Regular expression of the paths of the files of verdicts."""
 
 _Pairs = list[tuple[Float, NDArray[np.bool_]]]
+_Row = dict[str, Any]
 
 
 @dataclass
@@ -118,7 +132,7 @@ def defend(
 
     calibration : of the same detector
     detector  : that gives the boxes
-    rule      : of `fusion.FUSIONS`, by which verdicts of several are also fused; none if empty
+    rule      : of `calibration.FUSIONS`, by which verdicts of several are also fused; none if empty
     overwrite : replace a directory with former verdicts; other files there are kept
 
     Raises InputError if the data lack what a defence needs, before anything is judged.
@@ -157,19 +171,22 @@ def _judge(
         thresholds |= {
             (FUSED, level): fused_threshold(calibration, names, level=level, rule=rule) for level in LEVELS
         }
-    tally, tables = DefenceTally(), _Tables()
+    tally, tables = DefenceTally(), {"frames": list[_Row](), "objects": list[_Row]()}
     for place, scans, judged in job.judged(progress):
         if rule:
             judged.verdicts[FUSED] = fuse_verdicts(dict(judged.verdicts), calibration, rule=rule)
         frame = judged.frame
-        truth = _truth_of(scans, frame)
+        truth = attack_truth(scans, frame)
         tally.add(judged, truth)
         if out is not None:
-            tables.add(place, judged, truth=truth, thresholds=thresholds)
+            for name, row in _rows(place, judged, truth=truth, thresholds=thresholds):
+                tables[name].append(row)
             _write_returns(out / place / f"{frame.number:06d}.npz", judged.verdicts)
             _write_pictures(out / place, judged, defences=defences, thresholds=thresholds)
     if out is not None:
-        tables.write(out)
+        for name, rows in tables.items():
+            if rows:
+                write_columns(out / f"{name}.csv", {key: [row[key] for row in rows] for key in rows[0]})
     rng = generator(job.seed, "bootstrap")
     return Defended(
         tally.frames,
@@ -219,14 +236,10 @@ def calibrate(
 
     Raises DatasetError if a frame was attacked.
     """
-    job, tally, names = (
-        _job(datasets, defences, scene=scene, seed=seed, detector=detector),
-        DefenceTally(),
-        [],
-    )
+    job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+    tally, names = DefenceTally(), []
     for _, scans, judged in job.judged(progress):
-        frame = judged.frame
-        truth = _truth_of(scans, frame)
+        truth = attack_truth(scans, judged.frame)
         if truth.attacked:
             raise DatasetError(f"{scans.dataset.path}: was attacked; calibrate on genuine data")
         tally.add(judged, truth)
@@ -287,13 +300,6 @@ def _job(
     return job
 
 
-def _truth_of(scans: RecordedScans, frame: Observation) -> FrameTruth:
-    """Ground truth of the attacks on a frame."""
-    seconds = frame.start_ns * 1e-9
-    name, count = scans.sensor.name, len(frame)
-    return attack_truth(scans.dataset, name, frame=frame.number, count=count, seconds=seconds)
-
-
 def _write_returns(path: Path, verdicts: dict[str, Verdict]) -> None:
     """Suspicions of the returns of a frame by defence, and places of missing ones, as a NumPy archive."""
     columns: dict[str, NDArray[Any]] = {}
@@ -324,43 +330,26 @@ def _write_pictures(
             write_png(folder / named.name / f"{judged.frame.number:06d}_{name}.png", image)
 
 
-class _Tables:
-    """Rows of ``frames.csv`` and ``objects.csv``."""
-
-    def __init__(self) -> None:
-        self.frames: list[dict[str, Any]] = []
-        self.objects: list[dict[str, Any]] = []
-
-    def add(
-        self, place: Path, judged: Judged, *, truth: FrameTruth, thresholds: dict[tuple[str, str], float]
-    ) -> None:
-        """Add a frame."""
-        frame, boxes = judged.frame, judged.frame.objects
-        forged = truth.objects(frame.members)
-        for name, verdict in judged.verdicts.items():
-            known = {"data": str(place), "frame": frame.number, "defence": name}
-            self.frames.append(
-                known
-                | {
-                    "suspicion": round(verdict.frame, 5),
-                    "alarm": int(verdict.frame > thresholds[name, "frames"]),
-                    "attacked": int(truth.attacked),
-                    "attacked_returns": int(truth.returns.sum()),
-                    "removed_returns": len(truth.removed_xyz),
-                }
-            )
-            for k, suspicion in enumerate(() if verdict.objects is None else verdict.objects):
-                box = dict(zip(("x", "y", "z"), boxes.centre[k].round(3).tolist(), strict=True))
-                box |= dict(zip(("length", "width", "height"), boxes.size[k].round(3).tolist(), strict=True))
-                alarm = int(suspicion > thresholds[name, "objects"])
-                self.objects.append(
-                    known
-                    | {"object": k, **box, "yaw": round(float(boxes.yaw[k]), 4), "kind": str(boxes.kind[k])}
-                    | {"suspicion": round(float(suspicion), 5), "alarm": alarm, "forged": int(forged[k])}
-                )
-
-    def write(self, out: Path) -> None:
-        """Write the tables that have rows."""
-        for name, rows in (("frames", self.frames), ("objects", self.objects)):
-            if rows:
-                write_columns(out / f"{name}.csv", {key: [row[key] for row in rows] for key in rows[0]})
+def _rows(
+    place: Path, judged: Judged, *, truth: FrameTruth, thresholds: dict[tuple[str, str], float]
+) -> Iterator[tuple[str, _Row]]:
+    """Rows of ``frames.csv`` and ``objects.csv`` of a frame, with the name of the table."""
+    frame, boxes = judged.frame, judged.frame.objects
+    forged = truth.objects(frame.members)
+    for name, verdict in judged.verdicts.items():
+        known: _Row = {"data": str(place), "frame": frame.number, "defence": name}
+        of_frame: _Row = {
+            "suspicion": round(verdict.frame, 5),
+            "alarm": int(verdict.frame > thresholds[name, "frames"]),
+            "attacked": int(truth.attacked),
+            "attacked_returns": int(truth.returns.sum()),
+            "removed_returns": len(truth.removed_xyz),
+        }
+        yield "frames", known | of_frame
+        for k, suspicion in enumerate(() if verdict.objects is None else verdict.objects):
+            box: _Row = dict(zip(("x", "y", "z"), boxes.centre[k].round(3).tolist(), strict=True))
+            box |= dict(zip(("length", "width", "height"), boxes.size[k].round(3).tolist(), strict=True))
+            box |= {"yaw": round(float(boxes.yaw[k]), 4), "kind": str(boxes.kind[k])}
+            alarm = int(suspicion > thresholds[name, "objects"])
+            found = {"suspicion": round(float(suspicion), 5), "alarm": alarm, "forged": int(forged[k])}
+            yield "objects", known | {"object": k} | box | found

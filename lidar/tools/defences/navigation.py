@@ -10,10 +10,9 @@ from scipy.spatial import cKDTree
 
 from geoscene.typing import Float
 from lidar.parameters import parameter
-from lidar.tools.defences.defence import Defence, Window
+from lidar.tools.defences.defence import Defence, Verdict, Window
 from lidar.tools.defences.observation import NavigationMeasurements as Measured
 from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.verdict import Verdict
 
 _LAG = 10
 """Frames over which increments are compared."""

@@ -1,9 +1,9 @@
-"""Input of a defence: a frame's measurements, never labels or ground truth."""
+"""Input of a defence: a frame's measurements as a dataset has them, never labels or ground truth."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,14 +13,28 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from geoscene.typing import Float, Ints
+from lidar.dataset.formats import FORMATS
+from lidar.dataset.layout import Dataset, opened_rows, reading_file
+from lidar.dataset.png import read_png
+from lidar.dataset.recorded import Stream, cloud_points, clouds_in, color_images
+from lidar.errors import DatasetError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
+from lidar.sensors.physics.intensity import apparent_of_code
+from lidar.sensors.physics.link import amplitude
+from lidar.sensors.rig.devices import Scanner, cameras, scanners
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor, firings
-from lidar.sensors.rig.specs import CameraSpec
+from lidar.sensors.rig.specs import CameraSpec, rig_of
 from lidar.tools.detection import RULES, Detections, Detector
 from lidar.tools.detection.detector import inside
 from lidar.tools.detection.ground import Ground, ground_of
+
+SEEN = ("x", "y", "z", "intensity", "time_ns", "ring", "column", "range", "echo", "echoes")
+"""Columns of a recorded cloud that come from the scanner; the others are ground truth."""
+
+_FIXES = ("lon", "lat", "h", "quality", "hdop")
+_INERTIAL = ("gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z")
 
 GROUND_BAND = 0.3
 """Metres above the ground up to which returns count as of the ground, as for the detector."""
@@ -49,8 +63,6 @@ class Picture:
 @functools.lru_cache(maxsize=4)
 def pixels_of(file: Path) -> NDArray[np.uint8]:
     """Colours (h, w, 3) of a PNG file."""
-    from lidar.dataset.png import read_png  # noqa: PLC0415
-
     return read_png(file)[..., :3].astype(np.uint8)
 
 
@@ -107,6 +119,21 @@ class Observation:
     def __len__(self) -> int:
         """Number of returns."""
         return len(self.xyz)
+
+    @functools.cached_property
+    def apparent(self) -> Float:
+        """Apparent reflectance (n,) by the intensity."""
+        return apparent_of_code(self.intensity, diffuse_code=self.sensor.diffuse_code)
+
+    def power(self, apparent: Float, distance: Float) -> Float:
+        """Power over the detection threshold of targets of an apparent reflectance, metres away."""
+        return amplitude(
+            apparent,
+            distance,
+            reference_reflectance=self.sensor.reference_reflectance,
+            reference_range=self.sensor.reference_range,
+            falloff=self.sensor.falloff,
+        )
 
     @functools.cached_property
     def distance(self) -> Float:
@@ -240,3 +267,132 @@ def _direction_cell(points: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]
         np.clip(cell, 0, most - 1).astype(np.int64) for cell, most in zip(cells, _DIRECTIONS, strict=True)
     )
     return first, second
+
+
+@dataclass(frozen=True)
+class RecordedScans:
+    """The frames of a scanner.
+
+    pictures   : images of the cameras, by camera
+    navigation : of the vehicle; None without a receiver or an inertial unit
+    detector   : of road users
+    """
+
+    dataset: Dataset
+    sensor: Sensor
+    clouds: Stream
+    trajectory: Trajectory
+    pictures: tuple[tuple[CameraSpec, Stream], ...]
+    navigation: NavigationMeasurements | None
+    detector: Detector = RULES
+
+    @property
+    def frames(self) -> Ints:
+        """Numbers of the frames."""
+        return self.clouds.frames
+
+    def __iter__(self) -> Iterator[Observation]:
+        """The frames in order."""
+        return map(self.frame, range(len(self.clouds.frames)))
+
+    def frame(self, row: int) -> Observation:
+        """A frame by its row of `frames`.
+
+        Raises DatasetError for a damaged file.
+        """
+        start, number = int(self.clouds.time_ns[row]), int(self.clouds.frames[row])
+        table = {name: c for name, c in cloud_points(self.clouds.files[row]).items() if name in SEEN}
+        xyz = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float64)
+        whole = {
+            name: table[name].astype(np.int64) for name in ("time_ns", "ring", "column", "echo", "echoes")
+        }
+        return Observation(
+            number=number,
+            start_ns=start,
+            sensor=self.sensor,
+            mount=self.clouds.mount,
+            trajectory=self.trajectory,
+            xyz=xyz,
+            range=table["range"].astype(np.float64),
+            intensity=table["intensity"].astype(np.float64),
+            pictures=tuple(
+                picture
+                for camera, images in self.pictures
+                for picture in _pictures_during(camera, images, window_ns=self.sensor.window_ns(number))
+            ),
+            navigation=self.navigation,
+            detector=self.detector,
+            **(whole | {"time_ns": start + whole["time_ns"]}),
+        )
+
+
+def read_scans(dataset: Dataset, *, detector: Detector = RULES) -> list[RecordedScans]:
+    """The frames of each scanner of a dataset, with the boxes of a detector.
+
+    Raises InputError if the rig's files have changed since the drive, and DatasetError if clouds are not in
+    the sensor frame with ring, column and time.
+    """
+    with reading_file(dataset.paths.manifest):
+        rig = rig_of(str(dataset.manifest["recipe"]["rig"]))
+    trajectory = dataset.trajectory()
+    specs = {camera.name: camera.spec for camera in cameras(rig)}
+    streams = ((name, color_images(dataset, name)) for name in dataset.sensors("camera") if name in specs)
+    pictures = tuple((specs[name], stream) for name, stream in streams if stream is not None)
+    navigation = _navigation(dataset)
+    found = [
+        RecordedScans(
+            dataset,
+            scanner.sensor,
+            _clouds(dataset, scanner),
+            trajectory=trajectory,
+            pictures=pictures,
+            navigation=navigation,
+            detector=detector,
+        )
+        for scanner in scanners(rig)
+    ]
+    if not found:
+        raise DatasetError(f"{dataset.path}: has no scanner")
+    return found
+
+
+def _clouds(dataset: Dataset, scanner: Scanner) -> Stream:
+    able = [form for form in FORMATS.values() if form.frame == "sensor" and set(SEEN) <= set(form.columns)]
+    for form in able:
+        if (stream := clouds_in(dataset, scanner.name, form=form)) is not None:
+            return stream
+    raise DatasetError(
+        f"{dataset.path}: {scanner.name} has no clouds in the sensor frame with ring, column and time;"
+        f" drive again with `formats` {' or '.join(form.name for form in able)}"
+    )
+
+
+def _pictures_during(camera: CameraSpec, images: Stream, *, window_ns: tuple[int, int]) -> list[Picture]:
+    """A camera's pictures from just before to just after a frame."""
+    room = int(0.5e9 / camera.rate_hz)
+    near = (images.time_ns >= window_ns[0] - room) & (images.time_ns <= window_ns[1] + room)
+    return [Picture(camera, int(images.time_ns[k]), images.files[k]) for k in np.flatnonzero(near)]
+
+
+def _navigation(dataset: Dataset) -> NavigationMeasurements | None:
+    receivers, units = dataset.sensors("gnss"), dataset.sensors("imu")
+    if not receivers or not units:
+        return None
+    receiver, unit = next(iter(receivers)), next(iter(units))
+    gnss = _columns(dataset, receiver, names=_FIXES)
+    imu = _columns(dataset, unit, names=_INERTIAL)
+    x, y = dataset.frame.from_geographic(np.nan_to_num(gnss["lon"]), np.nan_to_num(gnss["lat"]))
+    place = np.column_stack([x, y])
+    place[~np.isfinite(gnss["lon"])] = np.nan
+    mount = np.array(receivers[receiver]["vehicle_from_sensor"], float)
+    return NavigationMeasurements(gnss, imu, mount[:3, 3], place)
+
+
+def _columns(dataset: Dataset, name: str, *, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    """Columns of a device's measurements; none of its ground truth."""
+    path = dataset.paths.measurements(name)
+    with reading_file(path), opened_rows(path) as rows:
+        table = [(int(row["time_ns"]), *(float(row[column]) for column in names)) for row in rows]
+    values = np.array([row[1:] for row in table], float).reshape(-1, len(names))
+    time_ns = np.array([row[0] for row in table], np.int64)
+    return {"time_ns": time_ns, **dict(zip(names, values.T, strict=True))}

@@ -16,9 +16,8 @@ from scipy.spatial import ConvexHull, QhullError
 from geoscene.typing import Float
 from lidar.parameters import parameter
 from lidar.sensors.rig.camera_model import project
-from lidar.tools.defences.defence import Defence, Window
+from lidar.tools.defences.defence import Defence, Verdict, Window, of_boxes
 from lidar.tools.defences.observation import Observation, Picture, pixels_of
-from lidar.tools.defences.verdict import Verdict, of_objects
 
 _BLUR = 1.0
 """Pixels, standard deviation of the filter before edges are computed."""
@@ -65,12 +64,12 @@ class Overlay(Defence):
     def judge(self, window: Window) -> Verdict:
         """Judge the bounding boxes of the last frame that are in view of a camera."""
         frame = window.frame
-        objects = np.zeros(len(frame.objects))
+        objects = [0.0] * len(frame.objects)
         for row in range(len(frame.objects)):
             found = [e for picture in frame.pictures if (e := self.evidence(frame, row, picture=picture))]
             if found:
                 objects[row] = min(suspicion_of(one) for one in found)
-        return of_objects(len(frame), frame.members, objects=objects)
+        return of_boxes(frame, objects)
 
     def pictures(
         self, frame: Observation, verdict: Verdict, *, threshold: float
@@ -167,18 +166,21 @@ def hull_of(pixels: Float) -> Float | None:
 
 def outline_samples(corners: Float) -> tuple[Float, Float]:
     """Places (s, 2) evenly along a convex outline, and the normals (s, 2) outwards."""
-    following = np.roll(corners, -1, axis=0)
-    side = following - corners
-    length = np.linalg.norm(side, axis=1)
+    side, length, normal = _sides(corners)
     along = (np.arange(_SAMPLES) + 0.5) / _SAMPLES * length.sum()
     ends = np.cumsum(length)
     row = np.minimum(np.searchsorted(ends, along), len(corners) - 1)
     part = (along - (ends[row] - length[row])) / np.maximum(length[row], 1e-9)
-    places = corners[row] + part[:, None] * side[row]
-    normals = np.column_stack([side[row, 1], -side[row, 0]]) / np.maximum(length[row], 1e-9)[:, None]
-    outwards = np.einsum("ij,ij->i", normals, places - corners.mean(axis=0)) < 0
-    normals[outwards] *= -1
-    return places, normals
+    return corners[row] + part[:, None] * side[row], normal[row]
+
+
+def _sides(corners: Float) -> tuple[Float, Float, Float]:
+    """Sides (k, 2) of a convex outline, their lengths (k,), and normals (k, 2) outwards."""
+    side = np.roll(corners, -1, axis=0) - corners
+    length = np.linalg.norm(side, axis=1)
+    normal = np.column_stack([side[:, 1], -side[:, 0]]) / np.maximum(length, 1e-9)[:, None]
+    normal[np.einsum("ij,ij->i", normal, corners - corners.mean(axis=0)) < 0] *= -1
+    return side, length, normal
 
 
 @functools.lru_cache(maxsize=4)
@@ -231,15 +233,9 @@ def _hellinger(one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
 
 def _outside(pixels: NDArray[np.int64], corners: Float, *, scale: Float) -> Float:
     """Distance (n,) of pixels outside a convex outline, in units of a scale by axis; negative inside."""
-    places, following = corners, np.roll(corners, -1, axis=0)
-    side = following - places
-    normal = np.column_stack([side[:, 1], -side[:, 0]])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    if np.einsum("ij,ij->i", normal, places - corners.mean(axis=0)).sum() < 0:
-        normal = -normal
-    over = np.einsum("nkj,kj->nk", pixels[:, None] - places[None], normal)
-    reach = np.abs(normal) @ scale
-    found: Float = (over / reach).max(axis=1)
+    normal = _sides(corners)[2]
+    over = np.einsum("nkj,kj->nk", pixels[:, None] - corners[None], normal)
+    found: Float = (over / (np.abs(normal) @ scale)).max(axis=1)
     return found
 
 

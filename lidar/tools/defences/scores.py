@@ -1,15 +1,21 @@
-"""Scores of suspicions against the truth: ROC, detection at fixed false alarms, bootstrap intervals."""
+"""Ground truth, which defences never see, and scores of suspicions against it: ROC, bootstrap intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Float
+from lidar.dataset.layout import reading_file
+from lidar.errors import DatasetError
+from lidar.sensors.physics.origin import Origin
+from lidar.signal.registry import ATTACKS, acts_on
+from lidar.tools.defences.observation import Observation, RecordedScans
 
 LEVELS = ("returns", "objects", "frames")
 """What is scored."""
@@ -20,6 +26,73 @@ FALSE_ALARMS = {"returns": 0.001, "objects": 0.01, "frames": 0.05}
 BINS = 2000
 """Steps of suspicion that samples are counted in."""
 _BOOTSTRAPS = 1000
+
+FORGED = (Origin.INJECTED, Origin.REPLAYED, Origin.MOVED)
+"""Origins of returns that an attack adds or moves."""
+
+FORGED_SHARE = 0.5
+"""Share of a box's returns from which on attacked ones make it a forged object."""
+
+
+@dataclass(frozen=True, slots=True)
+class FrameTruth:
+    """Ground truth of the attacks on a frame.
+
+    returns     : (n,) bool, returns that an attack gave
+    removed_xyz : (k, 3) metres, sensor frame: genuine returns that are missing
+    """
+
+    returns: NDArray[np.bool_]
+    removed_xyz: Float
+
+    @property
+    def attacked(self) -> bool:
+        """Whether the frame differs from what the sensor measured."""
+        return bool(self.returns.any()) or len(self.removed_xyz) > 0
+
+    def objects(self, members: Sequence[NDArray[np.intp]]) -> NDArray[np.bool_]:
+        """Whether each box (m,), of which the rows of its returns are given, is forged."""
+        return np.array(
+            [len(rows) > 0 and self.returns[rows].mean() >= FORGED_SHARE for rows in members], bool
+        )
+
+
+def attack_truth(scans: RecordedScans, frame: Observation) -> FrameTruth:
+    """As `frame_truth`; returns that are missing count only while an attack on the sensor's returns goes on.
+
+    Weather, lost packets and dirt take returns, too, and are no attacks.
+    """
+    truth, recipe = frame_truth(scans, frame), scans.dataset.manifest["recipe"]
+    with reading_file(scans.dataset.paths.manifest):
+        stages = [table for key in ("stages", "applied_stages") for table in recipe.get(key, ())]
+        goes_on = any(
+            table["name"] in ATTACKS
+            and acts_on(table, scans.sensor.name, kind="lidar")
+            and table["start"] <= frame.start_ns * 1e-9 < table["stop"]
+            for table in stages
+        )
+    return truth if goes_on else replace(truth, removed_xyz=truth.removed_xyz[:0])
+
+
+def frame_truth(scans: RecordedScans, frame: Observation) -> FrameTruth:
+    """The truth of a frame; without a truth file nothing was changed.
+
+    Returns that weather hid are not counted as missing.
+
+    Raises DatasetError for a truth file that is damaged or of another cloud.
+    """
+    path = scans.dataset.paths.truth(scans.sensor.name, frame.number)
+    if not path.exists():
+        return FrameTruth(np.zeros(len(frame), bool), np.empty((0, 3)))
+    with reading_file(path):
+        file = read_arrays(path)
+        origin, hidden, removed = file["origin"], file["hidden"], file["removed"]
+        xyz = file["removed_xyz"].astype(np.float64).reshape(-1, 3)
+    if len(origin) != len(frame):
+        raise DatasetError(f"{path}: is of {len(origin)} returns, the cloud has {len(frame)}")
+    by_weather = hidden[(origin == Origin.WEATHER) & (hidden >= 0)]
+    missing = ~np.isin(removed, by_weather)
+    return FrameTruth(np.isin(origin, FORGED), xyz[missing])
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,19 +6,26 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lidar.geometry.random_streams import generator
-from lidar.tools.defences.calibration import Calibration, tail_of
-from lidar.tools.defences.fusion import FUSED, fuse_verdicts
-from lidar.tools.defences.scores import Score, SuspicionCounts, score, threshold_at
-from lidar.tools.defences.verdict import Verdict
+from lidar.tools.defences.calibration import FUSED, Calibration, fuse_verdicts, tail_of
+from lidar.tools.defences.defence import Verdict
+from lidar.tools.defences.scores import SuspicionCounts, score, threshold_at
+from lidar.tools.redteam.matrix import (
+    AttackDetection,
+    DefenceCost,
+    DetectorAccuracy,
+    Matrix,
+    Rate,
+    Success,
+    rate,
+)
 from lidar.tools.redteam.measure import FEWEST, is_attacked
 from lidar.tools.redteam.plan import GOALS, Attack, Measure, Run
-from lidar.tools.redteam.statistics import Rate, rate
 
 POOLED = ("scene", "route")
 """Conditions that a setting has all of; the others, such as rig and weather, are kept apart."""
@@ -26,6 +33,7 @@ POOLED = ("scene", "route")
 RANGES = (0, 10, 20, 30, 40, 60)
 """Metres that bound the distances of the detector's table."""
 
+_LEVELS = ("frames", "objects")
 _SEED = 0
 
 
@@ -47,118 +55,23 @@ class Figures:
         conditions = {name: text for name, text in self.run.conditions.items() if name not in POOLED}
         return conditions | ({"detector": self.detector} if self.detector else {})
 
-    def block(self, frame: Mapping[str, Any], *, seconds: float) -> tuple[str, str, int]:
-        """Key of the independent part of a drive that a frame belongs to."""
-        return self.run.drive.name, frame["sensor"], int(frame["seconds"] // seconds)
-
-
-@dataclass(frozen=True, slots=True)
-class Success:
-    """Success rate of an attack in a setting.
-
-    scene    : of the drives; ``all`` for all of them
-    attacked : frames that the attack changed
-    success  : forge: attacked frames in which the detector reports a forged object; hide: targets that it no
-               longer finds; mislead: attacked frames whose last fix is off. Targets are road users that it
-               finds without the attack and that lost half of their returns.
-    added, lost : mean number of returns of an attacked frame
-    """
-
-    attack: str
-    goal: str
-    setting: dict[str, str]
-    scene: str
-    frames: int
-    attacked: int
-    success: Rate
-    added: float
-    lost: float
-
-
-@dataclass(frozen=True, slots=True)
-class AttackDetection:
-    """Detection rate of an attack by a defence in a setting.
-
-    level    : ``frames`` or ``objects``
-    genuine  : share of frames or objects without attack above the threshold
-    attacked : share of attacked frames or forged objects above it
-    score    : with the ROC and its area
-    residual : success of the attack where the defence has no alarm: of the forged object that the detector
-               reports, or of the frame if it does not judge objects or the goal is to hide
-    latency  : median seconds from the first attacked frame of a drive to the first alarm; nan without any
-    alarmed, drives : drives with an alarm in an attacked frame, and attacked drives
-    """
-
-    attack: str
-    defence: str
-    level: str
-    setting: dict[str, str]
-    scene: str
-    genuine: Rate
-    attacked: Rate
-    score: Score
-    residual: Rate
-    latency: float
-    alarmed: int
-    drives: int
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorAccuracy:
-    """Recall and precision of the detector without attack, from ``near`` to ``far`` metres away."""
-
-    setting: dict[str, str]
-    scene: str
-    kind: str
-    near: int
-    far: int
-    recall: Rate
-    precision: Rate
-    false_per_frame: float
-
-
-@dataclass(frozen=True, slots=True)
-class DefenceCost:
-    """Median seconds of a defence for a frame."""
-
-    setting: dict[str, str]
-    defence: str
-    seconds: float
-    frames: int
-
-
-@dataclass(frozen=True, slots=True)
-class Matrix:
-    """Results of a matrix of attacks and defences."""
-
-    success: list[Success]
-    detection: list[AttackDetection]
-    accuracy: list[DetectorAccuracy]
-    cost: list[DefenceCost]
-
-    @property
-    def of_all_scenes(self) -> Matrix:
-        """The rows that are not of a single scene."""
-        return Matrix(
-            [row for row in self.success if row.scene == "all"],
-            [row for row in self.detection if row.scene == "all"],
-            [row for row in self.accuracy if row.scene == "all"],
-            self.cost,
-        )
+    def parted(self, seconds: float) -> Figures:
+        """The drive with the key ``block`` of the independent part that each frame belongs to."""
+        parts = [(self.run.drive.name, f["sensor"], int(f["seconds"] // seconds)) for f in self.frames]
+        return replace(self, frames=[f | {"block": p} for f, p in zip(self.frames, parts, strict=True)])
 
 
 def evaluate(figures: Sequence[Figures], attacks: Sequence[Attack], *, measure: Measure) -> Matrix:
     """The matrix of drives with and without attack; attacks by goal, the most successful first."""
     found = Matrix([], [], [], [])
-    figures = _add_fused(figures, block=measure.block)
+    figures = _add_fused([one.parted(measure.block) for one in figures])
     thresholds = _thresholds(figures, measure=measure)
     for setting, scene, drives in _groups(figures):
         plain = [one for one in drives if one.run.attack is None]
         known = {"setting": setting, "scene": scene}
-        frames = [(one.block(frame, seconds=measure.block), frame) for one in plain for frame in one.frames]
-        found.accuracy.extend(accuracies(frames, measure=measure, known=known))
+        found.accuracy.extend(accuracies(_frames(plain), measure=measure, known=known))
         if scene == "all":
-            found.cost.extend(_costs(drives, setting=setting))
+            found.cost.extend(_costs(_frames(drives), setting=setting))
         for attack in attacks:
             mine = [one for one in drives if one.run.attack == attack]
             if mine:
@@ -203,29 +116,33 @@ def _sensor_of(setting: Mapping[str, str]) -> str:
     return str({name: text for name, text in setting.items() if name != "weather"})
 
 
-def _clear(figures: Iterable[Figures]) -> dict[str, list[Figures]]:
-    """Drives without attack by sensor, of which those without weather if there are."""
+def _frames(drives: Iterable[Figures]) -> list[dict[str, Any]]:
+    """The frames of drives."""
+    return [frame for one in drives for frame in one.frames]
+
+
+def _clear(figures: Iterable[Figures]) -> dict[str, list[dict[str, Any]]]:
+    """Frames without attack by sensor, of which those without weather if there are."""
     plain: dict[str, list[Figures]] = defaultdict(list)
     for one in figures:
         if one.run.attack is None:
             plain[_sensor_of(one.setting)].append(one)
     return {
-        key: [one for one in drives if not one.setting.get("weather")] or drives
+        key: _frames([one for one in drives if not one.setting.get("weather")] or drives)
         for key, drives in plain.items()
     }
 
 
-def _add_fused(figures: Sequence[Figures], *, block: float) -> list[Figures]:
+def _add_fused(figures: Sequence[Figures]) -> list[Figures]:
     """The drives with the verdict of all defences together as one more, if there are several."""
     calibrations = {}
-    for key, drives in _clear(figures).items():
-        tails = {}
-        for defence in _defences(drives):
-            for level in ("frames", "objects"):
-                samples = _samples(drives, (), defence=defence, level=level, block=block)
-                if samples.genuine.any():
-                    tails[defence, level] = tail_of(samples)
-        calibrations[key] = Calibration(tails)
+    for key, frames in _clear(figures).items():
+        samples = {
+            (d, level): _samples(frames, defence=d, level=level)
+            for d in _defences(frames)
+            for level in _LEVELS
+        }
+        calibrations[key] = Calibration({k: tail_of(own) for k, own in samples.items() if own.genuine.any()})
     return [
         replace(
             one, frames=[_fused_frame(frame, calibrations[_sensor_of(one.setting)]) for frame in one.frames]
@@ -254,42 +171,36 @@ def _fused_frame(frame: Mapping[str, Any], calibration: Calibration) -> dict[str
 
 def _thresholds(figures: Sequence[Figures], *, measure: Measure) -> dict[str, dict[tuple[str, str], float]]:
     """Thresholds by sensor, defence and level, of drives without attack, and without weather if there are."""
-    allowed = {"frames": measure.false_alarms, "objects": measure.false_objects}
-    found: dict[str, dict[tuple[str, str], float]] = {}
-    for key, clear in _clear(figures).items():
-        found[key] = {
-            (defence, level): threshold_at(
-                _samples(clear, (), defence=defence, level=level, block=measure.block), share
-            )
-            for defence in _defences(clear)
+    allowed = dict(zip(_LEVELS, (measure.false_alarms, measure.false_objects), strict=True))
+    return {
+        key: {
+            (defence, level): threshold_at(_samples(frames, defence=defence, level=level), share)
+            for defence in _defences(frames)
             for level, share in allowed.items()
         }
-    return found
+        for key, frames in _clear(figures).items()
+    }
 
 
-def _defences(drives: Iterable[Figures]) -> list[str]:
-    """Defences that judged drives, in order."""
-    return list(dict.fromkeys(name for one in drives for frame in one.frames for name in frame["suspicion"]))
+def _defences(frames: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Defences that judged frames, in order."""
+    return list(dict.fromkeys(name for frame in frames for name in frame["suspicion"]))
 
 
 def _samples(
-    plain: Iterable[Figures], attacked: Iterable[Figures], *, defence: str, level: str, block: float
+    plain: Iterable[Mapping[str, Any]],
+    attacked: Iterable[Mapping[str, Any]] = (),
+    *,
+    defence: str,
+    level: str,
 ) -> SuspicionCounts:
-    """Suspicions of a defence by independent blocks, of drives without attack and of attacked ones."""
+    """Suspicions of a defence by independent blocks, of frames without attack and of attacked ones."""
     blocks: dict[tuple[str, str, int], list[tuple[float, bool]]] = defaultdict(list)
-    for one, truth in [*((one, False) for one in plain), *((one, True) for one in attacked)]:
-        for frame in one.frames:
-            if defence in frame["suspicion"] and (not truth or is_attacked(frame)):
-                blocks[one.block(frame, seconds=block)] += _suspicions(
-                    frame, defence, level=level, forged=truth
-                )
-    return SuspicionCounts.of(
-        [
-            (np.array([s for s, _ in pairs]), np.array([truth for _, truth in pairs], bool))
-            for pairs in blocks.values()
-            if pairs
-        ]
-    )
+    for frame, forged in [*((frame, False) for frame in plain), *((frame, True) for frame in attacked)]:
+        if defence in frame["suspicion"]:
+            blocks[frame["block"]] += _suspicions(frame, defence, level=level, forged=forged)
+    columns = [np.array(pairs) for pairs in blocks.values() if pairs]
+    return SuspicionCounts.of([(column[:, 0], column[:, 1] > 0) for column in columns])
 
 
 def _suspicions(
@@ -305,32 +216,32 @@ def _suspicions(
 def _success(
     drives: Sequence[Figures], attack: Attack, *, measure: Measure, known: dict[str, Any]
 ) -> Success:
-    frames = [(one.block(frame, seconds=measure.block), frame) for one in drives for frame in one.frames]
-    attacked = [(block, frame) for block, frame in frames if is_attacked(frame)]
+    frames = _frames(drives)
+    attacked = [frame for frame in frames if is_attacked(frame)]
     return Success(
         attack.name,
         attack.goal,
         frames=len(frames),
         attacked=len(attacked),
         success=_success_rate(attacked, attack, measure=measure),
-        added=_mean(frame["added"] for _, frame in attacked),
-        lost=_mean(frame["lost"] for _, frame in attacked),
+        added=_mean(frame["added"] for frame in attacked),
+        lost=_mean(frame["lost"] for frame in attacked),
         **known,
     )
 
 
 def _success_rate(
-    attacked: Sequence[tuple[Any, Mapping[str, Any]]],
+    attacked: Sequence[Mapping[str, Any]],
     attack: Attack,
     *,
     measure: Measure,
     defence: str = "",
     thresholds: Mapping[tuple[str, str], float] | None = None,
 ) -> Rate:
-    """Success among attacked frames, each with its block; with a defence, where that has no alarm."""
+    """Success among attacked frames; with a defence, where that has no alarm."""
     hits = count = 0
     blocks = set()
-    for block, frame in attacked:
+    for frame in attacked:
         silent = not defence or frame["suspicion"][defence] <= (thresholds or {})[defence, "frames"]
         if attack.goal == "hide":
             tried, reached = frame["targets"], frame["hidden"] * silent
@@ -345,7 +256,7 @@ def _success_rate(
             objects = zip(frame["objects"]["forged"], frame["objects"]["score"], passed, strict=True)
             tried, reached = 1, int(any(f and s >= measure.score and p for f, s, p in objects))
         hits, count = hits + reached, count + tried
-        blocks |= {block} if tried else set()
+        blocks |= {frame["block"]} if tried else set()
     return rate(hits, count, blocks=len(blocks))
 
 
@@ -363,18 +274,13 @@ def _detections(
     known: dict[str, Any],
     thresholds: Mapping[tuple[str, str], float],
 ) -> Iterator[AttackDetection]:
-    frames = [
-        (one.block(frame, seconds=measure.block), frame)
-        for one in attacked
-        for frame in one.frames
-        if is_attacked(frame)
-    ]
-    for defence in _defences(attacked):
-        judged = [(block, frame) for block, frame in frames if defence in frame["suspicion"]]
+    genuine, frames = _frames(plain), [frame for frame in _frames(attacked) if is_attacked(frame)]
+    for defence in _defences(_frames(attacked)):
+        judged = [frame for frame in frames if defence in frame["suspicion"]]
         residual = _success_rate(judged, attack, measure=measure, defence=defence, thresholds=thresholds)
-        for level in ("frames", "objects"):
+        for level in _LEVELS:
             threshold = thresholds.get((defence, level), 1.0)
-            samples = _samples(plain, attacked, defence=defence, level=level, block=measure.block)
+            samples = _samples(genuine, frames, defence=defence, level=level)
             if not samples.attacked.any() and level == "objects":
                 continue
             found = score(samples, threshold=threshold, rng=generator(_SEED, attack.name, defence, level))
@@ -419,9 +325,9 @@ def _latency(one: Figures, defence: str, *, threshold: float) -> float | None:
 
 
 def accuracies(
-    frames: Sequence[tuple[Any, Mapping[str, Any]]], *, measure: Measure, known: dict[str, Any]
+    frames: Sequence[Mapping[str, Any]], *, measure: Measure, known: dict[str, Any]
 ) -> Iterator[DetectorAccuracy]:
-    """Accuracy of a detector in frames without attack, each with its block.
+    """Accuracy of a detector in frames without attack; ``block`` is the independent trial that one is of.
 
     known : fields of the rows that are not measured
     """
@@ -431,8 +337,8 @@ def accuracies(
         for near, far in itertools.pairwise(RANGES):
             users: list[tuple[Any, bool]] = []
             boxes: list[tuple[Any, bool]] = []
-            for block, frame in frames:
-                objects = frame["objects"]
+            for frame in frames:
+                objects, block = frame["objects"], frame["block"]
                 columns = zip(
                     objects["score"], objects["user"], objects["kind"], objects["distance"], strict=True
                 )
@@ -459,29 +365,10 @@ def _rate_of(trials: Sequence[tuple[Any, bool]]) -> Rate:
     return rate(sum(hit for _, hit in trials), len(trials), blocks=len({block for block, _ in trials}))
 
 
-def _costs(drives: Sequence[Figures], *, setting: dict[str, str]) -> Iterator[DefenceCost]:
+def _costs(frames: Iterable[Mapping[str, Any]], *, setting: dict[str, str]) -> Iterator[DefenceCost]:
     seconds: dict[str, list[float]] = defaultdict(list)
-    for frame in (frame for one in drives for frame in one.frames):
+    for frame in frames:
         for name, spent in frame["cost"].items():
             seconds[name].append(spent)
     for name, spent in seconds.items():
         yield DefenceCost(setting, name, float(np.median(spent)), len(spent))
-
-
-def document_of(rows: Iterable[Any]) -> list[dict[str, Any]]:
-    """Rows of the matrix as JSON; unknown figures are null."""
-    documents = []
-    for row in rows:
-        document = asdict(row)
-        if isinstance(row, AttackDetection):
-            document["score"] = row.score.to_json()
-        documents.append(_without_nan(document))
-    return documents
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _without_nan(part) for name, part in value.items()}
-    if isinstance(value, float):
-        return None if math.isnan(value) else round(value, 6)
-    return value

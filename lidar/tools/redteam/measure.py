@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,10 @@ from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.boxes import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
-from lidar.errors import InputError, LidarError
-from lidar.tools.defences.observation import Observation
-from lidar.tools.defences.reading import RecordedScans, read_scans
-from lidar.tools.defences.registry import NamedDefence
-from lidar.tools.defences.run import able, judged_frames
-from lidar.tools.defences.truth import frame_truth
+from lidar.errors import LidarError
+from lidar.tools.defences.observation import Observation, RecordedScans, read_scans
+from lidar.tools.defences.registry import NamedDefence, judged_frames, lacks
+from lidar.tools.defences.scores import frame_truth
 from lidar.tools.detection import RULES
 from lidar.tools.detection.detector import KINDS
 from lidar.tools.detection.registry import read_detector
@@ -81,11 +79,9 @@ def measure_drive(case: AttackCase) -> dict[str, Any]:
         return known
     dataset = open_dataset(case.path)
     needs_scene = any("scene" in named.defence.needs for named in case.defences)
-    if needs_scene:
-        with using(open_scene(dataset.scene_path), known=LidarError) as scene:
-            document = _document(case, dataset, scene=scene)
-    else:
-        document = _document(case, dataset, scene=None)
+    opened = using(open_scene(dataset.scene_path), known=LidarError) if needs_scene else nullcontext()
+    with opened as scene:
+        document = _document(case, dataset, scene=scene)
     document = json.loads(json.dumps({"key": _key(case)} | document))
     write_json(case.out, document)
     return dict(document)
@@ -114,21 +110,11 @@ def _document(case: AttackCase, dataset: Dataset, *, scene: Scene | None) -> dic
     frames: list[dict[str, Any]] = []
     absent: set[str] = set()
     for scans in read_scans(dataset, detector=detector):
-        defences, lacking = _able(scans, case.defences)
-        absent |= set(lacking)
-        frames += _frames(scans, defences, twin=twins.get(scans.sensor.name), scene=scene, score=case.score)
+        lacking = {named.name for named in case.defences if lacks(named.defence, scans)}
+        absent |= lacking
+        able = [named for named in case.defences if named.name not in lacking]
+        frames += _frames(scans, able, twin=twins.get(scans.sensor.name), scene=scene, score=case.score)
     return {"absent": sorted(absent), "frames": frames}
-
-
-def _able(scans: RecordedScans, defences: Sequence[NamedDefence]) -> tuple[list[NamedDefence], list[str]]:
-    """Defences whose needs the data have, and the names of the others."""
-    found, lacking = [], []
-    for named in defences:
-        try:
-            found += able([scans], [named])
-        except InputError:
-            lacking.append(named.name)
-    return found, lacking
 
 
 def _frames(
@@ -161,7 +147,7 @@ def _frames(
         if rows is None or row in rows:
             users = _users(dataset, name, frame=frame.number)
             matched = _match(frame, users)
-            truth = frame_truth(dataset, name, frame=frame.number, count=len(frame))
+            truth = frame_truth(scans, frame)
             forged = truth.objects(frame.members) | _near(frame, _place(users))
             figures["objects"] = _objects(frame, forged=forged, matched=matched)
             if twin is None:
@@ -181,10 +167,7 @@ def _change(scans: RecordedScans, twin: RecordedScans, *, row: int) -> dict[str,
     """Changes of an attack to a frame's returns, images and fixes, against the drive without it."""
     frame, other, name = scans.frame(row), twin.frame(row), scans.sensor.name
     placed = _place(_users(scans.dataset, name, frame=frame.number))
-    truth, before = (
-        frame_truth(of.dataset, name, frame=frame.number, count=len(each))
-        for of, each in ((scans, frame), (twin, other))
-    )
+    truth, before = frame_truth(scans, frame), frame_truth(twin, other)
     pictures = zip(frame.pictures, other.pictures, strict=True)
     return {
         "added": int(truth.returns.sum()) + sum(int(user["points"]) for user in placed),

@@ -13,18 +13,24 @@ from geoscene.drawing.figures import share
 from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_atomically, write_json
-from lidar.tools.redteam.evaluate import (
+from lidar.tools.redteam.matrix import (
     AttackDetection,
     DefenceCost,
     DetectorAccuracy,
     Matrix,
+    Rate,
     Success,
     document_of,
+    rate,
 )
 from lidar.tools.redteam.measure import FEWEST
-from lidar.tools.redteam.plan import Attack, RedteamPlan
-from lidar.tools.redteam.published import ATTACKS, DEFENCES, PublishedResult
-from lidar.tools.redteam.statistics import Rate, rate
+from lidar.tools.redteam.plan import (
+    PUBLISHED_ATTACKS,
+    PUBLISHED_DEFENCES,
+    Attack,
+    PublishedResult,
+    RedteamPlan,
+)
 
 REPORT = "redteam.json"
 
@@ -153,7 +159,7 @@ def _fill(
     page.heading("Latency and cost of defences")
     page.table(_cost_table(pooled))
     page.heading("Published figures of defences")
-    page.table(table_of(_PUBLISHED, DEFENCES.items()))
+    page.table(table_of(_PUBLISHED, PUBLISHED_DEFENCES.items()))
     page.heading("The detector without attacks")
     page.paragraph(f"Road users with {FEWEST} returns or more, by distance.")
     page.table(_accuracy_table(pooled.accuracy))
@@ -168,7 +174,7 @@ _PUBLISHED: tuple[Column[tuple[str, PublishedResult]], ...] = (
 
 def _published(attack: str, attacks: Sequence[Attack]) -> PublishedResult | None:
     """The published success of an attack."""
-    return next((ATTACKS[one.published] for one in attacks if one.name == attack and one.published), None)
+    return PUBLISHED_ATTACKS.get(next((one.published for one in attacks if one.name == attack), ""))
 
 
 def success_table(matrix: Matrix, *, published: Sequence[Attack] = ()) -> ReportTable:

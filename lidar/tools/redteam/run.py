@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from geoscene.errors import GeosceneError
 from geoscene.support.files import exclusive
 from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
-from lidar.errors import InputError, LidarError
 from lidar.tools.detection import RULES
 from lidar.tools.detection.registry import read_detector
-from lidar.tools.redteam.evaluate import Figures, Matrix, evaluate
+from lidar.tools.redteam.evaluate import Figures, evaluate
+from lidar.tools.redteam.matrix import Matrix
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import RedteamPlan, Run, read_plan
 from lidar.tools.redteam.report import write_report
-from lidar.tools.sweep.run import record_drives
-
-log = logging.getLogger(__name__)
+from lidar.tools.sweep.run import check_folder, failure_text, record_drives
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +51,7 @@ def redteam(
     Raises InputError for a file with an error, before the first drive starts.
     """
     plan, folder = read_plan(Path(file)), Path(out)
-    if folder.exists() and not (folder.is_dir() and (_is_matrix(folder) or not any(folder.iterdir()))):
-        raise InputError(f"{folder}: is not empty and no matrix; give another directory")
+    check_folder(folder, mark="drives/sweep.json", what="matrix")
     with exclusive(folder):
         folder.mkdir(parents=True, exist_ok=True)
         swept = record_drives(
@@ -82,10 +78,6 @@ def redteam(
     return summary
 
 
-def _is_matrix(folder: Path) -> bool:
-    return (folder / "drives" / "sweep.json").is_file()
-
-
 def _results(
     plan: RedteamPlan, folder: Path, *, failed: dict[str, str], workers: int, progress: Progress
 ) -> Iterator[tuple[Run, Figures | str]]:
@@ -95,24 +87,19 @@ def _results(
         yield run, f"the drive without attack failed: {failed[run.twin]}"
     ready = [run for run in ready if run.twin not in failed]
     both = [(run, name) for name in plan.measure.detector for run in ready]
-    tasks = [_Task(row, _case(run, name, plan=plan, folder=folder)) for row, (run, name) in enumerate(both)]
+    tasks = [(row, _case(run, name, plan=plan, folder=folder)) for row, (run, name) in enumerate(both)]
     several = len(plan.measure.detector) > 1
     found: dict[int, Figures | str] = {}
     progress("defences", 0, total=len(tasks))
-    for row, frames, absent, error in run_tasks(_measure, tasks, workers=workers):
+    for row, result in run_tasks(_measure, tasks, workers=workers):
         run, name = both[row]
-        found[row] = error or Figures(run, frames, absent, name if several else "")
+        if isinstance(result, str):
+            found[row] = result
+        else:
+            found[row] = Figures(run, result["frames"], result["absent"], name if several else "")
         progress("defences", len(found), total=len(tasks))
     for row, (run, _) in enumerate(both):
         yield run, found[row]
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """A drive to measure, and its number."""
-
-    row: int
-    case: AttackCase
 
 
 def _case(run: Run, detector: str, *, plan: RedteamPlan, folder: Path) -> AttackCase:
@@ -129,16 +116,13 @@ def _case(run: Run, detector: str, *, plan: RedteamPlan, folder: Path) -> Attack
     )
 
 
-def _measure(task: _Task) -> tuple[int, list[dict[str, object]], list[str], str]:
-    """Number, rows of the frames, defences without data, and the error of a drive. Run by workers."""
+def _measure(task: tuple[int, AttackCase]) -> tuple[int, dict[str, Any] | str]:
+    """Number of a drive, and its figures or why there are none. Run by workers."""
+    row, case = task
     try:
-        document = measure_drive(task.case)
-    except (GeosceneError, LidarError, OSError) as error:
-        return task.row, [], [], " ".join(str(error).split())
-    except Exception as error:  # one drive's defect must not end the others
-        log.exception("drive %s", task.case.path.name)
-        return task.row, [], [], f"{type(error).__name__}: {' '.join(str(error).split())}"
-    return task.row, document["frames"], document["absent"], ""
+        return row, measure_drive(case)
+    except Exception as error:  # noqa: BLE001 - one drive's defect must not end the others
+        return row, failure_text(f"drive {case.path.name}", error)
 
 
 def failed_drives(failed: dict[str, str]) -> Sequence[str]:

@@ -1,31 +1,39 @@
-"""Description of a sweep: a TOML file with grids of options, each combination of which is a drive."""
+"""Description of a sweep: a TOML file with grids of options, whose combinations are drives, and maps."""
 
 from __future__ import annotations
 
 import hashlib
 import itertools
+import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from cyclopts import App
+from cyclopts import App, CycloptsError
 
-from geoscene.errors import reading
+from geoscene.errors import GeosceneError, SceneFormatError, reading
+from geoscene.options import BuildOptions, Degrees
+from geoscene.pipeline.build import build
 from geoscene.scene import open_scene
-from geoscene.scene.layout import SceneFiles
+from geoscene.scene.layout import SceneFiles, changed_files
+from geoscene.sources import read_osm, with_elevation
+from geoscene.support.cluster import DaskCluster
 from geoscene.support.console import DEFAULTS, guard_numbers
-from geoscene.support.storage import url_of
+from geoscene.support.digests import file_digest, sources_digest
+from geoscene.support.files import write_json
+from geoscene.support.progress import Progress, silent
+from geoscene.support.storage import cache_folder, url_of
 from geoscene.support.untrusted import read_toml
-from lidar.errors import InputError
+from lidar.errors import InputError, LidarError
 from lidar.geometry.time_scales import check_start
+from lidar.grammar import item_of, item_text, value_text
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import AccuracyOptions, DriveOptions
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.plan import sensors_of
-from lidar.tools.sweep.maps import MapScene, map_of_file, read_maps
-from lidar.tools.sweep.words import naming, text_of, words_of
 from lidar.traffic.fcd import TrafficFile
 
 _OF_THE_SWEEP = ("out", "workers", "scheduler", "overwrite", "json", "quiet")
@@ -33,6 +41,66 @@ _OF_THE_SWEEP = ("out", "workers", "scheduler", "overwrite", "json", "quiet")
 
 _LONGEST = 32
 """Characters of a value in the name of a folder."""
+
+_REPEATED = ("set", "stage", "weather", "attack")
+"""Options of which each value is given by a flag of its own."""
+
+_JOINED = ("format", "labels", "only")
+"""Options whose values are separated by commas."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapScene:
+    """A map that a scene is built of.
+
+    name    : of the scene's folder
+    osm     : files of the map; absolute paths
+    bounds  : west, south, east, north in degrees of the part to build; None for all
+    options : of the build
+    """
+
+    name: str
+    osm: tuple[Path, ...]
+    bounds: Degrees | None = None
+    options: BuildOptions = BuildOptions()
+
+    @property
+    def inputs(self) -> list[Path]:
+        """Files that the scene depends on."""
+        dem = () if self.options.elevation_tiles else self.options.dem
+        named = (*self.osm, *map(Path, dem), *map(Path, self.options.along))
+        return [path for path in named if path.is_file()]
+
+    def built(
+        self,
+        folder: Path,
+        *,
+        workers: int = 1,
+        cluster: DaskCluster | None = None,
+        progress: Progress = silent,
+    ) -> Path:
+        """The scene in a folder, built unless it is there of the same files and options."""
+        target, stamp = folder / self.name, folder / f"{self.name}.json"
+        made_of = {
+            "program": sources_digest("geoscene"),
+            "bounds": self.bounds,
+            "options": asdict(self.options),
+            "files": {str(path): file_digest(path) for path in self.inputs},
+        }
+        if not _is_made_of(target, stamp, made_of=made_of):
+            data = read_osm(self.osm, bounds=self.bounds)
+            options = with_elevation(self.options, data, cache_dir=cache_folder(), progress=progress)
+            scene = build(
+                data,
+                target,
+                options=options,
+                overwrite=target.exists(),  # its unchanged tiles are kept
+                workers=workers,
+                cluster=cluster,
+                progress=progress,
+            )
+            write_json(stamp, made_of | {"scene": scene.manifest["digest"]})
+        return target
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +209,7 @@ def _drive(
         if not isinstance(scene, str):
             raise InputError("scene: give the directory of a scene, a map, or the name of a table [[map]]")
         words = [word for key, value in values.items() for word in words_of(key, value)]
-        options, wanted = _parse(words)
+        options, wanted = _parse(words, _drive_options)
         _check(options)
         options = _with_absolute_paths(options)
         place = Path(scene) if url_of(scene) else Path(scene).absolute()
@@ -159,20 +227,21 @@ def _slug(text: str) -> str:
     return f"{plain}-{hashlib.blake2b(text.encode(), digest_size=3).hexdigest()}"
 
 
-def _parse(words: list[str]) -> tuple[DriveOptions, AccuracyOptions]:
-    """Options from words of a command line."""
+def _parse(words: list[str], options_of: Callable[..., Any]) -> Any:
+    """Options of words of a command line, as a function takes and returns them."""
     app = App(default_parameter=DEFAULTS, help_flags=(), version_flags=())
+    app.default(options_of)
+    return app(guard_numbers(words), result_action="return_value", exit_on_error=False, print_error=False)
 
-    @app.default
-    def options_of(
-        *, options: DriveOptions | None = None, wanted: AccuracyOptions = AccuracyOptions()
-    ) -> tuple[DriveOptions, AccuracyOptions]:
-        return options or DriveOptions(), wanted
 
-    parsed: tuple[DriveOptions, AccuracyOptions] = app(
-        guard_numbers(words), result_action="return_value", exit_on_error=False, print_error=False
-    )
-    return parsed
+def _drive_options(
+    *, options: DriveOptions | None = None, wanted: AccuracyOptions = AccuracyOptions()
+) -> tuple[DriveOptions, AccuracyOptions]:
+    return options or DriveOptions(), wanted
+
+
+def _build_options(*, options: BuildOptions = BuildOptions()) -> BuildOptions:
+    return options
 
 
 def _check(options: DriveOptions) -> None:
@@ -203,3 +272,93 @@ def _with_absolute_paths(options: DriveOptions) -> DriveOptions:
             options.traffic, path=options.traffic.path.absolute(), net=net and net.absolute()
         )
     return replace(options, **changed)
+
+
+def _is_made_of(target: Path, stamp: Path, *, made_of: Mapping[str, Any]) -> bool:
+    """Whether a scene is there, undamaged, of the files and options of a stamp."""
+    with suppress(OSError, ValueError, LookupError, SceneFormatError):
+        document, scene = json.loads(stamp.read_text("utf-8")), open_scene(target)
+        wanted = json.loads(json.dumps(made_of)) | {"scene": scene.manifest["digest"]}
+        return bool(document == wanted) and not changed_files(scene)
+    return False
+
+
+def map_of_file(file: Path) -> MapScene:
+    """A map that is named by its file, built with default options."""
+    name = file.name.split(".")[0]
+    return MapScene(name, (file,), options=BuildOptions(name=name))
+
+
+def read_maps(path: Path, tables: Any) -> dict[str, MapScene]:
+    """Maps by name, of the tables ``[[map]]`` of a sweep's file.
+
+    Each has a ``name``, ``osm`` (a file or a list of files), ``bbox`` ([W, S, E, N] in degrees) and options
+    of ``geoscene build``, named as its flags.
+
+    Raises InputError, which names the map.
+    """
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        raise InputError(f"{path}: maps are tables, as in [[map]]")
+    maps: dict[str, MapScene] = {}
+    for number, table in enumerate(tables, 1):
+        name = table.get("name", "")
+        if not isinstance(name, str) or not re.fullmatch(r"\w[\w.=+-]*", name):
+            raise InputError(f'{path}: map {number}: give it a name, such as name = "city"')
+        if name in maps:
+            raise InputError(f"{path}: two maps are named {name}; rename one of them")
+        with naming(path, f"map {name}"):
+            maps[name] = _map(name, {key: value for key, value in table.items() if key != "name"})
+    return maps
+
+
+def _map(name: str, table: dict[str, Any]) -> MapScene:
+    osm, bounds = table.pop("osm", []), table.pop("bbox", None)
+    files = [osm] if isinstance(osm, str) else osm
+    if not isinstance(files, list) or not files or not all(isinstance(file, str) for file in files):
+        instead = f" (there is {next(iter(table))})" if table and osm == [] else ""
+        raise InputError(f'give it a map: osm = "city.osm.pbf"{instead}')
+    if bounds is not None:
+        if not isinstance(bounds, list) or [type(v) in (int, float) for v in bounds] != [True] * 4:
+            raise InputError("bbox: give [W, S, E, N] in degrees")
+        bounds = (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))
+    words = [word for key, value in table.items() for word in words_of(key, value)]
+    options: BuildOptions = _parse(words, _build_options)
+    along = options.along if len(options.along) == 1 else ()  # several are waypoints
+    dem = () if options.elevation_tiles else options.dem
+    for file in (*files, *dem, *along):
+        if not Path(file).is_file():
+            raise InputError(f"{file}: no such file")
+    if dem:
+        options = replace(options, dem=tuple(str(Path(file).absolute()) for file in dem))
+    options = replace(options, name=name)
+    return MapScene(name, tuple(Path(file).absolute() for file in files), bounds, options)
+
+
+@contextmanager
+def naming(path: Path, what: str) -> Iterator[None]:
+    """Raise errors of the block as InputErrors that name the file and what in it has the error."""
+    try:
+        yield
+    except (CycloptsError, LidarError, GeosceneError, OSError) as error:
+        raise InputError(f"{path}: {what}: {str(error).rstrip('.')}") from error
+
+
+def text_of(value: Any) -> str:
+    """A value of the grid as one text; a table with a name as ``NAME:KEY=VALUE,KEY=VALUE``."""
+    if isinstance(value, dict):
+        return item_text(item_of(value))
+    return " ".join(map(text_of, value)) if isinstance(value, list) else value_text(value)
+
+
+def words_of(key: str, value: Any) -> list[str]:
+    """An option and its value as on the command line."""
+    flag = f"--{key.replace('_', '-')}"
+    if isinstance(value, bool) and key != "traffic":
+        return [flag] * value
+    if not isinstance(value, list):
+        return [flag, text_of(value)] if value != "" else []
+    if key in _REPEATED:
+        return [word for item in value for word in (flag, text_of(item))]
+    if key in _JOINED:
+        return [flag, ",".join(map(str, value))] if value else []
+    return [flag, *map(str, value)]

@@ -133,8 +133,7 @@ def record_drives(
     """
     if not 1 <= workers <= 256:
         raise InputError(f"`workers` {workers}: give 1 to 256")
-    if folder.exists() and not (folder.is_dir() and (_is_sweep(folder) or not any(folder.iterdir()))):
-        raise InputError(f"{folder}: is not empty and no sweep; give another directory")
+    check_folder(folder, mark=_TABLE, what="sweep")
     with connect(scheduler) if scheduler else nullcontext() as cluster, exclusive(folder):
         folder.mkdir(parents=True, exist_ok=True)
         if cluster is not None:
@@ -143,7 +142,7 @@ def record_drives(
         with _table(folder, source, drives=drives) as table:
             scenes = _scenes(drives, folder.absolute(), workers=workers, cluster=cluster, progress=progress)
             threads = 1 if cluster else max(workers // len(drives), 1)
-            tasks = []
+            tasks, place = list[_Task](), folder.absolute()
             for row, planned in enumerate(drives):
                 scene = scenes[planned.map.name] if planned.map else planned.scene
                 if isinstance(scene, str):
@@ -151,14 +150,18 @@ def record_drives(
                     continue
                 ready = replace(planned, scene=scene, map=None)
                 earlier = None if overwrite or table.rows[row].state != "done" else table.rows[row]
-                tasks.append(
-                    _Task(row, ready, folder.absolute(), threads, overwrite=overwrite, earlier=earlier)
-                )
+                tasks.append(_Task(row, ready, place, threads, overwrite=overwrite, earlier=earlier))
             progress("drives", 0, total=len(tasks))
             for done, (row, result) in enumerate(_results(tasks, workers=workers, cluster=cluster), 1):
                 table.set(row, result)
                 progress("drives", done, total=len(tasks))
     return SweepSummary(folder, tuple(table.rows))
+
+
+def check_folder(folder: Path, *, mark: str, what: str) -> None:
+    """Raise InputError for a folder that is not empty and lacks the file ``mark`` of such a one."""
+    if folder.exists() and not (folder.is_dir() and ((folder / mark).is_file() or not any(folder.iterdir()))):
+        raise InputError(f"{folder}: is not empty and no {what}; give another directory")
 
 
 def _scenes(
@@ -176,21 +179,18 @@ def _scenes(
             scenes[one.name] = one.built(
                 folder / "scenes", workers=workers, cluster=cluster, progress=progress
             )
-        except (GeosceneError, LidarError, OSError) as error:
-            scenes[one.name] = f"map {one.name}: {_one_line(error)}"
-        except Exception as error:  # one map's defect must not end the others
-            log.exception("map %s", one.name)
-            scenes[one.name] = f"map {one.name}: {type(error).__name__}: {_one_line(error)}"
+        except Exception as error:  # noqa: BLE001 - one map's defect must not end the others
+            scenes[one.name] = f"map {one.name}: {failure_text(f'map {one.name}', error)}"
     return scenes
 
 
-def _one_line(error: Exception) -> str:
-    """The text of an error without line breaks."""
-    return " ".join(str(error).split())
-
-
-def _is_sweep(folder: Path) -> bool:
-    return (folder / _TABLE).is_file()
+def failure_text(what: str, error: Exception) -> str:
+    """An error in one line; a defect is logged, and its line begins with its class."""
+    text = " ".join(str(error).split())
+    if isinstance(error, GeosceneError | LidarError | OSError):
+        return text
+    log.error("%s", what, exc_info=error)
+    return f"{type(error).__name__}: {text}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,9 +222,8 @@ def _results(
         for row, result in run_tasks(_record_drive, tasks, workers=workers):
             del waiting[row]
             yield row, result
-    except (
-        WorkersLostError
-    ):  # one at a time needs the least memory, and shows which drives cannot be recorded
+    except WorkersLostError:
+        # One at a time needs the least memory, and shows which drives cannot be recorded.
         for task in waiting.values():
             try:
                 yield from run_tasks(_record_drive, [task], workers=1)
@@ -242,11 +241,8 @@ def _record_drive(task: _Task) -> tuple[int, DriveRow]:
                 return task.row, task.earlier
             pick = pick_settings(scene, options, wanted=wanted, out=None if task.overwrite else out)
             checked = driven(scene, out, options=options, wanted=wanted, pick=pick, overwrite=task.overwrite)
-    except (GeosceneError, LidarError, OSError) as error:
-        return task.row, DriveRow(name, "failed", _one_line(error))
-    except Exception as error:  # one drive's defect must not end the others
-        log.exception("drive %s", name)
-        return task.row, DriveRow(name, "failed", f"{type(error).__name__}: {_one_line(error)}")
+    except Exception as error:  # noqa: BLE001 - one drive's defect must not end the others
+        return task.row, DriveRow(name, "failed", failure_text(f"drive {name}", error))
     done = checked.summary
     return task.row, DriveRow(
         name,

@@ -15,21 +15,14 @@ from lidar.geometry.mounts import Mount
 from lidar.sensors.physics.pulse_identity import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.defences.azimuth import Azimuth
+from lidar.tools.defences.boxes import Occlusion, Shadow, Temporal
 from lidar.tools.defences.defence import Window
-from lidar.tools.defences.map import Map
+from lidar.tools.defences.missing import Azimuth, Map, Void
 from lidar.tools.defences.navigation import NavigationDefence as Consistency
 from lidar.tools.defences.observation import NavigationMeasurements, Picture
-from lidar.tools.defences.occlusion import Occlusion
 from lidar.tools.defences.overlay import Overlay, project_returns
-from lidar.tools.defences.physics import Physics
-from lidar.tools.defences.registry import read_defences
-from lidar.tools.defences.run import able
-from lidar.tools.defences.shadow import Shadow
-from lidar.tools.defences.statistical import StatisticalDefence
-from lidar.tools.defences.temporal import Temporal
-from lidar.tools.defences.timing import Timing
-from lidar.tools.defences.void import Void
+from lidar.tools.defences.registry import able, read_defences
+from lidar.tools.defences.returns import Physics, StatisticalDefence, Timing
 
 STREET = (
     box((-60, -60, -1), (60, 60, 0), feature=7, klass=Class.ROAD, material="asphalt"),

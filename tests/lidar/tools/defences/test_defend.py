@@ -18,10 +18,9 @@ from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
 from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.defences.defend import calibrate, defend
-from lidar.tools.defences.physics import Physics
-from lidar.tools.defences.reading import SEEN, read_scans
-from lidar.tools.defences.registry import DEFENCES, read_defences
-from lidar.tools.defences.run import DETECTOR
+from lidar.tools.defences.observation import SEEN, read_scans
+from lidar.tools.defences.registry import DEFENCES, DETECTOR, read_defences
+from lidar.tools.defences.returns import Physics
 from lidar.tools.detection.registry import read_detector
 from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset

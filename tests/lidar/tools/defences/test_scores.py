@@ -7,11 +7,19 @@ import pytest
 from scipy.stats import norm
 
 from lidar.errors import InputError
-from lidar.tools.defences.calibration import Calibration, calibration_text, read_calibration, tail_of
-from lidar.tools.defences.fusion import FUSIONS, fuse_verdicts, fused_threshold, joint_of
+from lidar.tools.defences.calibration import (
+    FUSIONS,
+    Calibration,
+    calibration_text,
+    fuse_verdicts,
+    fused_threshold,
+    joint_of,
+    read_calibration,
+    tail_of,
+)
+from lidar.tools.defences.defence import Verdict
 from lidar.tools.defences.registry import DEFENCES, defence_rows, read_defences
 from lidar.tools.defences.scores import FALSE_ALARMS, SuspicionCounts, score, threshold_at
-from lidar.tools.defences.verdict import Verdict
 
 
 def normal_frames(rng, shift, frames=100, each=100):

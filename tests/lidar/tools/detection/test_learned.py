@@ -202,7 +202,7 @@ def _f1(folder: Path, out: Path, detector: str) -> float:
     """Of road users within 40 m that have ten returns or more."""
     measure = Measure()
     case = AttackCase(folder, None, out / f"{detector}.json", (), measure.score, detector)
-    frames = [(k, frame) for k, frame in enumerate(measure_drive(case)["frames"])]
+    frames = [frame | {"block": k} for k, frame in enumerate(measure_drive(case)["frames"])]
     rows = [
         row
         for row in accuracies(frames, measure=measure, known={"setting": {}, "scene": ""})

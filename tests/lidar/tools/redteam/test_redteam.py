@@ -17,10 +17,10 @@ from geoscene.scene import Scene
 from lidar.errors import InputError
 from lidar.tools.redteam import redteam
 from lidar.tools.redteam.evaluate import Figures, evaluate
+from lidar.tools.redteam.matrix import rate
 from lidar.tools.redteam.measure import KIND_OF
 from lidar.tools.redteam.plan import Attack, Measure, Run, read_plan
 from lidar.tools.redteam.report import setting_tables
-from lidar.tools.redteam.statistics import rate
 from lidar.tools.sweep.grid import read_grid
 
 PHANTOM = '[[attack]]\nname = "phantom"\nattack = "inject:shape=object"\ngoal = "forge"\npublished = "pla"\n'

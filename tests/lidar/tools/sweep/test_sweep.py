@@ -225,7 +225,7 @@ def test_maps_are_built_once_with_their_options_and_shared(tmp_path, monkeypatch
         built.append(arguments[1].name)
         return build(*arguments, **options)
 
-    monkeypatch.setattr("lidar.tools.sweep.maps.build", build_again)
+    monkeypatch.setattr("lidar.tools.sweep.grid.build", build_again)
     assert sweep(file, tmp_path / "out").rows == first.rows
     assert not built
     scene = open_scene(tmp_path / "out" / "scenes" / "whole")
