@@ -52,12 +52,16 @@ from lidar.simulation.navigation_files import record_fixes, record_samples
 from lidar.simulation.record_clouds import sent_pulses
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import RecordedSurroundings, situation_of, situation_of_unit, surroundings_of
-from lidar.tools.earlier_stages import Former, read_foreign, read_foreign_past, read_past, select_labels
 from lidar.tools.rerecord import (
+    Former,
     acted_stages,
+    read_foreign,
+    read_foreign_past,
+    read_past,
     recorded_cloud,
     recording_again,
     richest_format,
+    select_labels,
     truth_of_past,
     write_altered,
 )

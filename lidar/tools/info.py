@@ -300,7 +300,8 @@ def _classes(dataset: Dataset, *, progress: Progress) -> dict[str, dict[str, int
     names = {int(klass): klass.name.lower() for klass in Class}
     labelled = [form for form in FORMATS.values() if "label" in form.columns]
     for name in dataset.sensors("lidar"):
-        files = next((f for form in labelled if (f := _files(dataset, name, form=form))), [])
+        every = ([(form, path) for _, path in dataset.files(name, form)] for form in labelled)
+        files = next(filter(None, every), [])
         counts = np.zeros(256, np.int64)
         for done, (form, path) in enumerate(files):
             progress(f"reading {name}", done, total=len(files))
@@ -310,10 +311,6 @@ def _classes(dataset: Dataset, *, progress: Progress) -> dict[str, dict[str, int
             rows = np.flatnonzero(counts).tolist()
             found[name] = {names.get(code, f"code {code}"): int(counts[code]) for code in rows}
     return found
-
-
-def _files(dataset: Dataset, name: str, *, form: Format) -> list[tuple[Format, Path]]:
-    return [(form, path) for _, path in dataset.files(name, form)]
 
 
 def _road_users(dataset: Dataset) -> dict[str, int]:

@@ -1,8 +1,9 @@
-"""Recordings of datasets that are written again, their clouds as stages read them, and changed clouds."""
+"""Recordings that are written again, their clouds with the truth of earlier stages, and changed clouds."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.support.csv_tables import write_columns
+from lidar.dataset.foreign import foreign_truth
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, table_cloud
 from lidar.dataset.layout import Dataset, Paths, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
+from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import with_stage_settings
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.sensors.rig.scanner import Sensor
 from lidar.settings import RecordingSettings, settings_of
+from lidar.signal.past import Past, past_of
 from lidar.signal.recorded_pulses import complete
 from lidar.signal.registry import NO_STAGES, Stages, acts_on
 from lidar.signal.run import Altered, write_truth
@@ -144,3 +149,55 @@ def _labels(altered: Altered, semantic_kitti: Path | None) -> PointLabels:
     if len(road_user) != len(altered.original):
         raise DatasetError(f"{semantic_kitti}: {len(road_user)} labels for {len(altered.original)} points")
     return PointLabels(altered.cloud.klass, np.append(road_user, 0)[source], np.append(moving, False)[source])
+
+
+def read_foreign(path: Path, form: Format, *, device: Sensor) -> Cloud:
+    """A point cloud of KITTI or nuScenes."""
+    return complete(table_cloud(form.read(path)), device, columns=form.columns)
+
+
+def read_foreign_past(path: Path, form: Format, *, source: Path, device: Sensor) -> Past:
+    """A point cloud of KITTI or nuScenes with the ground truth of earlier stages, if any."""
+    truth = foreign_truth(source, path.relative_to(source), form=form)
+    return read_past(truth, read_foreign(path, form, device=device))
+
+
+@dataclass(frozen=True, slots=True)
+class Former:
+    """The point clouds before one in the order of names, of the same folder.
+
+    clouds : all files
+    row    : of the one
+    """
+
+    clouds: Sequence[tuple[Path, Format]]
+    row: int
+    source: Path
+    device: Sensor
+
+    def cloud(self, frames: int) -> Cloud | None:
+        """The cloud a number of frames before, as without stages; None before the first."""
+        path, _ = self.clouds[self.row]
+        row = self.row - frames
+        if row < 0 or self.clouds[row][0].parent != path.parent:
+            return None
+        return read_foreign_past(*self.clouds[row], source=self.source, device=self.device).original
+
+
+def select_labels(path: Path, out: Path, *, altered: Altered) -> None:
+    """Write labels of SemanticKITTI for the returns after stages; added ones are unlabelled (0)."""
+    codes = np.append(np.fromfile(path, "<u4"), np.uint32(0))
+    if len(codes) != len(altered.original) + 1:
+        raise DatasetError(f"{path}: {len(codes) - 1} labels for {len(altered.original)} points")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_bytes(codes[altered.cloud.source].astype("<u4").tobytes())
+
+
+def read_past(path: Path, cloud: Cloud) -> Past:
+    """A recorded cloud with the ground truth of its truth file, if any; see `lidar.signal.past.past_of`.
+
+    Raises DatasetError for a file that is damaged or of another cloud.
+    """
+    truth = read_truth(path, count=len(cloud))
+    with reading_file(path):
+        return past_of(cloud, truth)

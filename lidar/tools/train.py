@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene import __version__
 from geoscene.errors import need
+from geoscene.support.columns import Columns
 from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float, Ints
@@ -39,7 +40,7 @@ _THRESHOLDS = np.linspace(0.05, 0.95, 91)
 
 
 @dataclass(frozen=True, slots=True)
-class Examples:
+class Examples(Columns):
     """Labelled clusters for training.
 
     measures : (n, features) float32, as `lidar.tools.detection.features.features`
@@ -50,14 +51,6 @@ class Examples:
     measures: NDArray[np.float32]
     kind: Ints
     group: Ints
-
-    def __len__(self) -> int:
-        """Number of clusters."""
-        return len(self.kind)
-
-    def take(self, rows: Ints | Bools) -> Examples:
-        """The chosen rows."""
-        return Examples(self.measures[rows], self.kind[rows], self.group[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +118,7 @@ def train(
         found[number] = examples
         progress("clusters", len(found), total=len(jobs))
     parts = [found[number] for number in sorted(found)]
-    data = Examples(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("measures", "kind", "group"))
-    )
+    data = Examples.concatenate(parts)
     counts = {kind: int((data.kind == row).sum()) for row, kind in enumerate(CLASSES)}
     _check(counts, datasets)
     data = data.take(np.isin(data.kind, [row for row, kind in enumerate(CLASSES) if counts[kind] >= FEWEST]))
