@@ -30,7 +30,8 @@ from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast.device import WARP_CPU, device
 from lidar.raycast.hits import Hits
-from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
@@ -129,7 +130,7 @@ def sensors(worlds: dict[str, World], exact: World, *, options: DriveOptions, sc
         "HDL-64E scans": lambda w: scan(
             load_sensor("hdl64e_s3"), mount, trajectory=trajectory, world=w, frame=0
         ),
-        "images 960 x 600": lambda w: render(camera, poses, world=w, sun=SUN, options=RenderOptions()),
+        "images 960 x 600": lambda w: render(camera, poses, world=w, sun=SUN, settings=CameraSettings()),
     }
     for title, task in tasks.items():
         taken = seconds({name: partial(task, world) for name, world in worlds.items()})

@@ -33,7 +33,7 @@ from lidar.simulation.plan import plan_drive
 from lidar.simulation.record_images import measure_images
 from lidar.simulation.recording import Recording
 from lidar.traffic.populate import TrafficOptions
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 GROUND = (
     *(Class.ROAD, Class.SIDEWALK, Class.PARKING, Class.KERB, Class.TERRAIN, Class.GRASS),

@@ -19,8 +19,9 @@ from geoscene.scene import open_scene
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.options import DriveOptions
-from lidar.sensors.camera.render import RenderOptions, render
-from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.camera.light import sun_direction
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.simulation.plan import plan_drive
 from lidar.world.world import World
@@ -49,7 +50,7 @@ def main(folders: list[str]) -> None:
             for relief, world in worlds.items():
                 for rays in (1, 2):
                     start = time.process_time()
-                    render(CAMERA, pose, world=world, sun=sun, options=RenderOptions(edge_rays=rays))
+                    render(CAMERA, pose, world=world, sun=sun, settings=CameraSettings(edge_rays=rays))
                     if lap:  # the first compiles
                         seconds[relief, rays][k].append(time.process_time() - start)
     for (relief, rays), places in seconds.items():

@@ -35,7 +35,7 @@ from lidar.sensors.rig.specs import load_rig, rig_digest
 from lidar.signal.attacks.images import _picture
 from lidar.signal.attacks.placed_object import _read_mesh
 from lidar.signal.registry import read_stages
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.detection.forest import read_forest
 from lidar.tools.integrity.digests import read_digests, read_links

@@ -19,7 +19,8 @@ import numpy as np
 from geoscene.scene import open_scene
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
@@ -41,7 +42,7 @@ def image(world: World, x: float, y: float) -> None:
     """One image of 960 x 600 pixels along the street."""
     camera = CameraSpec("c", Mount(), 960, 600, 700.0, 700.0, 479.5, 299.5)
     poses = Poses(np.array([[x, y, 2.0]]), OPTICAL[None], np.ones((1, 3)))
-    render(camera, poses, world=world, sun=SUN, options=RenderOptions())
+    render(camera, poses, world=world, sun=SUN, settings=CameraSettings())
 
 
 def main(folder: str, x: float, y: float) -> None:

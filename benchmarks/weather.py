@@ -24,15 +24,16 @@ import numpy as np
 from geoscene.scene import open_scene
 from lidar.options import DriveOptions
 from lidar.sensors.laser.scan import cast, measure
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.devices import Scanner
-from lidar.signal.run import Altered, altered_sweep, cloud_truth
-from lidar.signal.weather.read import read_weather
+from lidar.signal.run import altered_sweep
+from lidar.signal.truth import Altered, cloud_truth
+from lidar.signal.weather.setting import read_weather
 from lidar.simulation.frame_loop import chunks
 from lidar.simulation.plan import DrivePlan, plan_drive
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 SENSORS = {"vlp16": "VLP-16", "hdl64e_s2": "HDL-64E S2"}
 RIG = """

@@ -9,7 +9,7 @@ return, the root mean square error of one pulse and the share of pulses that hit
 
 import numpy as np
 
-from lidar.sensors.physics.footprint import INSIDE, bundle
+from lidar.sensors.laser.rays import INSIDE, bundle
 
 PULSES = 100_000
 RAYS = (7, 19, 61)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lidar.sensors.rig.specs import load_rig as load_rig
     from lidar.signal.registry import read_attacks as read_attacks
     from lidar.signal.registry import read_stages as read_stages
-    from lidar.signal.weather.read import read_weather as read_weather
+    from lidar.signal.weather.setting import read_weather as read_weather
     from lidar.simulation.drive import drive as drive
     from lidar.simulation.frames import DriveFrame as DriveFrame
     from lidar.simulation.frames import Simulation as Simulation
@@ -46,7 +46,7 @@ _HOMES = {
     "read_attacks": "signal.registry",
     "read_cloud": "dataset.formats",
     "read_stages": "signal.registry",
-    "read_weather": "signal.weather.read",
+    "read_weather": "signal.weather.setting",
     "simulate": "simulation.frames",
     "training_data": "tools.training_data",
 }

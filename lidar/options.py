@@ -26,7 +26,7 @@ from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
 from lidar.geometry.time_scales import LONGEST_S
 from lidar.grammar import split_pairs
-from lidar.sensors.rig.imu_grades import PRESETS
+from lidar.sensors.rig.specs import PRESETS
 
 if TYPE_CHECKING:
     from geoscene.pipeline.reach import RoadMap
@@ -63,7 +63,7 @@ RASTERS = ("dsm", "dtm", "density", "intensity")
 """Rasters of a map."""
 
 ORIGINS = ("surface", "weather", "interference", "injected", "replayed", "moved", "receiver")
-"""Origins of returns, `lidar.sensors.physics.origin.Origin` in lower case."""
+"""Origins of returns, `lidar.sensors.physics.echoes.Origin` in lower case."""
 
 SHOWN = ("all", "sweep", "cameras", "map")
 """What a film can show."""
@@ -198,7 +198,7 @@ def _attacks(_: object, tokens: Sequence[Token]) -> Any:
 
 
 def _weather(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.signal.weather.read import read_weather  # noqa: PLC0415
+    from lidar.signal.weather.setting import read_weather  # noqa: PLC0415
 
     return tuple(setting for token in tokens for setting in read_weather(token.value))
 
@@ -393,7 +393,7 @@ class DriveOptions:
 
         if self.road != "by-weather":
             return ROADS[self.road]
-        from lidar.signal.weather.road import road_conditions  # noqa: PLC0415
+        from lidar.signal.weather.media import road_conditions  # noqa: PLC0415
 
         ground = self.recording_settings.world
         return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)

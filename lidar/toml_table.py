@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from importlib import resources
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -184,3 +185,26 @@ def read_table(path: Path | Any, *, name: str = "") -> Table:
     except tomllib.TOMLDecodeError as error:
         raise RigError(f"{shown}: not valid TOML: {error}") from error
     return Table(shown, data, (), _lines(text))
+
+
+def built_in_names(package: str, folder: str) -> list[str]:
+    """Names of the TOML files in a folder of a package."""
+    files = (resources.files(package) / folder).iterdir()
+    return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
+
+
+def read_named_table(name: str | Path, *, what: str, package: str, folder: str) -> Table:
+    """The root table of a TOML file, or of a built-in one by its name.
+
+    what : of what it is, for messages
+
+    Raises RigError as `read_table`, and for a name that is neither.
+    """
+    known = ", ".join(built_in_names(package, folder))
+    if str(name).endswith(".toml"):
+        if not Path(name).is_file():
+            raise RigError(f"{name}: no such {what} file; built-in ones are {known}")
+        return read_table(Path(name))
+    if str(name) not in known.split(", "):
+        raise RigError(f"{what} {str(name)!r} is not known: {known}, or the path of a .toml file")
+    return read_table(resources.files(package) / folder / f"{name}.toml", name=f"{folder}/{name}.toml")

@@ -11,7 +11,7 @@ from helpers.programs import ENVIRONMENT
 
 import geoscene.cli
 import lidar.cli
-from lidar.sensors.rig.catalog import rig_names, sensor_names
+from lidar.sensors.rig.devices import rig_names, sensor_names
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,8 @@ from bench.scenes import RIGS, Setup
 from geoscene.typing import Ints
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
+from lidar.sensors.camera.light import sun_direction
 from lidar.sensors.camera.render import render
-from lidar.sensors.camera.sun import sun_direction
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera, Scanner
@@ -136,7 +136,7 @@ def _image_sides(plan: DrivePlan, *, images: tuple[str, ...] = ()) -> dict[str, 
                 sun=sun,
                 times=None,
                 random=generator(0, camera.name, frame, "image"),
-                options=settings.camera.options(spec),
+                settings=settings.camera,
             )
 
     u, v = np.meshgrid(np.arange(spec.width) + 0.5 - spec.cx, np.arange(spec.height) + 0.5 - spec.cy)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import geoscene
 import lidar
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.defences.defend import defend, score_table
 from lidar.tools.defences.registry import read_defences

@@ -49,7 +49,7 @@ def rigs(*, json: JsonFlag = False) -> int:
         Print them as JSON, with all their values.
     """
     from geoscene.drawing.report import align_columns  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import rig_rows  # noqa: PLC0415
+    from lidar.sensors.rig.devices import rig_rows  # noqa: PLC0415
 
     rows = rig_rows()
     if json:
@@ -75,7 +75,7 @@ def sensors(*, json: JsonFlag = False) -> int:
         Print them as JSON, with the source of every number.
     """
     from geoscene.drawing.report import align_columns  # noqa: PLC0415
-    from lidar.sensors.rig.catalog import sensor_rows  # noqa: PLC0415
+    from lidar.sensors.rig.devices import sensor_rows  # noqa: PLC0415
 
     rows = sensor_rows()
     if json:

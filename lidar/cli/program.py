@@ -12,7 +12,7 @@ from geoscene.support.console import DEFAULTS, Report
 from lidar.options import OUTPUT
 
 if TYPE_CHECKING:
-    from lidar.signal.effects import Counts
+    from lidar.signal.situation import Counts
 
 app = App(
     name="lidar",
@@ -36,7 +36,7 @@ QuietFlag = Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)]
 
 def print_effects(effects: Counts) -> None:
     """Say what each stage did."""
-    from lidar.signal.effects import effect_lines  # noqa: PLC0415
+    from lidar.signal.situation import effect_lines  # noqa: PLC0415
 
     for line in effect_lines(effects):
         print(line)

@@ -14,16 +14,16 @@ from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
 from lidar.grammar import Item, item_of, read_items
 from lidar.parameters import build, parameter_rows
-from lidar.signal.effects import Counts
+from lidar.signal.situation import Counts
 from lidar.signal.stage import Stage
 
 _ATTACKS = {
     "inject": "lidar.signal.attacks.inject:Inject",
     "replay": "lidar.signal.attacks.replay:Replay",
-    "relay": "lidar.signal.attacks.relay:Relay",
+    "relay": "lidar.signal.attacks.replay:Relay",
     "remove": "lidar.signal.attacks.remove:Remove",
     "placed_object": "lidar.signal.attacks.placed_object:PlacedObject",
-    "high_frequency_removal": "lidar.signal.attacks.high_frequency_removal:HighFrequencyRemoval",
+    "high_frequency_removal": "lidar.signal.attacks.remove:HighFrequencyRemoval",
     "perturb": "lidar.signal.attacks.points:Perturb",
     "insert": "lidar.signal.attacks.points:Insert",
     "delete": "lidar.signal.attacks.points:Delete",
@@ -40,12 +40,12 @@ ATTACKS: Registry[type[Stage]] = Registry("attack", _ATTACKS, error=InputError)
 STAGES: Registry[type[Stage]] = Registry(
     "stage",
     {
-        "cover_glass": "lidar.signal.cover_glass:CoverGlass",
-        "dropped_packets": "lidar.signal.dropped_packets:DroppedPackets",
-        "lost_rows": "lidar.signal.lost_rows:LostRows",
+        "cover_glass": "lidar.signal.faults:CoverGlass",
+        "dropped_packets": "lidar.signal.faults:DroppedPackets",
+        "lost_rows": "lidar.signal.faults:LostRows",
         **_ATTACKS,
         "weather": "lidar.signal.weather.stage:Weather",
-        "weather_model": "lidar.signal.weather.model_stage:WeatherModel",
+        "weather_model": "lidar.signal.weather.stage:WeatherModel",
     },
     error=InputError,
 )

@@ -1,66 +1,36 @@
-"""Runs stages on a frame and records the ground truth of their changes."""
+"""Runs stages on frames and measurements, and records the ground truth of their changes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from io import BytesIO
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import LidarError
 from lidar.geometry.random_streams import generator
 from lidar.sensors.laser.cloud import Cloud, TracedCloud
 from lidar.sensors.laser.scan import Sweep, detect, deviates_of, report
+from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.sensors.physics.detector import added_noise
-from lidar.sensors.physics.echoes import Echoes, TracedEchoes, mix, trace
-from lidar.sensors.physics.origin import Origin
-from lidar.signal.effects import row_changes
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, mix, trace
 from lidar.signal.registry import Stages
-from lidar.signal.situation import Situation
-from lidar.signal.stage import CloudStage, EchoStage, ImageStage, Pulses, pulses_of
+from lidar.signal.situation import Situation, row_changes
+from lidar.signal.stage import Pulses, pulses_of
+from lidar.signal.truth import Altered, fixes_truth, image_truth, samples_truth
 
 if TYPE_CHECKING:
     from lidar.sensors.camera.render import CameraImage
 
+T = TypeVar("T")
+Rows = TypeVar("Rows", Fixes, Inertial)
+
 _FALSE_KINDS = 3  # kinds of false echoes, each at most one per pulse
-
-
-@dataclass(frozen=True, slots=True)
-class Altered:
-    """A frame after its stages.
-
-    cloud    : the recorded cloud
-    original : the cloud without stages
-    """
-
-    cloud: TracedCloud
-    original: Cloud
-
-    def where(self, keep: Callable[[Cloud], NDArray[np.bool_]]) -> Altered:
-        """The returns that a rule keeps, of both clouds."""
-        kept = keep(self.original)
-        row = np.append(np.where(kept, np.cumsum(kept) - 1, -1), -1).astype(np.int32)
-        cloud = self.cloud.where(keep(self.cloud))
-        cloud = replace(cloud, source=row[cloud.source], hidden=row[cloud.hidden])
-        return Altered(cloud, self.original.where(kept))
-
-
-def trace_unaltered(cloud: Cloud) -> Altered:
-    """A cloud that no stage has changed."""
-    n = len(cloud)
-    added: list[Any] = [
-        np.full(n, Origin.SURFACE, np.uint8),
-        np.arange(n, dtype=np.int32),
-        np.full(n, -1, np.int32),
-    ]
-    return Altered(TracedCloud(cloud.start_ns, *cloud.columns().values(), *added), cloud)
 
 
 def altered_sweep(sweep: Sweep, stages: Stages, *, at: Situation) -> Altered:
@@ -90,23 +60,21 @@ def altered_echoes(
 
     extinction : of the air, 1/m one way, beside that of the stages
     """
-    acting = stages.at("echoes", at.sensor)
-
-    in_between = [one for one in (*stages.before, *acting) if one.sensor in ("", at.sensor)]
+    in_between = [*(s for s in stages.before if s.sensor in ("", at.sensor)), *stages.at("echoes", at.sensor)]
 
     def clearness(row: int, distance: float) -> float:
         shares = [one.stage.clearness(pulses, row, distance=distance, at=at) for one in in_between]
         return math.exp(-extinction * distance) * math.prod(shares)
 
+    def fault(found: TracedEchoes) -> str:
+        fired = not len(found) or 0 <= found.pulse.min() <= found.pulse.max() < len(pulses)
+        return "" if fired else "echoes of pulses that were not fired"
+
     situation = replace(at, clearness=clearness)
-    for named in acting:
-        stage, rng = cast("EchoStage", named.stage), named.rng(stages.seed, at.sensor, frame=at.frame)
-        before, echoes = echoes, stage.echoes(pulses, echoes, at=situation, rng=rng)
-        if len(echoes) and not 0 <= echoes.pulse.min() <= echoes.pulse.max() < len(pulses):
-            raise LidarError(f"stage {named.name} returned echoes of pulses that were not fired")
-        if at.effects is not None:
-            found = row_changes(before, echoes, unit="echoes", columns=("range", "apparent"))
-            at.effects.add(named.label, found)
+    changes = partial(row_changes, unit="echoes", columns=("range", "apparent"))
+    echoes = _altered(
+        echoes, stages, seam="echoes", at=situation, changes=changes, pulses=(pulses,), fault=fault
+    )
     is_new = (echoes.source < 0) | (echoes.origin == Origin.MOVED)
     return mix(echoes, is_new, pulses=len(pulses), separation=pulses.sensor.echo_separation)
 
@@ -139,26 +107,78 @@ def _others(rows: NDArray[np.integer], count: int) -> NDArray[np.int64]:
 
 def altered_cloud(cloud: TracedCloud, stages: Stages, *, at: Situation) -> TracedCloud:
     """A cloud after the stages on it."""
-    for named in stages.at("cloud", at.sensor):
-        rng = named.rng(stages.seed, at.sensor, frame=at.frame)
-        before, cloud = cloud, cast("CloudStage", named.stage).cloud(cloud, at=at, rng=rng)
-        if at.effects is not None:
-            found = row_changes(before, cloud, unit="returns", columns=("xyz", "intensity"))
-            at.effects.add(named.label, found)
+    changes = partial(row_changes, unit="returns", columns=("xyz", "intensity"))
+    cloud = _altered(cloud, stages, seam="cloud", at=at, changes=changes)
     moved = (cloud.origin == Origin.MOVED) & (cloud.hidden < 0)
     return replace(cloud, hidden=np.where(moved, cloud.source, cloud.hidden))
 
 
 def altered_image(image: CameraImage, stages: Stages, *, at: Situation) -> CameraImage:
-    """An image with colours after the stages on it."""
-    for named in stages.at("image", at.sensor):
+    """An image with colours after the stages on it; depth and labels stay."""
+
+    def changes(before: CameraImage, after: CameraImage) -> dict[str, int]:
+        return {"images changed": int(image_truth(after, before)["changed"].any())}
+
+    return replace(image, rgb=_altered(image, stages, seam="image", at=at, changes=changes).rgb)
+
+
+def altered_fixes(fixes: Fixes, stages: Stages, *, at: Situation) -> Fixes:
+    """The fixes of a receiver after the stages on them; ground truth stays."""
+    found = _altered_rows(fixes, stages, seam="fixes", at=at, truth=fixes_truth)
+    return replace(
+        found, **{name: getattr(fixes, name) for name in ("error", "true_lonlath", "true_velocity")}
+    )
+
+
+def altered_samples(samples: Inertial, stages: Stages, *, at: Situation) -> Inertial:
+    """The samples of an inertial unit after the stages on them; ground truth stays."""
+    found = _altered_rows(samples, stages, seam="samples", at=at, truth=samples_truth)
+    return replace(found, true_gyro=samples.true_gyro, true_accel=samples.true_accel)
+
+
+def _altered_rows(
+    rows: Rows,
+    stages: Stages,
+    *,
+    seam: str,
+    at: Situation,
+    truth: Callable[[Rows, Rows], Mapping[str, NDArray[Any]]],
+) -> Rows:
+    """Measurements after the stages on their seam, which is also what they are called."""
+
+    def changes(before: Rows, after: Rows) -> dict[str, int]:
+        return {f"{seam} changed": int(truth(after, before)["changed"].sum())}
+
+    def fault(found: Rows) -> str:
+        return "" if len(found) == len(rows) else f"{len(found)} of {len(rows)} {seam}"
+
+    return _altered(rows, stages, seam=seam, at=at, changes=changes, fault=fault)
+
+
+def _altered(
+    data: T,
+    stages: Stages,
+    *,
+    seam: str,
+    at: Situation,
+    changes: Callable[[T, T], Mapping[str, int]],
+    pulses: tuple[Pulses, ...] = (),
+    fault: Callable[[T], str] = lambda _: "",
+) -> T:
+    """Data after the stages on a seam.
+
+    changes : what a stage changed, from the data before and after it
+    pulses  : of echoes; none of other data
+    fault   : what is wrong with the data that a stage returned; empty for nothing
+    """
+    for named in stages.at(seam, at.sensor):
         rng = named.rng(stages.seed, at.sensor, frame=at.frame)
-        before = image
-        image = replace(image, rgb=cast("ImageStage", named.stage).image(image, at=at, rng=rng).rgb)
+        before, data = data, getattr(named.stage, seam)(*pulses, data, at=at, rng=rng)
+        if found := fault(data):
+            raise LidarError(f"stage {named.label} returned {found}")
         if at.effects is not None:
-            changed = int(image_truth(image, before)["changed"].any())
-            at.effects.add(named.label, {"images changed": changed})
-    return image
+            at.effects.add(named.label, changes(before, data))
+    return data
 
 
 class _RepeatedNoise:
@@ -182,66 +202,3 @@ class _RepeatedNoise:
         rng = generator(sweep.seed, sweep.sensor.name, sweep.frame, purpose, "altered")
         known = self._known[purpose][cast("TracedEchoes", echoes).source]
         return np.where(np.isnan(known), rng.standard_normal(len(echoes)), known)
-
-
-def cloud_truth(
-    altered: Altered, *, start_ns: int, rows: NDArray[np.integer] | None = None
-) -> dict[str, NDArray[Any]]:
-    """Columns of a truth file; ``removed_time_ns`` counts from ``start_ns``.
-
-    rows : (m,) of the original, which ``altered.original`` holds; by default all
-
-    origin, source, hidden : (n,) of the recorded returns, as in `TracedCloud`
-    removed                : (k,) int32, rows of the original returns that are not among them, or were moved
-    removed_*              : (k,) or (k, 3), the columns of those, as in `Cloud`
-    """
-    cloud, original = altered.cloud, altered.original
-    kept = cloud.source[(cloud.source >= 0) & (cloud.origin != Origin.MOVED)]
-    rows = np.arange(len(original)) if rows is None else rows
-    is_lost = ~np.isin(rows, kept)
-    removed_columns = original.take(np.flatnonzero(is_lost)).columns()
-    time_ns = original.start_ns - start_ns + removed_columns["time_ns"].astype(np.int64)
-    removed_columns["time_ns"] = time_ns.astype(np.int64)
-    return {
-        "origin": cloud.origin,
-        "source": cloud.source,
-        "hidden": cloud.hidden,
-        "removed": rows[is_lost].astype(np.int32),
-        **{f"removed_{name}": column for name, column in removed_columns.items()},
-    }
-
-
-def image_truth(image: CameraImage, original: CameraImage) -> dict[str, NDArray[Any]]:
-    """Ground truth of the changes that stages made to an image, as `changed_pixels`."""
-    assert image.rgb is not None  # noqa: S101
-    assert original.rgb is not None  # noqa: S101
-    return changed_pixels(image.rgb, original.rgb)
-
-
-def changed_pixels(rgb: NDArray[np.uint8], original: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Differences that stages made to colours (h, w, 3).
-
-    changed : (h, w) bool
-    removed : (k, 3) uint8, the colours of the changed pixels without stages, row by row
-    """
-    changed = (rgb != original).any(axis=2)
-    return {"changed": changed, "removed": original[changed]}
-
-
-def image_past(image: CameraImage, truth: Mapping[str, NDArray[Any]] | None) -> CameraImage:
-    """A recorded image before the stages in its truth file.
-
-    Raises ValueError for the truth of another image.
-    """
-    if truth is None or image.rgb is None:
-        return image
-    rgb = image.rgb.copy()
-    rgb[truth["changed"]] = truth["removed"]
-    return replace(image, rgb=rgb)
-
-
-def write_truth(path: Path, columns: dict[str, NDArray[Any]]) -> None:
-    """Write a truth file (NPZ)."""
-    data = BytesIO()
-    np.savez_compressed(data, **columns)  # type: ignore[arg-type]
-    write_atomically(path, data.getvalue())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
-from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,18 +13,12 @@ from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.parameters import Parameters
-from lidar.sensors.laser.cloud import TracedCloud
 from lidar.sensors.physics.detector import receive
-from lidar.sensors.physics.echoes import Echoes, TracedEchoes, artificial_echoes, trace
+from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, trace
 from lidar.sensors.physics.link import apparent_of
-from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.situation import Situation
-
-if TYPE_CHECKING:
-    from lidar.sensors.camera.render import CameraImage
-    from lidar.sensors.navigation.measurements import Fixes, Inertial
 
 POSES = "poses and time"
 ROAD_USERS = "road users (lidar drive --traffic)"
@@ -35,7 +28,10 @@ LABELS = "labelled road users (lidar drive --traffic, in a format with classes a
 
 @dataclass(frozen=True)
 class Stage(Parameters):
-    """Base of all stages."""
+    """Base of all stages; a stage has a method of the name of each seam of `registry.SEAMS` it acts on.
+
+    Of images only colours are used, of fixes and samples only measurements: depth, labels and truth stay.
+    """
 
     def __post_init__(self) -> None:
         """Validate the parameters, and their times."""
@@ -104,13 +100,7 @@ class Pulses(Columns):
 
         distance : (m,) metres from the beam's start
         """
-        return apparent_of(
-            power,
-            distance + self.sensor.pattern.range_offset,
-            reference_reflectance=self.sensor.reference_reflectance,
-            reference_range=self.sensor.reference_range,
-            falloff=self.sensor.falloff,
-        )
+        return apparent_of(self.sensor, power, distance=distance + self.sensor.pattern.range_offset)
 
 
 def pulses_of(sensor: Sensor, sent: Firings, *, noise: float = 0.0) -> Pulses:
@@ -136,40 +126,3 @@ def added_echoes(
     """
     found = artificial_echoes(pulse, distance, apparent=apparent, klass=klass, feature=feature)
     return trace(found, origin, source=np.full(len(found), -1))
-
-
-class EchoStage(Protocol):
-    """A stage before the detector."""
-
-    def echoes(
-        self, pulses: Pulses, echoes: TracedEchoes, *, at: Situation, rng: np.random.Generator
-    ) -> TracedEchoes:
-        """The echoes that reach the detector, in any order."""
-
-
-class CloudStage(Protocol):
-    """A stage after the sensor."""
-
-    def cloud(self, cloud: TracedCloud, *, at: Situation, rng: np.random.Generator) -> TracedCloud:
-        """The cloud that is recorded. Moved returns get the origin MOVED and keep their source."""
-
-
-class ImageStage(Protocol):
-    """A stage on camera images."""
-
-    def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
-        """The frame that is recorded. Only its colours are used: depth and labels stay ground truth."""
-
-
-class FixesStage(Protocol):
-    """A stage on the fixes of a satellite receiver."""
-
-    def fixes(self, fixes: Fixes, *, at: Situation, rng: np.random.Generator) -> Fixes:
-        """The fixes of the whole drive that are recorded, as many. Only measurements are used, not truth."""
-
-
-class SamplesStage(Protocol):
-    """A stage on the samples of an inertial unit."""
-
-    def samples(self, samples: Inertial, *, at: Situation, rng: np.random.Generator) -> Inertial:
-        """The samples that are recorded, as many, in order of time."""

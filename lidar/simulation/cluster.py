@@ -15,11 +15,10 @@ from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.journal import Journal
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.signal.effects import Counts
+from lidar.signal.situation import Counts
 from lidar.simulation.plan import DrivePlan, SensorFrame
 from lidar.simulation.record import record_frame
-from lidar.world.thread_worlds import Worlds
-from lidar.world.world import Region
+from lidar.world.world import Region, Worlds
 
 if TYPE_CHECKING:
     from lidar.simulation.recording import Recording

@@ -28,7 +28,7 @@ from lidar.errors import InputError, LidarError
 from lidar.geometry.trajectory_csv import write_trajectory
 from lidar.options import DriveOptions
 from lidar.sensors.rig.devices import Scanner
-from lidar.signal.effects import Counts
+from lidar.signal.situation import Counts
 from lidar.simulation.boxes import merge_box_files, merge_signal_files
 from lidar.simulation.frame_loop import check_attackers, recording_chunks, run_jobs
 from lidar.simulation.measured import MeasuredCloud, MeasuredImages
@@ -36,7 +36,7 @@ from lidar.simulation.metadata import write_metadata
 from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.record import record_frame
 from lidar.simulation.recording import Recording
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 Show = Callable[[MeasuredCloud | MeasuredImages], None]
 """Shows a frame that is recorded."""

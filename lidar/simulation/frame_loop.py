@@ -16,13 +16,12 @@ from geoscene.scene import Scene
 from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Scanner
-from lidar.signal.attacks.sight import Seen, check_sight, sent_only
+from lidar.signal.attacks.attacker import Seen, check_sight, sent_only
 from lidar.signal.situation import Situation
 from lidar.simulation.plan import DrivePlan, SensorFrame
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of
-from lidar.world.thread_worlds import Worlds
-from lidar.world.world import Region
+from lidar.world.world import Region, Worlds
 
 T = TypeVar("T")
 

@@ -23,8 +23,8 @@ from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.imu import observe_imu
 from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.sensors.rig.specs import GnssSpec, ImuSpec
-from lidar.signal.navigation import altered_fixes, altered_samples
 from lidar.signal.registry import Stages
+from lidar.signal.run import altered_fixes, altered_samples
 from lidar.signal.situation import Situation
 from lidar.simulation.frame_loop import check_attackers, run_jobs
 from lidar.simulation.measured import Columns, MeasuredCloud, MeasuredImages
@@ -33,7 +33,7 @@ from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.record import measure_frame
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of_unit
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 Readings = TypeVar("Readings", Fixes, Inertial)
 

@@ -26,7 +26,7 @@ from lidar.sensors.rig.camera_model import intrinsic_matrix
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import Rig
 from lidar.settings import RecordingSettings
-from lidar.signal.effects import Effects
+from lidar.signal.situation import Effects
 from lidar.simulation.navigation_files import heights_of, observed_fixes, record_fixes, record_samples
 from lidar.simulation.situations import situation_of_unit
 

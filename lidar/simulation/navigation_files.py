@@ -17,16 +17,16 @@ from lidar.dataset.layout import Paths, reading_file
 from lidar.dataset.navigation_files import FixHeights
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import iso_times
-from lidar.sensors.navigation.geoid import geoid_at
 from lidar.sensors.navigation.gnss import antenna_motion, epochs, gnss_columns, observe_gnss
 from lidar.sensors.navigation.imu import imu_columns
 from lidar.sensors.navigation.measurements import Fixes, Inertial
-from lidar.sensors.navigation.nmea import HEIGHTS, height_note, nmea
+from lidar.sensors.navigation.nmea import HEIGHTS, geoid_at, height_note, nmea
 from lidar.sensors.navigation.satellite_visibility import sky_view
 from lidar.sensors.rig.specs import GnssSpec
-from lidar.signal.navigation import altered_fixes, altered_samples, fixes_truth, samples_truth
 from lidar.signal.registry import Stages
+from lidar.signal.run import altered_fixes, altered_samples
 from lidar.signal.situation import Situation
+from lidar.signal.truth import fixes_truth, samples_truth
 from lidar.world.world import World
 
 

@@ -6,7 +6,7 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.measured import MeasuredCloud, MeasuredImages
 from lidar.simulation.record_clouds import measure_cloud, record_cloud
 from lidar.simulation.recording import Recording
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 
 def record_frame(

@@ -20,14 +20,14 @@ from lidar.sensors.laser.doppler import radial_velocity, surface_velocity
 from lidar.sensors.laser.scan import Sweep, cast, find_pulse, measure
 from lidar.sensors.rig.devices import Scanner
 from lidar.sensors.rig.patterns.beams import Firings
-from lidar.signal.run import Altered, altered_sweep, cloud_truth, trace_unaltered, write_truth
+from lidar.signal.run import altered_sweep
+from lidar.signal.truth import Altered, cloud_truth, trace_unaltered, write_truth
 from lidar.simulation.boxes import box_rows, count_points
 from lidar.simulation.measured import MeasuredCloud, firing_times, placed_cloud
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import situation_of
 from lidar.world.actors import Actors
-from lidar.world.thread_worlds import Worlds
-from lidar.world.world import World
+from lidar.world.world import World, Worlds
 
 
 def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:

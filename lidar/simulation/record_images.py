@@ -13,20 +13,20 @@ from geoscene.support.csv_tables import write_columns
 from lidar.dataset.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator
+from lidar.sensors.camera.light import Lamps
 from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.camera.render import optical_flow, render
-from lidar.sensors.camera.signal_lamps import Lamps
 from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera
-from lidar.signal.run import altered_image, image_truth, write_truth
+from lidar.signal.run import altered_image
+from lidar.signal.truth import image_truth, write_truth
 from lidar.simulation.boxes import ImageBoxes, image_boxes
 from lidar.simulation.measured import MeasuredImages
 from lidar.simulation.recording import Recording
 from lidar.simulation.signals import lamps_at, signal_columns
 from lidar.simulation.situations import situation_of, sun_during
 from lidar.world.actors import Actors
-from lidar.world.thread_worlds import Worlds
-from lidar.world.world import World
+from lidar.world.world import World, Worlds
 
 
 def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
@@ -120,7 +120,7 @@ def _render(
             times=None if recording.actors is None else (times - start) / (end - start),
             lamps=lamps,
             random=generator(settings.seed, camera.name, frame, "image"),
-            options=settings.camera.options(camera.spec),
+            settings=settings.camera,
         )
 
 

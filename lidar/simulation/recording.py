@@ -23,9 +23,8 @@ from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.settings import RecordingSettings
-from lidar.signal.effects import Effects
-from lidar.world.actors import Actors
-from lidar.world.visibility import Visibility
+from lidar.signal.situation import Effects
+from lidar.world.actors import Actors, Visibility
 
 if TYPE_CHECKING:
     from lidar.traffic.signal_heads import SignalStates

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from lidar.geometry.poses import Poses
+from lidar.sensors.camera.light import Lamps
 from lidar.sensors.camera.render import CameraImage as Image
-from lidar.sensors.camera.signal_lamps import Lamps
 from lidar.traffic.signal_heads import STATES, SignalStates
 
 _LAMPS_Z = 2.9  # metres of the middle of the lamps above the foot of the post

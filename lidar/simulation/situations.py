@@ -16,12 +16,10 @@ from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.sensors.camera.light import Light
-from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.camera.light import Light, sun_direction
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.signal.effects import Effects
-from lidar.signal.situation import Situation
+from lidar.signal.situation import Effects, Situation
 from lidar.simulation.recording import Recording
 from lidar.world.ground import ground_height
 from lidar.world.world import World

@@ -38,15 +38,13 @@ from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.scanner import Sensor, load_sensor
 from lidar.sensors.rig.specs import GnssSpec, ImuSpec, Rig, rig_of
-from lidar.signal.attacks.attacker import Attacker
-from lidar.signal.attacks.sight import Seen, check_sight
-from lidar.signal.effects import Counts, Effects
-from lidar.signal.past import Past, truth_since
+from lidar.signal.attacks.attacker import Attacker, Seen, check_sight
 from lidar.signal.recorded import altered_recording, recorded_echoes
 from lidar.signal.registry import NamedStage, Stages, dimming, number_stages
-from lidar.signal.run import altered_image, image_past, image_truth, write_truth
-from lidar.signal.situation import Situation
+from lidar.signal.run import altered_image
+from lidar.signal.situation import Counts, Effects, Situation
 from lidar.signal.stage import LABELS, POSES
+from lidar.signal.truth import Past, image_past, image_truth, truth_since, write_truth
 from lidar.simulation.boxes import merge_box_files
 from lidar.simulation.navigation_files import record_fixes, record_samples
 from lidar.simulation.record_clouds import sent_pulses

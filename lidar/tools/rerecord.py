@@ -25,10 +25,9 @@ from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import Sensor
 from lidar.settings import RecordingSettings, settings_of
-from lidar.signal.past import Past, past_of
-from lidar.signal.recorded_pulses import complete
+from lidar.signal.recorded import complete
 from lidar.signal.registry import NO_STAGES, Stages, acts_on
-from lidar.signal.run import Altered, write_truth
+from lidar.signal.truth import Altered, Past, past_of, write_truth
 from lidar.simulation.record_clouds import write_clouds
 from lidar.simulation.recording import Recording
 

@@ -24,11 +24,12 @@ from lidar.world.actor_solids import (
     limb,
     loft,
     mirror,
+    person,
     repaint,
+    rider,
     sides,
     wheel,
 )
-from lidar.world.people import person, rider
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -11,29 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.geometry.mesh import Mesh
+from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
 from geoscene.relief import MESH
 from geoscene.scene import Scene
 from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.raycast import Caster, Geometry, Hits, MeshInstances
-from lidar.raycast.geometry import split
+from lidar.raycast import Caster, Hits, MeshInstances
 from lidar.raycast.refine import Refiner
 from lidar.raycast.relief import (
     NO_WALLS,
     GroundRefiner,
-    GroundTables,
     WallRefiner,
-    WallTables,
-    ground_tables,
     join,
     joined_ground,
 )
-from lidar.world.openings import openings_of
+from lidar.world.actors import Actors, actor_shapes, actor_transforms
 from lidar.world.settings import PLAIN, WorldSettings, check_relief
-from lidar.world.shared import Shared
 from lidar.world.shelter import CELL, Shelter, shelter_of
 from lidar.world.surfaces import (
     GLASS,
@@ -48,7 +43,7 @@ from lidar.world.surfaces import (
     surfaces_at,
     surfaces_of,
 )
-from lidar.world.tile_selection import selected_tile
+from lidar.world.tiles import LoadedTile, SharedTiles, load_tile
 
 Region = tuple[float, float, float, float]
 
@@ -62,31 +57,7 @@ _GRID = 2048.0  # spacing in metres of possible origins of float32 coordinates
 _PARTS = 8  # part numbers per tile, one for each mask
 
 
-@dataclass(frozen=True, slots=True, weakref_slot=True)
-class _Tile:
-    """A loaded tile: its parts by number, attributes of its faces, instances of shapes in scene metres.
-
-    Worlds share it, and change none of its arrays.
-
-    scene    : it is of
-    surfaces : of the faces of the mesh, then of those that ``walls`` adds
-    walls    : openings of its walls
-    ground   : roughness of its ground, None for none
-    centre   : (m, 3) of the faces of the mesh, scene metres; then zeros
-    """
-
-    scene: Scene
-    parts: Mapping[int, Geometry]
-    surfaces: Surfaces
-    walls: WallTables
-    ground: GroundTables | None
-    shape: NDArray[np.int32]
-    transform: Float
-    feature: NDArray[np.int32]
-    centre: Float
-
-
-_TILES: Shared[_Tile] = Shared()
+_TILES = SharedTiles()
 
 
 def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Caster:
@@ -94,11 +65,10 @@ def _empty_caster(origin: Float, *, backend: str, settings: WorldSettings) -> Ca
 
 
 class _Placed(NamedTuple):
-    """Instances, and the number (k,) of each one's shape among all shapes, and its feature (k,)."""
+    """Copies of shapes by number, and the same for rays."""
 
+    copies: ShapeInstances
     instances: MeshInstances
-    shape: NDArray[np.int32]
-    feature: NDArray[np.int32]
 
 
 class _Shapes:
@@ -120,22 +90,25 @@ class _Shapes:
             )
         return self._casters[number]
 
-    def placed(self, shape: NDArray[np.int32], transform: Float, *, feature: NDArray[np.int32]) -> _Placed:
-        """Copies (k,) of shapes by number.
+    def placed(self, copies: ShapeInstances) -> _Placed:
+        """Copies of the shapes, with transforms as of `World.place_actors`.
 
         Raises InputError for a number beyond the shapes.
         """
+        shape = copies.shape
         if len(shape) and not 0 <= shape.min() <= shape.max() < len(self.meshes):
             raise InputError(f"an instance has a shape number beyond the {len(self.meshes)} shapes")
         used, own = np.unique(shape, return_inverse=True)
         casters = tuple(self._caster(number) for number in used.tolist())
-        return _Placed(MeshInstances(casters, own.astype(np.int32), transform), shape, feature)
+        return _Placed(copies, MeshInstances(casters, own.astype(np.int32), copies.transform))
 
 
 class World:
     """The loaded part of a scene, for ray casting; coordinates are scene metres.
 
     ``world.caster`` casts the rays (see `lidar.raycast.Caster`), `lookup` returns the surfaces of their hits.
+    ``faces`` has the attributes of all faces, for compiled code; ``surfaces`` is the table of surfaces, where
+    hits on the mesh have the row `Hits.face`; ``walls`` has the openings of walls, none without relief.
     `follow` loads another region and `place_actors` places moving actors, both in place: look up hits first.
 
     scene    : the scene
@@ -167,14 +140,12 @@ class World:
             _Shapes(meshes, backend, device=settings.device) for meshes in (shapes, actors)
         )
         self._copied = [surfaces_of(mesh, settings) for mesh in (*shapes, *actors)]
-        self._tiles: dict[int, _Tile] = {}
-        none = np.empty(0, np.int32)
-        self._moving = self._actors.placed(none, np.empty((0, 3, 4)), feature=none)
+        self._tiles: dict[int, LoadedTile] = {}
+        self._moving = self._actors.placed(ShapeInstances.empty())
         self.span_ns = 0, 1
         self._sheltered: dict[tuple[float, float], Shelter | None] = {}
         self.caster = _empty_caster(np.zeros(3), backend=backend, settings=settings)
-        self._walls = WallRefiner(NO_WALLS)
-        self._rough = scene.relief != "off" and settings.relief != "off"
+        self.walls = WallRefiner(NO_WALLS)
         self._concatenate_tables()
 
     @classmethod
@@ -225,10 +196,16 @@ class World:
         _TILES.keep(self._tiles.values())
         self.region = region
         self._concatenate_tables()
+        numbers = {r: range(_PARTS * r, _PARTS * r + len(t.parts)) for r, t in (old | self._tiles).items()}
         self.caster.update(
-            detach=[number for rank in old.keys() - kept for number in old[rank].parts],
-            attach={n: p for rank in ranks if rank not in kept for n, p in self._tiles[rank].parts.items()},
-            first={n: self._first[rank] for rank in ranks for n in self._tiles[rank].parts},
+            detach=[number for rank in old.keys() - kept for number in numbers[rank]],
+            attach={
+                n: part
+                for rank in ranks
+                if rank not in kept
+                for n, part in zip(numbers[rank], self._tiles[rank].parts, strict=True)
+            },
+            first={n: self._first[rank] for rank in ranks for n in numbers[rank]},
             instances=self._instances,
         )
         self.caster.refiners = self._refiners()
@@ -254,13 +231,14 @@ class World:
         span_ns   : times that the ray times 0 and 1 stand for
         """
         self.span_ns = span_ns
-        self._moving = self._actors.placed(np.asarray(shape, np.int32), transform, feature=feature)
+        copies = ShapeInstances(np.asarray(shape, np.int32), transform, np.asarray(feature, np.int32))
+        self._moving = self._actors.placed(copies)
         self._index_instances()
         self.caster.update(instances=self._instances)
 
     def lookup(self, hits: Hits) -> Surfaces:
         """Surfaces that the rays hit."""
-        return surfaces_at(self._surfaces, hits.face, hits.instance, start=self._base, named=self._feature)
+        return surfaces_at(self.surfaces, hits.face, hits.instance, start=self._base, named=self._feature)
 
     def shelter(self, position: Float) -> Shelter | None:
         """Covered air (under roofs, bridges, in tunnels) around a place; None if nothing is covered.
@@ -276,9 +254,7 @@ class World:
             return None
         if (place := (float(x), float(y))) not in self._sheltered:
             corner = float(x - half), float(y - half)
-            parts = (
-                p for t in self._tiles.values() for p in t.parts.values() if p.mask & (SOLID | GLASS | WATER)
-            )
+            parts = (p for t in self._tiles.values() for p in t.parts if p.mask & (SOLID | GLASS | WATER))
             found = shelter_of(parts, origin=self.caster.origin, corner=corner, count=int(2 * half / CELL))
             self._sheltered = dict([*self._sheltered.items(), (place, found)][-_KEPT:])
         return self._sheltered[place]
@@ -293,127 +269,79 @@ class World:
         """Metres from a sensor beyond which nothing is hit."""
         return self.settings.reach
 
-    @property
-    def faces(self) -> SurfaceFaces:
-        """Attributes of all faces, for compiled code."""
-        return self._faces
-
-    @property
-    def surfaces(self) -> Surfaces:
-        """The table of surfaces; hits on the mesh have the row `Hits.face`."""
-        return self._surfaces
-
-    @property
-    def walls(self) -> WallRefiner:
-        """Openings of walls; an empty table without relief (see the settings)."""
-        return self._walls
-
     def _refiners(self) -> list[Refiner]:
         """Refiners of the loaded tiles: they intersect rays with the surfaces behind the planes of faces.
 
         A kind of surface is one `lidar.raycast.refine.Refiner`. It finds its own faces by `Hits.face`, which
         is also the row in the table of surfaces of the world.
         """
-        count = len(self._surfaces)
+        count = len(self.surfaces)
         tables = [NO_WALLS, *(tile.walls for tile in self._tiles.values())]
         faces = [0, *(self._first[rank] for rank in self._tiles)]
-        self._walls = WallRefiner(join(tables, faces=faces, count=count))
+        self.walls = WallRefiner(join(tables, faces=faces, count=count))
         refiners: list[Refiner] = []
-        if self.settings.relief != "off" and len(self._walls.tables.first):
-            refiners.append(self._walls)
+        if self.settings.relief != "off" and len(self.walls.tables.first):
+            refiners.append(self.walls)
         rough = {self._first[rank]: tile.ground for rank, tile in self._tiles.items() if tile.ground}
         if rough:
             refiners.append(GroundRefiner(joined_ground(rough, count=count)))
         return refiners
 
-    def _tile(self, rank: int) -> _Tile:
+    def _tile(self, rank: int) -> LoadedTile:
+        origin, settings = self.caster.origin, self.settings
         # a tile holds its scene, so no other scene has the same number
-        key = id(self.scene), rank, self.settings, *self.caster.origin.tolist()
-        return _TILES.get(key, partial(self._read, rank))
-
-    def _read(self, rank: int) -> _Tile:
-        tile = selected_tile(self.scene, rank, settings=self.settings, shapes=self._named)
-        mesh, copies = tile.mesh, tile.instances
-        parts = split(
-            mesh.vertices + (tile.origin - self.caster.origin), mesh.faces, mask=mask_bits(mesh.material)
-        )
-        transform = copies.transform.copy()
-        transform[:, :, 3] += tile.origin
-        surfaces, walls = surfaces_of(mesh, self.settings), NO_WALLS
-        centre = mesh.vertices[mesh.faces].mean(axis=1) + tile.origin
-        if tile.relief is not None:
-            bits = mask_bits(np.arange(256, dtype=np.uint8))
-            walls, added = openings_of(tile.relief, origin=tile.origin, bits=bits)
-            surfaces = Surfaces.concatenate([surfaces, added])
-            centre = np.concatenate([centre, np.zeros((len(added), 3))])
-        return _Tile(
-            self.scene,
-            {_PARTS * rank + k: part for k, part in enumerate(parts)},
-            surfaces,
-            walls,
-            ground_tables(mesh, origin=tile.origin) if self._rough else None,
-            copies.shape,
-            transform,
-            copies.feature,
-            centre,
-        )
+        key = id(self.scene), rank, settings, *origin.tolist()
+        load = partial(load_tile, self.scene, rank, origin=origin, settings=settings, shapes=self._named)
+        return _TILES.get(key, load)
 
     def _concatenate_tables(self) -> None:
         """Concatenate the tables of tiles and shapes, with the row of a miss last (index -1)."""
         tables = [*(tile.surfaces for tile in self._tiles.values()), *self._copied]
         starts = np.cumsum([0, *(len(table.klass) for table in tables)])
         self._first = dict(zip(self._tiles, starts.tolist(), strict=False))
-        self._surfaces = Surfaces.concatenate([*tables, MISS])
-        self._packed = pack_surfaces(self._surfaces, self._leaves_of(starts[len(self._tiles) :]))
-        feature = self._surfaces.feature
+        self.surfaces = Surfaces.concatenate([*tables, MISS])
+        self._packed = pack_surfaces(self.surfaces, self._leaves_of(starts[len(self._tiles) :]))
+        feature = self.surfaces.feature
         self._bounds = int(feature.min()), int(feature.max())
-        self._still = self._static()
+        copies = [ShapeInstances.empty(), *(tile.instances for tile in self._tiles.values())]
+        self._still = self._shapes.placed(ShapeInstances.concatenate(copies))
         self._of_shape, self._of_actor = np.split(starts[len(self._tiles) : -1], [len(self._shapes.meshes)])
         self._index_instances()
 
     def _shelter(self) -> None:
         """Clear `OPEN` of faces of tiles under roofs, bridges and in tunnels, by a ray upwards from each."""
-        first = len(self._surfaces) - sum(len(table) for table in self._copied) - 1
-        row = np.flatnonzero(self._surfaces.material[:first] & OPEN)
+        first = len(self.surfaces) - sum(len(table) for table in self._copied) - 1
+        row = np.flatnonzero(self.surfaces.material[:first] & OPEN)
         if not len(row):
             return
         start = np.concatenate([tile.centre for tile in self._tiles.values()])[row] + [0.0, 0.0, _ABOVE]
         up = np.broadcast_to([0.0, 0.0, 1.0], start.shape)
         covered = row[self.caster.occluded(start, up, far=_CEILING, mask=SOLID | GLASS)]
-        self._surfaces.material[covered] &= ~np.uint8(OPEN)
+        self.surfaces.material[covered] &= ~np.uint8(OPEN)
         self._packed[covered] &= ~np.int64(OPEN)
         self._index_instances()
 
     def _leaves_of(self, starts: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Kinds of leaves of all rows of the tables; ``starts`` are those of the shapes."""
-        kinds, found = list(self._leaves), np.zeros(len(self._surfaces.klass), np.uint8)
+        kinds, found = list(self._leaves), np.zeros(len(self.surfaces.klass), np.uint8)
         for k, (name, mesh) in enumerate(self._named.items()):
             if name in kinds:
                 leafy = mesh.klass == Class.TREE_CROWN  # limbs in a crown let no ray pass
                 found[starts[k] : starts[k + 1]][leafy] = 1 + kinds.index(name)
         if "hedge" in kinds:
-            found[self._surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
+            found[self.surfaces.klass == Class.HEDGE] = 1 + kinds.index("hedge")
         return found
 
     def _index_instances(self) -> None:
         """Set the first rows and feature numbers of all instances."""
-        still, moving = self._still, self._moving
+        still, moving = self._still.copies, self._moving.copies
         self._base = np.concatenate([self._of_shape[still.shape], self._of_actor[moving.shape], [0]])
-        self._feature = np.concatenate([still.feature, np.asarray(moving.feature, np.int32)])
+        self._feature = np.concatenate([still.feature, moving.feature])
         low, high = self._bounds
         if len(self._feature):
             low, high = min(low, int(self._feature.min())), max(high, int(self._feature.max()))
         leaves = np.array([0.0, *self._leaves.values()])
-        self._faces = SurfaceFaces(self._base, self._feature, self._packed, low, high, leaves)
-
-    def _static(self) -> _Placed:
-        tiles = self._tiles.values()
-        shape = np.concatenate([np.empty(0, np.int32), *(tile.shape for tile in tiles)])
-        transform = np.concatenate([np.empty((0, 3, 4)), *(tile.transform for tile in tiles)])
-        feature = [np.asarray(tile.feature, np.int32) for tile in tiles]
-        return self._shapes.placed(
-            shape, transform, feature=np.concatenate([np.empty(0, np.int32), *feature])
-        )
+        self.faces = SurfaceFaces(self._base, self._feature, self._packed, low, high, leaves)
 
     @property
     def _instances(self) -> list[MeshInstances]:
@@ -425,3 +353,59 @@ def _tiles_intersecting(scene: Scene, region: Region, *, margin: float) -> list[
     boxes = scene.tile_boxes
     near = (boxes[:, :2] <= np.array(region[2:]) + margin) & (boxes[:, 2:] >= np.array(region[:2]) - margin)
     return [int(k) for k in np.flatnonzero(near.all(axis=1))]
+
+
+class Worlds:
+    """Worlds of the threads of a drive: one for all threads without moving actors, else one per thread.
+
+    scene    : the static scene
+    margin   : maximum range of the sensors, metres
+    actors   : the road users; none by default
+    settings : of the worlds
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        margin: float,
+        *,
+        actors: Actors | None = None,
+        settings: WorldSettings = PLAIN,
+    ) -> None:
+        self.scene = scene
+        self.margin = min(margin, settings.reach)
+        self.settings = settings
+        self.actors = actors if actors is not None and len(actors) else None
+        self._region: Region | None = None
+        self._shared: World | None = None
+        self._own = threading.local()
+
+    def follow(self, region: Region) -> None:
+        """Load another region. Call it only while no thread uses a world."""
+        self._region = region
+        if self.actors is None:
+            self._shared = self._loaded(self._shared, region)
+
+    def during(self, start_ns: int, end_ns: int) -> World:
+        """The world of this thread until its next call; ray times 0 and 1 are ``start_ns`` and ``end_ns``."""
+        if self._shared is not None:
+            return self._shared
+        region = self._region
+        assert region is not None, "follow comes before during"  # noqa: S101
+        world: World | None = getattr(self._own, "world", None)
+        if world is None or self._own.region != region:
+            world = self._loaded(world, region)
+            self._own.world, self._own.region = world, region
+        if self.actors is not None:
+            m = self.margin
+            around = (region[0] - m, region[1] - m, region[2] + m, region[3] + m)
+            shape, transform, feature = actor_transforms(self.actors, start_ns, end_ns=end_ns, region=around)
+            world.place_actors(shape, transform, feature=feature, span_ns=(start_ns, end_ns))
+        return world
+
+    def _loaded(self, world: World | None, region: Region) -> World:
+        if world is None:
+            shapes = actor_shapes(self.actors) if self.actors is not None else ()
+            world = World(self.scene, margin=self.margin, actors=shapes, settings=self.settings)
+        world.follow(region)
+        return world

@@ -11,10 +11,10 @@ from lidar.geometry.poses import Trajectory
 from lidar.raycast import Caster
 from lidar.raycast.geometry import split
 from lidar.raycast.relief import NO_WALLS, WallRefiner, join
-from lidar.world.openings import openings_of
 from lidar.world.settings import PLAIN, WorldSettings
 from lidar.world.shelter import shelter_of
 from lidar.world.surfaces import MISS, SurfaceFaces, Surfaces, mask_bits, pack_surfaces, surfaces_of
+from lidar.world.tiles import openings_of
 
 LEAVES = 0.8  # m2/m3 of leaves in boxes of class HEDGE
 

@@ -12,7 +12,7 @@ from lidar.cli import app
 from lidar.errors import InputError
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import ScannerSettings
-from lidar.sensors.rig.catalog import rig_rows, sensor_rows
+from lidar.sensors.rig.devices import rig_rows, sensor_rows
 from lidar.sensors.rig.scanner import load_sensor, sensor_names
 from lidar.sensors.rig.specs import load_rig, rig_names
 from lidar.settings import levels, list_settings, settings_of

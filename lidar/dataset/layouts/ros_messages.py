@@ -16,7 +16,7 @@ from geoscene.classes import Class
 from geoscene.errors import need
 from geoscene.typing import Float
 from lidar.dataset.formats.table import Table
-from lidar.sensors.rig.patterns.scanner2d import Scan2d
+from lidar.sensors.rig.patterns.repeating import Scan2d
 
 _FIELDS = {
     "x": ("x", np.float32),

@@ -21,7 +21,7 @@ from lidar.geometry.attitude import body_rates, matrix_from_quat, quat_from_matr
 from lidar.geometry.mounts import OPTICAL, OPTICAL_QUAT
 from lidar.sensors.navigation.measurements import Fixes, fix_variances
 from lidar.sensors.rig.devices import Scanner, scanners
-from lidar.sensors.rig.patterns.scanner2d import Scan2d
+from lidar.sensors.rig.patterns.repeating import Scan2d
 from lidar.sensors.rig.specs import ImuSpec
 
 log = logging.getLogger(__name__)

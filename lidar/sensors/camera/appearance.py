@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.typing import Float
 from lidar.raycast import Caster
+from lidar.sensors.camera.light import LENSES
 from lidar.sensors.camera.sign_faces import OF_SHAPE, PLATE, SIDE, face_levels, plate_levels, sample
-from lidar.sensors.camera.signal_lamps import LENSES
 from lidar.sensors.camera.texture import compiled, hash_place
 from lidar.world.actor_shapes import CLOTHES, FLEET
-from lidar.world.actor_solids import WHITE
-from lidar.world.people import HAIR, SKIN
+from lidar.world.actor_solids import HAIR, SKIN, WHITE
 from lidar.world.world import World
 
 _CODE = {name: material.code for name, material in materials().items()}

@@ -20,9 +20,9 @@ from lidar.raycast.hits import own_faces
 from lidar.sensors.camera import appearance, shade
 from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.facades import RenderedFacades, facades_of, flatten, walls_of
-from lidar.sensors.camera.light import Light, daylight
-from lidar.sensors.camera.signal_lamps import Lamps, emit
-from lidar.sensors.physics.fresnel import reflect
+from lidar.sensors.camera.light import Lamps, Light, daylight, emit
+from lidar.sensors.camera.settings import PLAIN, CameraSettings
+from lidar.sensors.physics.reflect import reflect
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.surfaces import Surfaces, label_hits
@@ -54,45 +54,6 @@ _LIFT = 1e-3
 """Offset in metres of a shadow ray from its surface; it grows with distance."""
 
 
-@dataclass(frozen=True)
-class RenderOptions:
-    """Settings of the renderer.
-
-    precision   : of depths, see `lidar.raycast.Caster.cast`
-    retrace     : whether rays that miss are traced a second time
-    shadows     : cast shadows
-    detail      : draw windows, joints and grain on surfaces of uniform colour
-    supersample : rays along each side of a pixel, for colour only; labels and depth are those of its centre
-    edge_rays   : the same at edges, as `edges` finds them, where it is more than ``supersample``
-    visibility  : metres at which haze has taken 98 % of a contrast (Koschmieder); inf for clear air
-    cloud       : share of the sky that clouds cover
-    exposure    : stops added to the automatic exposure
-    full_well   : electrons at full scale, which set the shot noise; inf for none
-    read_noise  : electrons (standard deviation), with a finite ``full_well``
-    threads     : threads to use; the images do not depend on it
-    """
-
-    precision: str = "exact"
-    retrace: bool = True
-    shadows: bool = True
-    detail: bool = True
-    supersample: int = 1
-    edge_rays: int = 2
-    visibility: float = 20_000.0
-    cloud: float = 0.0
-    exposure: float = 0.0
-    full_well: float = float("inf")
-    read_noise: float = 4.0
-    threads: int = 1
-
-    def __post_init__(self) -> None:
-        """Raise InputError for values out of range."""
-        sound = 1 <= self.supersample <= 16 and 1 <= self.edge_rays <= 16
-        sound = sound and self.visibility > 0 and 0 <= self.cloud <= 1
-        if not (sound and self.full_well > 0 and self.threads):
-            raise InputError(f"camera options out of range: {self}")
-
-
 @dataclass(frozen=True, slots=True)
 class CameraImage:
     """One frame of a camera, row by row from the top.
@@ -111,7 +72,7 @@ class CameraImage:
 
 
 @dataclass(frozen=True, slots=True)
-class _Traced:
+class TracedView:
     """Rays in the scene and their hits.
 
     origin    : (k, 3) scene metres
@@ -129,21 +90,6 @@ class _Traced:
     time: Float | None
     hits: Hits
 
-    def view(self, world: World) -> TracedView:
-        """These, and the surfaces that are hit."""
-        found = world.lookup(self.hits)
-        return TracedView(self.origin, self.row, self.direction, self.seen, self.time, self.hits, found)
-
-
-@dataclass(frozen=True, slots=True)
-class TracedView(_Traced):
-    """Rays in the scene and their hits, as in `_Traced`.
-
-    surfaces : surfaces at the hits
-    """
-
-    surfaces: Surfaces
-
 
 def render(
     camera: CameraSpec,
@@ -154,76 +100,79 @@ def render(
     times: Float | None = None,
     lamps: Lamps | None = None,
     random: np.random.Generator | None = None,
-    options: RenderOptions | None = None,
+    settings: CameraSettings = PLAIN,
+    threads: int = 1,
 ) -> CameraImage:
     """One frame of a camera.
 
     poses   : of the camera (z forward, x right, y down), one for each of `exposure_times`: a single one, one
               a row for a rolling shutter, and that many again for every sample of the exposure; colour is
               their mean, depth and labels are the middle sample's
-    sun     : (3,) direction towards the sun, scene axes, from `lidar.sensors.camera.sun.sun_direction`
+    sun     : (3,) direction towards the sun, scene axes, from `lidar.sensors.camera.light.sun_direction`
     times   : ray times 0 to 1 of the poses, for actors that move
     lamps   : signal heads that are lit; none by default
-    random  : source of the noise of a finite ``options.full_well``
+    random  : source of the noise of ``settings.camera_noise``
+    threads : threads to use; the image does not depend on it
 
     Raises InputError for a number of poses that does not fit the camera.
     """
-    options = options or RenderOptions()
     rows = camera.height if camera.row_ns else 1
     samples, rest = divmod(len(poses), rows)
     if rest or not samples:
         raise InputError(f"camera {camera.name}: {len(poses)} poses for {rows} moments; see exposure_times")
-    if np.isfinite(options.full_well) and random is None:
-        raise InputError(f"camera {camera.name}: `full_well` adds noise and needs `random`")
+    noise = random if settings.camera_noise else None
+    if settings.camera_noise and noise is None:
+        raise InputError(f"camera {camera.name}: `camera_noise` needs `random`")
     h, w = camera.height, camera.width
     coloured = "rgb" in camera.images
-    light = replace(light_of(sun, cloud=options.cloud, snow=world.settings.snow), lamps=lamps)
-    exposure = light.exposure * 2.0**options.exposure
+    light = replace(light_of(sun, cloud=settings.cloud, snow=world.settings.snow), lamps=lamps)
+    exposure = light.exposure * 2.0**camera.exposure_ev
     walls = facades_of(world)
-    k = options.supersample
-    trace = functools.partial(_trace, poses=poses, world=world, times=times, options=options)
-    colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, options=options)
+    k = settings.supersample
+    trace = functools.partial(_trace, poses=poses, world=world, times=times, settings=settings)
+    colour = functools.partial(radiance, world, light=light, walls=walls, blur=0.0, settings=settings)
 
     def band(edges: tuple[int, int], image: _Image, *, sample: int) -> None:
         """Labels, depth and colour of the rows of an image."""
         first, last = edges
         here = slice(first * w, last * w)
+        view = trace(camera, here, sample=sample, normals=coloured)
         if not coloured:
-            traced = trace(camera, here, sample=sample, normals=False)
-            hits, klass, feature = traced.hits, image.klass[here], image.feature[here]
-            label_hits(world.faces, hits.face, hits.instance, klass, feature)
-            image.label(here, hits=hits, seen=traced.seen, klass=klass, feature=feature)
+            klass, feature = image.klass[here], image.feature[here]
+            label_hits(world.faces, view.hits.face, view.hits.instance, klass, feature)
+            image.label(here, hits=view.hits, seen=view.seen, klass=klass, feature=feature)
             return
-        view = trace(camera, here, sample=sample).view(world)
-        found = view.surfaces
+        found = world.lookup(view.hits)
         image.label(here, hits=view.hits, seen=view.seen, klass=found.klass, feature=found.feature)
         if k == 1:
-            image.light[here] = colour(view, angle=1 / camera.fx)
+            image.light[here] = colour(view, surfaces=found, angle=1 / camera.fx)
         else:
             fine = _finer(camera, k)
             sharp = trace(fine, slice(first * k * w * k, last * k * w * k), sample=sample, rows=h)
-            image.light[here] = _bin_values(colour(sharp.view(world), angle=1 / fine.fx), k, width=w)
+            linear = colour(sharp, surfaces=world.lookup(sharp.hits), angle=1 / fine.fx)
+            image.light[here] = _bin_values(linear, k, width=w)
 
     def refine(pixels: NDArray[np.int64], image: _Image, *, sample: int) -> None:
         """Colour of single pixels of an image, from more rays."""
-        n = options.edge_rays
+        n = settings.edge_rays
         fine = _finer(camera, n)
         sharp = trace(fine, _finer_pixels(pixels, n, width=w), sample=sample, rows=h)
-        part = colour(sharp.view(world), angle=1 / fine.fx).reshape(len(pixels), n * n, 3)
+        linear = colour(sharp, surfaces=world.lookup(sharp.hits), angle=1 / fine.fx)
+        part = linear.reshape(len(pixels), n * n, 3)
         # The same as their mean, of which NumPy adds three numbers at a time.
         image.light[pixels] = sum(part[:, i] for i in range(n * n)) / np.float32(n * n)
 
     step = max(1, _BAND // (w * k * k))
     bands = [(a, min(a + step, h)) for a in range(0, h, step)]
     total = None
-    with ThreadPoolExecutor(options.threads) as pool:
-        run = map if options.threads == 1 else pool.map
+    with ThreadPoolExecutor(threads) as pool:
+        run = map if threads == 1 else pool.map
         for sample in range(samples) if coloured else [samples // 2]:
             image = _Image.of(h * w, coloured=coloured)
             list(run(functools.partial(band, image=image, sample=sample), bands))
             if coloured:
                 rgb = shade.develop_tone(image.light, exposure).reshape(h, w, 3)
-            if coloured and options.edge_rays > k:
+            if coloured and settings.edge_rays > k:
                 edge = edge_pixels(rgb, image.feature.reshape(h, w), klass=image.klass.reshape(h, w))
                 parts = np.split(edge, range(_EDGES, len(edge), _EDGES))
                 list(run(functools.partial(refine, image=image, sample=sample), parts))
@@ -231,12 +180,11 @@ def render(
             total = image.light if total is None else total + image.light
             if sample == samples // 2:
                 middle = image
-    noise = random if np.isfinite(options.full_well) else None
     if coloured and total is not None and (samples > 1 or noise is not None):
         exposure /= samples
         if noise is not None:
             electrons = noise.standard_normal((h, w, 3), np.float32).reshape(-1, 3)
-            total = _noisy(total, exposure, normal=electrons, options=options)
+            total = _noisy(total, exposure, normal=electrons, camera=camera)
         rgb = shade.develop_tone(total, exposure).reshape(h, w, 3)
     depth = np.where(middle.range <= camera.far, middle.range, np.inf)
     return CameraImage(
@@ -330,10 +278,10 @@ def _trace(
     world: World,
     sample: int,
     times: Float | None,
-    options: RenderOptions,
+    settings: CameraSettings,
     rows: int | None = None,
     normals: bool = True,
-) -> _Traced:
+) -> TracedView:
     """Rays and hits of pixels of a camera in one sample of the exposure.
 
     pixels  : numbers of pixels, row by row from the top
@@ -359,14 +307,14 @@ def _trace(
         far=world.reach,
         time=time,
         normals=normals,
-        precision=options.precision,
-        retrace=options.retrace,
+        precision=settings.precision,
+        retrace=settings.retrace,
         footprint=(0.0, 1.0 / camera.fx),
         scattered=True,
     )
     if not seen.all():
-        hits = _with_misses(hits, ~seen)
-    return _Traced(poses.position, row, direction, seen, time, hits)
+        hits.range[~seen], hits.face[~seen], hits.instance[~seen], hits.cosine[~seen] = np.inf, -1, -1, 0
+    return TracedView(poses.position, row, direction, seen, time, hits)
 
 
 def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
@@ -394,40 +342,30 @@ def _bent_rays(camera: CameraSpec, number: NDArray[np.int64]) -> Float:
     return rays if camera.model == "fisheye" else rays / rays[:, 2:]
 
 
-def _with_misses(hits: Hits, missed: NDArray[np.bool_]) -> Hits:
-    """The hits with some rays turned into misses."""
-    return Hits(
-        np.where(missed, np.inf, hits.range),
-        np.where(missed, np.int32(-1), hits.face),
-        np.where(missed, np.int32(-1), hits.instance),
-        np.where(missed, np.float32(0), hits.cosine),
-        hits.normal,
-    )
-
-
 def radiance(
     world: World,
     view: TracedView,
     *,
+    surfaces: Surfaces,
     light: Light,
     walls: RenderedFacades,
     blur: float,
     angle: float,
-    options: RenderOptions,
+    settings: CameraSettings,
 ) -> NDArray[np.float32]:
     """Linear light (n, 3) along the rays of a view, in units of `Light`.
 
+    surfaces    : what the rays hit
     blur, angle : a pixel is blur + angle * distance metres wide
     """
     wet = world.settings.wetness > 0
-    out, gloss, facet = _shade(
-        world, view, light=light, walls=walls, size=(blur, angle), options=options, wet=wet
-    )
+    fill = functools.partial(_shade, world, light=light, walls=walls, settings=settings)
+    out, gloss, facet = fill(view, surfaces=surfaces, size=(blur, angle), wet=wet)
     row = np.flatnonzero(gloss > _GLOSS)
     if len(row):
-        mirror = _mirrored_view(world, view, row=row, facet=facet[row], options=options)
+        mirror = _mirrored_view(world, view, row=row, facet=facet[row], settings=settings)
         size = float(angle * np.median(view.hits.range[row])), angle
-        seen, _, _ = _shade(world, mirror, light=light, walls=walls, size=size, options=options, wet=False)
+        seen, _, _ = fill(mirror, surfaces=world.lookup(mirror.hits), size=size, wet=False)
         out[row] += gloss[row, None] * seen
     return out
 
@@ -438,7 +376,7 @@ def _mirrored_view(
     *,
     row: NDArray[np.intp],
     facet: NDArray[np.float32],
-    options: RenderOptions,
+    settings: CameraSettings,
 ) -> TracedView:
     """Hits of rays (k,) of a view after reflection at films of water with normals (k, 3)."""
     direction, normal = view.direction[row], view.hits.normal[row]
@@ -451,20 +389,21 @@ def _mirrored_view(
     start = place + (_LIFT + 1e-6 * view.hits.range[row, None]) * normal
     time = None if view.time is None else view.time[row]
     hits = world.caster.cast(
-        start, towards, far=world.reach, time=time, normals=True, retrace=options.retrace
+        start, towards, far=world.reach, time=time, normals=True, retrace=settings.retrace
     )
     each = np.arange(len(row), dtype=np.int32)
-    return TracedView(start, each, towards, np.ones(len(row), np.bool_), time, hits, world.lookup(hits))
+    return TracedView(start, each, towards, np.ones(len(row), np.bool_), time, hits)
 
 
 def _shade(
     world: World,
     view: TracedView,
     *,
+    surfaces: Surfaces,
     light: Light,
     walls: RenderedFacades,
     size: tuple[float, float],
-    options: RenderOptions,
+    settings: CameraSettings,
     wet: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Linear light (n, 3) along the rays of a view, and gloss (n,) and normals (n, 3) of wet surfaces.
@@ -474,8 +413,7 @@ def _shade(
     """
     hits = view.hits
     n = len(hits)
-    surfaces, wall = walls_of(walls, view.surfaces, hits=hits)
-    view = replace(view, surfaces=surfaces)
+    surfaces, wall = walls_of(walls, surfaces, hits=hits)
     distance, normal = hits.range, hits.normal
     if walls.deep and (wall >= 0).any():
         distance = distance.copy()
@@ -487,7 +425,7 @@ def _shade(
     lit = np.zeros(n, np.bool_)
     if k and light.beam.any():
         which = which[:k]
-        if options.shadows:
+        if settings.shadows:
             towards = np.broadcast_to(light.direction, (k, 3))
             time = None if view.time is None else view.time[which]
             on = own_faces(hits)[which]
@@ -506,14 +444,14 @@ def _shade(
         normal,
         surfaces.klass,
         surfaces.material,
-        _drawn(world, view, size=size) if options.detail else surfaces.color,
+        _drawn(world, view, found=surfaces, size=size) if settings.detail else surfaces.color,
         surfaces.feature,
         wall,
         walls,
         lit,
         (light.direction, light.beam, light.ambient, light.sky, light.horizon),
         (*shade.material_tables(), shade.linear_table()),
-        (*size, 3.912 / options.visibility, options.detail),
+        (*size, 3.912 / settings.haze, settings.detail),
         shade.covers(world.settings.wetness, world.settings.snow),
         out,
         gloss,
@@ -530,7 +468,7 @@ def _shade(
             width=size[0] + size[1] * away,
             exposure=light.exposure,
         )
-        out[rows] += seen * np.exp(-3.912 / options.visibility * away)[:, None].astype(np.float32)
+        out[rows] += seen * np.exp(-3.912 / settings.haze * away)[:, None].astype(np.float32)
     if not view.seen.all():
         out[~view.seen] = 0.0
     return out, gloss, facet
@@ -547,14 +485,14 @@ def _on_shapes(world: World, view: TracedView, *, rows: NDArray[np.intp]) -> Flo
     """Places (k, 3) of some hits on instances, in the instances' own frames."""
     point = view.origin[view.row[rows]] + view.hits.range[rows, None] * view.direction[rows]
     time = np.zeros(len(rows)) if view.time is None else view.time[rows]
-    transform = _transforms(world, view.hits.instance[rows], time=time)
-    offset = (point - transform[:, :, 3])[..., None]
-    return np.linalg.solve(transform[:, :, :3], offset)[..., 0].astype(np.float64)
+    return _on_bodies(point, view.hits.instance[rows], world=world, time=time)
 
 
-def _drawn(world: World, view: TracedView, *, size: tuple[float, float]) -> NDArray[np.uint8]:
+def _drawn(
+    world: World, view: TracedView, *, found: Surfaces, size: tuple[float, float]
+) -> NDArray[np.uint8]:
     """Colours (n, 3) of the visible surfaces, with signs, plates and clothes drawn on instances."""
-    hits, found = view.hits, view.surfaces
+    hits = view.hits
     on = np.flatnonzero(hits.instance >= 0)
     if not len(on):
         return found.color
@@ -575,11 +513,11 @@ def _drawn(world: World, view: TracedView, *, size: tuple[float, float]) -> NDAr
 
 
 def _noisy(
-    light: NDArray[np.float32], exposure: float, *, normal: NDArray[np.float32], options: RenderOptions
+    light: NDArray[np.float32], exposure: float, *, normal: NDArray[np.float32], camera: CameraSpec
 ) -> NDArray[np.float32]:
     """Light with shot noise and read noise."""
-    electrons = np.minimum(light * exposure, 1.0) * options.full_well
-    spread = np.sqrt(electrons + options.read_noise**2) / options.full_well
+    electrons = np.minimum(light * exposure, 1.0) * camera.full_well
+    spread = np.sqrt(electrons + camera.read_noise**2) / camera.full_well
     noisy: NDArray[np.float32] = (light + spread * normal / exposure).astype(np.float32)
     return noisy
 
@@ -615,16 +553,20 @@ def optical_flow(
         world=world,
         sample=0,
         times=start,
-        options=RenderOptions(),
+        settings=PLAIN,
         normals=False,
     )
     hit = np.isfinite(view.hits.range)
     point = view.origin[view.row] + np.where(hit, view.hits.range, 1.0)[:, None] * view.direction
-    body = _on_bodies(point, view.hits, world=world, time=start[view.row])
+    on = np.flatnonzero(view.hits.instance >= 0)
+    instance = view.hits.instance[on]
+    body = _on_bodies(point[on], instance, world=world, time=start[view.row[on]])
     row = view.row
     for _ in range(_ROLLS if rows > 1 else 1):
         there = later.take(row if rows > 1 else [0])
-        moved = _off_bodies(point, body, hits=view.hits, world=world, time=end[row])
+        place = _transforms(world, instance, time=end[row[on]])
+        moved = point.copy()
+        moved[on] = np.einsum("nij,nj->ni", place[:, :, :3], body) + place[:, :, 3]
         away = np.where(hit[:, None], moved - there.position, view.direction)
         seen = np.einsum("ni,nij->nj", away / there.scale, np.broadcast_to(there.rotation, (len(away), 3, 3)))
         pixel, _ = project(camera, np.where(view.seen[:, None], seen, np.nan))
@@ -634,21 +576,11 @@ def optical_flow(
     return flow.reshape(camera.height, camera.width, 2)
 
 
-def _on_bodies(point: Float, hits: Hits, *, world: World, time: Float) -> Float:
-    """Points (k, 3) on instances, in the instances' own frames, at ray times (n,)."""
-    on = np.flatnonzero(hits.instance >= 0)
-    place = _transforms(world, hits.instance[on], time=time[on])
-    offset = (point[on] - place[:, :, 3])[..., None]
+def _on_bodies(point: Float, instance: NDArray[np.int32], *, world: World, time: Float) -> Float:
+    """Points (k, 3) at ray times (k,), in the own frames of instances (k,)."""
+    place = _transforms(world, instance, time=time)
+    offset = (point - place[:, :, 3])[..., None]
     return np.linalg.solve(place[:, :, :3], offset)[..., 0].astype(np.float64)
-
-
-def _off_bodies(point: Float, body: Float, *, hits: Hits, world: World, time: Float) -> Float:
-    """Points (n, 3) at ray times (n,): those on instances (k, 3) moved along with them."""
-    on = np.flatnonzero(hits.instance >= 0)
-    place = _transforms(world, hits.instance[on], time=time[on])
-    moved = point.copy()
-    moved[on] = np.einsum("nij,nj->ni", place[:, :, :3], body) + place[:, :, 3]
-    return moved
 
 
 def _transforms(world: World, instance: NDArray[np.int32], *, time: Float) -> Float:

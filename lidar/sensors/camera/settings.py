@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
-from typing import TYPE_CHECKING
 
 from lidar.parameters import check_parameters, parameter
 from lidar.raycast import PRECISIONS
 from lidar.sensors.rig.specs import CameraSpec
-
-if TYPE_CHECKING:
-    from lidar.sensors.camera.render import RenderOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,24 +56,6 @@ class CameraSettings:
     def moments(self, camera: CameraSpec) -> int:
         """Number of samples of an exposure that are rendered."""
         return self.blur if camera.exposure_ns else 1
-
-    def options(self, camera: CameraSpec) -> RenderOptions:
-        """The renderer's options for a camera."""
-        from lidar.sensors.camera.render import RenderOptions  # noqa: PLC0415  (0.1 s)
-
-        return RenderOptions(
-            precision=self.precision,
-            retrace=self.retrace,
-            shadows=self.shadows,
-            detail=self.detail,
-            supersample=self.supersample,
-            edge_rays=self.edge_rays,
-            visibility=self.haze,
-            cloud=self.cloud,
-            exposure=camera.exposure_ev,
-            full_well=camera.full_well if self.camera_noise else inf,
-            read_noise=camera.read_noise,
-        )
 
 
 PLAIN = CameraSettings()

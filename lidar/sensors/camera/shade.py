@@ -67,6 +67,14 @@ def linear_table() -> Float:
     return np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
 
 
+def srgb_bytes(light: Float) -> NDArray[np.uint8]:
+    """Bytes of sRGB of linear light 0..1, of any shape; other values are clipped."""
+    c = np.clip(light, 0, 1)
+    coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
+    rounded: NDArray[np.uint8] = np.rint(255 * coded).astype(np.uint8)
+    return rounded
+
+
 _LEVEL = 0.7
 """Least vertical part of the normal of ground that is textured as such; steeper ground has other detail."""
 

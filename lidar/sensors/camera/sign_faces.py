@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Float
+from lidar.sensors.camera.shade import linear_table, srgb_bytes
 
 SIDE = 1.5
 """Side in metres of the square that a face is drawn on, about the centre of its plate."""
@@ -112,10 +113,6 @@ def _stop(canvas: _Canvas, _: str) -> None:
     canvas.text("STOP", within=(0.58, 0.2), fill=_WHITE)
 
 
-def _give_way(canvas: _Canvas, _: str) -> None:
-    canvas.shape(_ngon(3, 0.52, math.pi), _WHITE)
-
-
 def _hazard(canvas: _Canvas, _: str) -> None:
     canvas.shape(_ngon(3, 0.52), _WHITE)
     canvas.bar((-0.035, 0.0), (0.035, 0.26), _BLACK)
@@ -133,14 +130,6 @@ def _zone(canvas: _Canvas, words: str) -> None:
     canvas.disc(0.165, _WHITE, y=0.05)
     canvas.text(words, within=(0.25, 0.15), fill=_BLACK, y=0.05)
     canvas.text("ZONE", within=(0.4, 0.08), fill=_BLACK, y=-0.23)
-
-
-def _no_entry(canvas: _Canvas, _: str) -> None:
-    canvas.bar((-0.22, -0.055), (0.22, 0.055), _WHITE)
-
-
-def _no_vehicles(canvas: _Canvas, _: str) -> None:
-    _rim(canvas)
 
 
 def _no_overtaking(canvas: _Canvas, _: str) -> None:
@@ -188,10 +177,6 @@ def _ahead(canvas: _Canvas, words: str) -> None:
         canvas.arrow(_COURSES[words], 0.06, _WHITE)
 
 
-def _one_way(canvas: _Canvas, _: str) -> None:
-    canvas.arrow([(0.0, -0.2), (0.0, 0.18)], 0.08, _WHITE)
-
-
 def _path(canvas: _Canvas, words: str) -> None:
     canvas.disc(0.29, _BLUE)
     if words == "bicycle":
@@ -215,10 +200,6 @@ def _living(canvas: _Canvas, _: str) -> None:
     canvas.bar((-0.24, -0.2), (0.24, -0.18), _WHITE)
 
 
-def _letter(canvas: _Canvas, words: str) -> None:
-    canvas.text(words, within=(0.46, 0.36), fill=_WHITE)
-
-
 def _words(canvas: _Canvas, words: str, *, fill: Rgb = _BLACK) -> None:
     canvas.bar((-0.28, -0.28), (0.28, 0.28), canvas.image.getpixel((2, 2)))  # type: ignore[arg-type]
     lines = words.upper().split()
@@ -236,25 +217,23 @@ def _bus(canvas: _Canvas, _: str) -> None:
 
 
 def _signal(canvas: _Canvas, _: str) -> None:
-    """Three lenses, none of them lit; lit ones shine, see `lidar.sensors.camera.signal_lamps`."""
+    """Three lenses, none of them lit; lit ones shine, see `lidar.sensors.camera.light`."""
     for k, fill in enumerate(((92, 20, 20), (104, 76, 18), (16, 76, 48))):
         canvas.disc(0.1, fill, y=0.283 * (1 - k))
 
 
-def _nothing(canvas: _Canvas, _: str) -> None:
-    pass
-
-
 _FACES: dict[str, tuple[Rgb, Callable[[_Canvas, str], None]]] = {
-    "stop": (_WHITE, _stop), "give_way": (_RED, _give_way), "hazard": (_RED, _hazard),
-    "limit": (_RED, _limit),
-    "zone": (_WHITE, _zone), "no_entry": (_RED, _no_entry), "no_vehicles": (_RED, _no_vehicles),
-    "no_overtaking": (_RED, _no_overtaking), "no_parking": (_RED, _no_parking),
-    "no_stopping": (_RED, _no_stopping), "priority": (_WHITE, _priority), "ahead": (_WHITE, _ahead),
-    "one_way": (_BLUE, _one_way), "path": (_WHITE, _path), "crossing": (_BLUE, _crossing),
-    "living_street": (_BLUE, _living), "parking": (_BLUE, _letter), "bus_stop": (_BLUE, _bus),
-    "city": (_YELLOW, _words), "street": (_BLUE, functools.partial(_words, fill=_WHITE)),
-    "words": (_WHITE, _words), "signal": (_BLACK, _signal), "plain": (_WHITE, _nothing),
+    "stop": (_WHITE, _stop), "hazard": (_RED, _hazard), "limit": (_RED, _limit), "zone": (_WHITE, _zone),
+    "give_way": (_RED, lambda canvas, _: canvas.shape(_ngon(3, 0.52, math.pi), _WHITE)),
+    "no_entry": (_RED, lambda canvas, _: canvas.bar((-0.22, -0.055), (0.22, 0.055), _WHITE)),
+    "no_vehicles": (_RED, lambda canvas, _: _rim(canvas)), "no_overtaking": (_RED, _no_overtaking),
+    "no_parking": (_RED, _no_parking), "no_stopping": (_RED, _no_stopping), "priority": (_WHITE, _priority),
+    "one_way": (_BLUE, lambda canvas, _: canvas.arrow([(0.0, -0.2), (0.0, 0.18)], 0.08, _WHITE)),
+    "ahead": (_WHITE, _ahead), "path": (_WHITE, _path), "crossing": (_BLUE, _crossing),
+    "living_street": (_BLUE, _living), "bus_stop": (_BLUE, _bus), "city": (_YELLOW, _words),
+    "parking": (_BLUE, lambda canvas, words: canvas.text(words, within=(0.46, 0.36), fill=_WHITE)),
+    "street": (_BLUE, functools.partial(_words, fill=_WHITE)), "words": (_WHITE, _words),
+    "signal": (_BLACK, _signal), "plain": (_WHITE, lambda *_: None),
 }  # fmt: skip
 """Colour of the plate, and what is drawn on it, by the first word of a face."""
 
@@ -297,8 +276,7 @@ def plate_levels(feature: int) -> tuple[NDArray[np.float32], ...]:
 
 
 def _levels(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]:
-    s = pixels / 255
-    level = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    level = linear_table()[pixels].astype(np.float32)
     levels = [level]
     while len(level) > 1:
         level = level.reshape(len(level) // 2, 2, len(level) // 2, 2, 3).mean(axis=(1, 3))
@@ -326,6 +304,4 @@ def sample(
         low = levels[k][i, j] * (1 - u) + levels[k][i, right] * u
         high = levels[k][below, j] * (1 - u) + levels[k][below, right] * u
         out[rows] = low * (1 - v) + high * v
-    s = np.where(out <= 0.0031308, 12.92 * out, 1.055 * np.maximum(out, 1e-9) ** (1 / 2.4) - 0.055)
-    colors: NDArray[np.uint8] = np.rint(255 * s).astype(np.uint8)
-    return colors
+    return srgb_bytes(out)

@@ -59,7 +59,7 @@ class TracedCloud(Cloud):
 
     The original cloud is what the scanner reports without stages.
 
-    origin : (n,) uint8, `lidar.sensors.physics.origin.Origin`
+    origin : (n,) uint8, `lidar.sensors.physics.echoes.Origin`
     source : (n,) int32, row of the original return that this one is, or was moved from; -1 for an added one
     hidden : (n,) int32, row of the original return that this one hides or replaces; -1 for none
     """

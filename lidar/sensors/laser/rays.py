@@ -1,7 +1,9 @@
-"""Rays of a sensor that moves while it fires."""
+"""Rays of a sensor that moves while it fires, which sample the cross-sections of its beams."""
 
 from __future__ import annotations
 
+import functools
+import math
 import threading
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +13,45 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
+from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
-from lidar.sensors.physics.footprint import Gap, bundle, widest_gap
+from lidar.sensors.physics.echoes import Gap
+from lidar.sensors.physics.settings import MOST_RAYS
 from lidar.sensors.rig.patterns.beams import Firings
+
+INSIDE = 1 - math.exp(-2)
+"""Share of a Gaussian beam's power within its 1/e^2 radius, which rays sample."""
+
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+@functools.cache
+def bundle(rays: int) -> Float:
+    """Positions (rays, 2) on the unit disc of rays of equal power, the axis first; their mean is the axis.
+
+    They sample a Gaussian beam within its 1/e^2 radius. Ray k lies in the middle of the ring with the k-th
+    of equal parts of the power, a golden angle on from the ray before (Vogel 1979): rays seldom lie in line,
+    so that wires and edges of any direction cover few at once.
+
+    Raises InputError for a number that is not from 1 to `MOST_RAYS`.
+    """
+    if not 1 <= rays <= MOST_RAYS:
+        raise InputError(f"`rays` {rays}: give 1 to {MOST_RAYS}")
+    ray = np.arange(1, rays)
+    radius = np.sqrt(-0.5 * np.log1p(-INSIDE * (ray + 0.5) / rays))
+    angle = ray * _GOLDEN_ANGLE
+    place = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return np.concatenate([np.zeros((1, 2)), place - place.mean(axis=0)]) if rays > 1 else np.zeros((1, 2))
+
+
+@functools.cache
+def widest_gap(rays: int) -> float:
+    """Widest gap between neighbours of a `bundle` in projection on any line, on the unit disc."""
+    angle = np.linspace(0, math.pi, 720, endpoint=False)
+    across = np.sort(bundle(rays) @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+    return float(np.diff(across, axis=0).max(initial=0.0))
+
 
 _UNIFORM = 0.5 * np.sqrt(3.0)
 """Width of a uniform profile with the standard deviation of a Gaussian one, in widths of that at 1/e^2."""
@@ -24,7 +61,7 @@ _UNIFORM = 0.5 * np.sqrt(3.0)
 class Beam:
     """Rays of equal power that sample the cross-section of each pulse.
 
-    place  : (rays, 2) on the unit disc, see `physics.footprint.bundle`; the beam's axis comes first
+    place  : (rays, 2) on the unit disc, see `bundle`; the beam's axis comes first
     spread : (2,) radians, half angles of the beam to the left and up
     size   : (2,) metres, half of the beam's width and height where it starts
     turn   : (n,) radians by which ``place`` is turned for each pulse; empty for one ray

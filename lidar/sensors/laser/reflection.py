@@ -14,13 +14,13 @@ from geoscene.typing import Float
 from lidar.geometry.random_streams import normal_of
 from lidar.raycast import Hits
 from lidar.sensors.laser.rays import Beam
-from lidar.sensors.physics.echoes import Echoes, depth_of, gather, insert
-from lidar.sensors.physics.fresnel import film, glint, under_film
+from lidar.sensors.physics.echoes import AXIS_ONLY, Echoes, Gap, depth_of, gather, insert
 from lidar.sensors.physics.reflect import (
     INCIDENCE_LAWS,
     RETRO,
-    apparent,
     covered_reflectance,
+    film,
+    glint,
     reflectance_table,
     sent_back,
 )
@@ -89,25 +89,50 @@ class SurfaceOptics:
         low = self.faces.low
         self.tables = ReflectionTables(reflectance, specular, films, soaked, factor, low, law, glossy)
 
-    def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.uint8]]:
-        """Surfaces (n,) of hits, with the hit's row as pulse and all on the axis; and their materials."""
-        found, tables = self.world.lookup(hits), self.tables
-        cosine = np.minimum(np.abs(hits.cosine).astype(np.float64), 1.0)
-        rho = tables.reflectance[found.material]
-        wet = np.flatnonzero(tables.film[found.material])
-        code = found.material[wet]
-        rho[wet] += tables.film[code] * under_film(cosine[wet], tables.soaked[code])
-        if len(tables.factor):
-            one_off = rho * tables.factor[np.maximum(found.feature - tables.low, 0)]
-            rho = np.where(rho > RETRO, one_off, np.minimum(one_off, RETRO))
-        back = apparent(rho, cosine, specular=tables.specular[found.material], law=self.settings.law)
-        if self.settings.mirrors:
-            water = np.flatnonzero(found.material == glossy_codes()[1])
-            back[water] = glint(cosine[water])
+    def at(self, hits: Hits) -> tuple[Echoes, NDArray[np.int32], NDArray[np.bool_]]:
+        """Surfaces of hits, with the hit's row as pulse, all on the axis; glass and water as of `fill`."""
         n = len(hits.range)
-        number, axis = np.arange(n, dtype=np.int32), np.ones(n, bool)
-        rows = Echoes(number, hits.range, back, found.feature, found.klass, cosine, hits.range, axis)
-        return rows, found.material
+        found, apart = _columns(n), np.empty(n, np.bool_)
+        count, row, is_water = self.fill(
+            found, hits, first=0, rays=1, separation=0.0, gap=AXIS_ONLY, apart=apart
+        )
+        return found.take(slice(count)), row, is_water
+
+    def fill(
+        self,
+        echoes: Echoes,
+        hits: Hits,
+        *,
+        first: int,
+        rays: int,
+        separation: float,
+        gap: Gap,
+        apart: NDArray[np.bool_],
+    ) -> tuple[int, NDArray[np.int32], NDArray[np.bool_]]:
+        """Fill columns with the echoes of the pulses from number ``first`` on, and return their number.
+
+        Also returned are the rays (k,) that hit glass or water, and whether they hit water. The surfaces of
+        pulses with such rays are marked in ``apart`` and not merged into echoes.
+        """
+        glossy = np.empty((2, len(hits.range) if self.settings.mirrors else 0), np.int32)
+        count, found = _receive(
+            (hits.range, hits.face, hits.instance, hits.cosine),
+            first,
+            rays,
+            self.faces,
+            self.tables,
+            separation,
+            gap,
+            tuple(echoes.columns().values()),
+            apart,
+            glossy,
+        )
+        ray, row = glossy[:, :found]
+        surface = self.faces.packed[hits.face[ray] + self.faces.start[hits.instance[ray]]]
+        is_water: NDArray[np.bool_] = surface & 255 == glossy_codes()[1]
+        wet = row[is_water]
+        echoes.apparent[wet] = glint(echoes.cosine[wet]) / rays
+        return count, ray, is_water
 
 
 def _with_open(plain: Float, covered: Float) -> Float:
@@ -132,32 +157,19 @@ class EchoCollector:
 
         The surfaces of pulses with such rays are collected apart and not yet merged into echoes.
         """
-        n = len(hits.range)
-        self._make_room(n)
-        start, glossy = self._count, np.empty((2, n if self._optics.settings.mirrors else 0), np.int32)
-        echoes = self._columns.take(slice(start, start + n))
-        count, found = _receive(
-            (hits.range, hits.face, hits.instance, hits.cosine),
-            first,
-            self._beam.rays,
-            self._optics.faces,
-            self._optics.tables,
-            self._separation,
-            self._gap,
-            tuple(echoes.columns().values()),
-            self._glossy[start : start + n],
-            glossy,
+        self._make_room(len(hits.range))
+        part = slice(self._count, self._count + len(hits.range))
+        count, ray, _ = self._optics.fill(
+            self._columns.take(part),
+            hits,
+            first=first,
+            rays=self._beam.rays,
+            separation=self._separation,
+            gap=self._gap,
+            apart=self._glossy[part],
         )
         self._count += count
-        ray, row = glossy[:, :found]
-        if found:
-            wet = (
-                self._optics.faces.packed[_face_row(self._optics.faces, hits, ray=ray)] & 255
-                == glossy_codes()[1]
-            )
-            echoes.apparent[row[wet]] = glint(echoes.cosine[row[wet]]) / self._beam.rays
-        rays: NDArray[np.int32] = ray
-        return rays
+        return ray
 
     def echoes(self) -> tuple[Echoes, Echoes]:
         """Echoes of pulses that hit neither glass nor water, and surfaces of the others."""
@@ -179,11 +191,6 @@ def _columns(n: int) -> Echoes:
     number, feature = np.empty(n, np.int32), np.empty(n, np.int32)
     klass, axis = np.empty(n, np.uint8), np.empty(n, np.bool_)
     return Echoes(number, distance, apparent, feature, klass, cosine, true, axis)
-
-
-def _face_row(faces: SurfaceFaces, hits: Hits, *, ray: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Row of ``faces.packed`` of each ray's hit."""
-    return hits.face[ray] + faces.start[hits.instance[ray]]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

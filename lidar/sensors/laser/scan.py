@@ -17,10 +17,9 @@ from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.surface_echoes import surface_echoes
 from lidar.sensors.physics.detector import Deviates, detect_echoes, false_echoes, measured_range, receive
 from lidar.sensors.physics.echoes import Echoes, TracedEchoes, join, number_echoes, select_reported, trace
-from lidar.sensors.physics.intensity import reflectivity_code
-from lidar.sensors.physics.link import transmission
+from lidar.sensors.physics.link import reflectivity_code, transmission
 from lidar.sensors.physics.settings import PLAIN, ScannerSettings
-from lidar.sensors.rig.patterns.beams import Firings
+from lidar.sensors.rig.patterns.beams import Firings, chosen
 from lidar.sensors.rig.scanner import Sensor
 from lidar.sensors.rig.scanner import firings as fire
 from lidar.world.world import World
@@ -114,17 +113,23 @@ def cast(
     """
     firings = find_pulse(sensor, frame, settings=settings)
     if pulses is not None:
-        firings = _only(firings, pulses)
+        firings = chosen(firings, np.isin(np.arange(len(firings)), pulses))
     sent = firings
     if settings.angle_noise:
-        sent = _with_angle_noise(firings, sensor, rng=generator(seed, sensor.name, frame, "angle"))
+        noise = generator(seed, sensor.name, frame, "angle").standard_normal((len(firings), 3))
+        bent = firings.direction + sensor.angle_sigma * noise
+        sent = replace(firings, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
+    time = None
+    if any(group.transform.ndim == 4 for group in world.caster.instances):  # actors move
+        start, stop = sensor.window_ns(frame)
+        time = ((firings.time_ns - start) / (stop - start)).astype(np.float32)
     echoes = surface_echoes(
         sent,
         mount,
         sensor=sensor,
         trajectory=trajectory,
         world=world,
-        time=_ray_time(sensor, frame, pulses=firings) if _moving(world) else None,
+        time=time,
         settings=settings,
         seed=seed,
         frame=frame,
@@ -150,12 +155,6 @@ def _pose_times(firings: Firings, poses: str) -> NDArray[np.int64]:
         return np.full_like(firings.time_ns, firings.time_ns[0])
     _, first, block = np.unique(firings.column, return_index=True, return_inverse=True)
     return firings.time_ns[first][block]
-
-
-def _only(firings: Firings, rows: NDArray[np.integer]) -> Firings:
-    """Some rows (k,) of firings, ascending, with the order among them."""
-    order = firings.order[np.isin(firings.order, rows)]
-    return replace(firings.take(rows), order=np.searchsorted(rows, order).astype(np.int32))
 
 
 def deviates_of(sweep: Sweep) -> Deviates:
@@ -237,20 +236,3 @@ def _place(pulse: Any, distance: Any, origin: Any, direction: Any, time_ns: Any,
         xyz[i, 1] = origin[p, 1] + distance[i] * direction[p, 1]
         xyz[i, 2] = origin[p, 2] + distance[i] * direction[p, 2]
         time[i] = time_ns[p] - time_ns[0]
-
-
-def _with_angle_noise(pulses: Firings, sensor: Sensor, *, rng: np.random.Generator) -> Firings:
-    """The pulses as sent, whose directions differ from the reported ones by noise."""
-    bent = pulses.direction + sensor.angle_sigma * rng.standard_normal((len(pulses), 3))
-    return replace(pulses, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
-
-
-def _moving(world: World) -> bool:
-    """Whether any instance in the world moves during a frame."""
-    return any(group.transform.ndim == 4 for group in world.caster.instances)
-
-
-def _ray_time(sensor: Sensor, frame: int, *, pulses: Firings) -> NDArray[np.float32]:
-    """Ray times (n,) of the pulses, 0 to 1 over `Sensor.window_ns`."""
-    start, stop = sensor.window_ns(frame)
-    return ((pulses.time_ns - start) / (stop - start)).astype(np.float32)

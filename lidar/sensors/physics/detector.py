@@ -1,4 +1,4 @@
-"""The detector of a scanner: lost and false echoes, and measured ranges."""
+"""The detector of a scanner: lost, false and foreign echoes, and measured ranges with their errors."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from geoscene.typing import Float
+from geoscene.typing import Bools, Float
 from lidar.geometry.random_streams import generator
-from lidar.sensors.physics.echoes import Echoes, EchoesT, artificial_echoes
+from lidar.sensors.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
 from lidar.sensors.physics.link import (
     amplitude,
     apparent_of,
@@ -18,9 +18,6 @@ from lidar.sensors.physics.link import (
     false_alarm_probability,
     noise_of,
 )
-from lidar.sensors.physics.origin import Origin
-from lidar.sensors.physics.pulse_identity import has_code
-from lidar.sensors.physics.range_error import quantise, signal_sigma, stretch_sigma, walk
 from lidar.sensors.physics.reflect import RETRO
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.patterns.beams import Firings
@@ -36,13 +33,7 @@ _OVERLAP = 5e-5  # probability that a pulse of another scanner is received, typi
 
 def receive(sensor: Sensor, echoes: Echoes) -> Float:
     """Power (m,) of each echo over the detection threshold."""
-    return amplitude(
-        echoes.apparent,
-        echoes.range + sensor.pattern.range_offset,
-        reference_reflectance=sensor.reference_reflectance,
-        reference_range=sensor.reference_range,
-        falloff=sensor.falloff,
-    )
+    return amplitude(sensor, echoes.apparent, distance=echoes.range + sensor.pattern.range_offset)
 
 
 def detect_echoes(
@@ -101,13 +92,7 @@ def _anywhere(
 ) -> Echoes:
     """Echoes with a power over the threshold, at uniformly distributed ranges within the sensor's limits."""
     distance = rng.uniform(sensor.min_range, sensor.max_range, len(pulse))
-    apparent = apparent_of(
-        power,
-        distance,
-        reference_reflectance=sensor.reference_reflectance,
-        reference_range=sensor.reference_range,
-        falloff=sensor.falloff,
-    )
+    apparent = apparent_of(sensor, power, distance=distance)
     return artificial_echoes(pulse, distance - sensor.pattern.range_offset, apparent=apparent)
 
 
@@ -156,3 +141,70 @@ def measured_range(
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
         distance = distance + width * deviates("stretch", echoes)
     return quantise(distance, sensor.range_quantum) if settings.quantise else distance
+
+
+METRES_PER_NS = 0.299792458 / 2
+"""Range per nanosecond of delay."""
+
+
+def shift_by_delay(sensor: Sensor, count: int, *, rng: np.random.Generator) -> Float:
+    """Metres (count,) by which prepared pulses seem off, as the sensor fires its own at random times.
+
+    Uniform over c J / 2 of the sensor's greatest delay J, around 0: the mean delay is known to all.
+    """
+    if not sensor.firing_jitter_ns:
+        return np.zeros(count)
+    return METRES_PER_NS * sensor.firing_jitter_ns * rng.uniform(-0.5, 0.5, count)
+
+
+def has_code(sensor: Sensor, count: int, *, rng: np.random.Generator) -> Bools:
+    """Mask (count,) of pulses from elsewhere that have the code of the sensor's pulse by chance."""
+    if not sensor.code_bits:
+        return np.ones(count, bool)
+    return rng.random(count) < 0.5**sensor.code_bits
+
+
+_WALK = 0.005  # metres nearer per decade of amplitude, typical value
+
+
+def signal_sigma(received: ArrayLike, weak_sigma: tuple[float, float]) -> Float:
+    """Standard deviation in metres that noise adds to ranges, by received power A over threshold.
+
+    sqrt(s^2 / A + b^2 / A^2): noise of the signal's own photons, and of background and receiver. With b = 0
+    it is dR / sqrt(2 SNR) of LISA (Kilic et al. 2021), of which dR = 0.09 m is the default.
+
+    weak_sigma : (s, b) metres, both at the threshold
+    """
+    power = np.asarray(received, float)
+    own, background = weak_sigma
+    sigma: Float = np.hypot(own / np.sqrt(power), background / power)
+    return sigma
+
+
+def stretch_sigma(distance: ArrayLike, cosine: ArrayLike, *, divergence: float) -> Float:
+    """Standard deviation in metres that the depth of the footprint on a slanted surface adds.
+
+    The 1/e^2 footprint is R B tan(theta) deep, and the deviation of a Gaussian is a quarter of its 1/e^2
+    width. The depth of grazing beams is limited to the distance.
+    """
+    c = np.maximum(np.asarray(cosine, float), 1e-3)
+    depth = np.asarray(distance, float) * divergence * np.sqrt(np.maximum(1 - c * c, 0)) / c
+    sigma: Float = np.minimum(depth, np.asarray(distance, float)) / 4
+    return sigma
+
+
+def walk(received: ArrayLike) -> Float:
+    """Range walk in metres, negative: the flank of a bright echo crosses the threshold earlier."""
+    error: Float = -_WALK * np.log10(np.maximum(np.asarray(received, float), 1.0))
+    return error
+
+
+def quantise(distance: Float, quantum: float) -> Float:
+    """Distances rounded to multiples of ``quantum`` metres; unchanged if that is 0."""
+    if quantum <= 0:
+        return distance
+    # Divide by whole steps per metre: 3 steps of 2 mm are then 0.006, not 0.006000000000000001.
+    steps = round(1 / quantum)
+    if abs(steps * quantum - 1) < 1e-9:
+        return np.round(distance * steps) / steps
+    return quantum * np.round(distance / quantum)

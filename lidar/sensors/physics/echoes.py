@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from enum import IntEnum
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,34 @@ from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import inline
-from lidar.sensors.physics.footprint import AXIS_ONLY, Gap
-from lidar.sensors.physics.origin import Origin
+
+
+class Gap(NamedTuple):
+    """Widest gap between neighbouring rays of a beam, across it.
+
+    start  : metres where the beam starts
+    spread : radians by which the gap widens
+    """
+
+    start: float = 0.0
+    spread: float = 0.0
+
+
+AXIS_ONLY = Gap()
+"""Of a beam of one ray."""
+
+
+class Origin(IntEnum):
+    """Cause of an echo or a return."""
+
+    SURFACE = 0
+    WEATHER = 1
+    INTERFERENCE = 2
+    INJECTED = 3
+    REPLAYED = 4
+    MOVED = 5
+    RECEIVER = 6  # false alarms and blooming
+
 
 _MODES = ("strongest", "first", "last", "dual", "all")
 _STRONGEST, _FIRST, _LAST, _DUAL, _ALL = range(5)
@@ -149,7 +176,7 @@ def insert(row: Any, size: Any, new: Any, distance: Any) -> None:
 def depth_of(distance: Any, cosine: Any, gap: Any) -> Any:
     """Metres along the beam between neighbouring rays on a surface at this distance and cosine of incidence.
 
-    gap : (2,) as `lidar.sensors.physics.footprint.Gap`
+    gap : (2,) as `Gap`
     """
     return (gap[0] + gap[1] * distance) * np.sqrt(1 - cosine * cosine) / max(cosine, _GRAZING)
 

@@ -29,39 +29,15 @@ def exposure_times(camera: CameraSpec, start_ns: int, *, samples: int = 1) -> ND
     return (start_ns + within[:, None] + rows[None]).ravel().astype(np.int64)
 
 
+@functools.lru_cache(maxsize=16)  # the cameras of a rig
 def pixel_rays(camera: CameraSpec) -> Float:
     """Unit directions (height * width, 3) of the pixels' centres, row by row, in the camera frame.
 
     NaN for pixels without a ray: outside a fisheye's image circle, or where the distortion is not one to one.
     The array is read-only and shared between calls.
     """
-    return _pixel_rays(
-        camera.model,
-        camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        distortion=camera.distortion,
-    )
-
-
-@functools.lru_cache(maxsize=16)  # the cameras of a rig
-def _pixel_rays(
-    model: str,
-    width: int,
-    *,
-    height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    distortion: tuple[float, ...],
-) -> Float:
-    x, y = np.meshgrid((np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy)
-    distorted = np.stack([x.ravel(), y.ravel()], axis=1)
-    directions = _fisheye_rays(distorted, distortion) if model == "fisheye" else _rays(distorted, distortion)
+    row, column = np.indices((camera.height, camera.width))
+    directions = unproject(camera, np.stack([column.ravel(), row.ravel()], axis=1))
     directions.flags.writeable = False
     return directions
 

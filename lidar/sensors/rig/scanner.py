@@ -5,20 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
-from lidar.errors import RigError
 from lidar.sensors.rig.patterns.beams import Firings, Pattern, frame_ns, frame_window_ns
-from lidar.sensors.rig.patterns.flash import read_flash
-from lidar.sensors.rig.patterns.line import read_line
-from lidar.sensors.rig.patterns.prisms import read_prisms
-from lidar.sensors.rig.patterns.scanner2d import read_scan2d
+from lidar.sensors.rig.patterns.continuing import read_line, read_listed, read_prisms, read_sweep
+from lidar.sensors.rig.patterns.repeating import read_flash, read_scan2d
 from lidar.sensors.rig.patterns.spinning import read_spinning
-from lidar.sensors.rig.patterns.sweep import read_listed, read_sweep
-from lidar.toml_table import Table, read_table
+from lidar.toml_table import Table, built_in_names, read_named_table
 
 RETURN_MODES = ("strongest", "last", "first", "dual", "all")
 """Which echoes of a pulse a sensor can report."""
@@ -31,6 +26,8 @@ WEAK_SIGMA = (0.09 / math.sqrt(2), 0.0)
 
 MOST_JITTER_NS, MOST_CODE_BITS = 1e4, 64
 """Greatest random delay of pulses, and longest code."""
+
+_BUILT_IN = {"package": "lidar.sensors.rig", "folder": "sensors"}
 
 _RATES_HZ = (1e-3, 1e4)
 """Least and greatest rate of a scanner's frames."""
@@ -140,8 +137,7 @@ def firings(sensor: Sensor, frame: int) -> Firings:
 
 def sensor_names() -> list[str]:
     """Names of the built-in presets."""
-    folder = resources.files("lidar.sensors.rig") / "sensors"
-    return sorted(f.name.removesuffix(".toml") for f in folder.iterdir() if f.name.endswith(".toml"))
+    return built_in_names(**_BUILT_IN)
 
 
 def load_sensor(
@@ -164,16 +160,7 @@ def load_sensor(
 
     Raises RigError, naming file, line and key, for keys that are missing, unknown or out of bounds.
     """
-    if str(preset).endswith(".toml"):
-        path = Path(preset)
-        if not path.is_file():
-            raise RigError(f"{path}: no such sensor file; built-in presets are {', '.join(sensor_names())}")
-        table = read_table(path)
-    else:
-        if str(preset) not in sensor_names():
-            raise RigError(f"sensor {preset!r} is not known: {', '.join(sensor_names())}, or a .toml file")
-        file = resources.files("lidar.sensors.rig") / "sensors" / f"{preset}.toml"
-        table = read_table(file, name=f"presets/{preset}.toml")
+    table = read_named_table(preset, what="sensor", **_BUILT_IN)
     sensor = _read(
         table, name or Path(preset).stem, rate_hz=rate_hz, return_mode=return_mode, start_ns=start_ns
     )

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.geometry.frames import Frame
+from geoscene.support.columns import Columns
 from geoscene.support.digests import recipe_digest
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
 from lidar.parameters import parameter
 from lidar.raycast.geometry import ALL
-from lidar.sensors.physics.echoes import TracedEchoes, join, number_echoes
+from lidar.sensors.physics.detector import METRES_PER_NS
+from lidar.sensors.physics.echoes import Origin, TracedEchoes, artificial_echoes, join, number_echoes, trace
 from lidar.sensors.physics.link import amplitude
-from lidar.sensors.physics.origin import Origin
-from lidar.sensors.physics.pulse_identity import METRES_PER_NS
-from lidar.signal.situation import Situation
-from lidar.signal.stage import POSES, Pulses, Stage, added_echoes
+from lidar.sensors.rig.scanner import Sensor, firings
+from lidar.signal.registry import Stages
+from lidar.signal.situation import Situation, degrees_of, point_of
+from lidar.signal.stage import POSES, Pulses, Stage, added_echoes, pulses_of
 from lidar.world.surfaces import GLASS
 from lidar.world.world import World
 
@@ -71,7 +74,7 @@ number of points.
 
 
 @dataclass(frozen=True, slots=True)
-class Aim:
+class Aim(Columns):
     """The pulses that a device reaches in a frame.
 
     row      : (k,) int64, rows of `Pulses`
@@ -84,10 +87,6 @@ class Aim:
     azimuth: Float
     distance: Float
     power: Float
-
-    def where(self, keep: NDArray[np.bool_]) -> Aim:
-        """Subset of the pulses."""
-        return Aim(self.row[keep], self.azimuth[keep], self.distance[keep], self.power[keep])
 
 
 @dataclass(frozen=True)
@@ -268,7 +267,7 @@ class TimedAttacker(Attacker):
 class SynchronisedAttacker(TimedAttacker):
     """An attacker's device that knows when the sensor fires and answers each pulse.
 
-    It cannot know a random delay or code of each pulse: see `lidar.sensors.physics.pulse_identity`.
+    It cannot know a random delay or code of each pulse: see `lidar.sensors.physics.detector`.
     """
 
     frame_jitter: float = parameter(
@@ -283,24 +282,6 @@ class SynchronisedAttacker(TimedAttacker):
         own = super().errors(aim, rng=rng)
         error: Float = own + METRES_PER_NS * self.sync * rng.standard_normal()
         return error
-
-
-def degrees_of(place: str) -> tuple[float, float, float]:
-    """Latitude, longitude and height of a text; raises InputError for others."""
-    try:
-        lat, lon, height = (float(word) for word in place.replace(",", " ").split())
-    except ValueError:
-        raise InputError(f"place = {place!r} is not LAT,LON,HEIGHT") from None
-    if not (abs(lat) <= 90 and abs(lon) <= 180 and abs(height) < 1e4):
-        raise InputError(f"place = {place!r} is not LAT,LON,HEIGHT in degrees and metres")
-    return lat, lon, height
-
-
-def point_of(place: str, *, geo: Frame, at: Situation) -> Float:
-    """The point (3,) in the scene frame of a place as `degrees_of` reads it, its height above the ground."""
-    lat, lon, height = degrees_of(place)
-    x, y = (float(axis) for axis in geo.from_geographic(lon, lat))
-    return np.array([x, y, height + (0.0 if at.ground is None else at.ground(x, y))])
 
 
 def checked_digest(file: str, *, known: str) -> str:
@@ -320,13 +301,7 @@ def in_body(poses: Poses, *, point: Float) -> Float:
 def power_of(pulses: Pulses, apparent: Float, *, distance: Float) -> Float:
     """Power (k,) over the detection threshold of apparent reflectances (k,) at distances (k,) in metres."""
     sensor = pulses.sensor
-    return amplitude(
-        apparent,
-        distance + sensor.pattern.range_offset,
-        reference_reflectance=sensor.reference_reflectance,
-        reference_range=sensor.reference_range,
-        falloff=sensor.falloff,
-    )
+    return amplitude(sensor, apparent, distance=distance + sensor.pattern.range_offset)
 
 
 def sent_back(
@@ -381,3 +356,41 @@ def crowded_out(
         "dual": beaten & (number < count),
         "all": hit & (number >= sensor.max_echoes),
     }[sensor.return_mode]
+
+
+Seen = tuple[Pulses, TracedEchoes, Situation]
+"""Pulses of a frame, the echoes that are known without rays, and where it is taken."""
+
+
+def check_sight(stages: Stages, frames: Iterable[tuple[Situation, Callable[[], Seen]]]) -> None:
+    """Raise InputError for a device that is in the line of sight of a scanner in none of the frames.
+
+    frames : where each is taken, without its world, and what it sees, which is asked for near the device
+    """
+    waiting = [named for named in stages.stages if isinstance(named.stage, Attacker)]
+    rest = iter(frames)
+    while waiting and (frame := next(rest, None)):
+        where, seen = frame
+        near = [
+            named
+            for named in waiting
+            if named.sensor in ("", where.sensor) and cast("Attacker", named.stage).may_reach(where)
+        ]
+        if near:
+            pulses, echoes, at = seen()
+            for named in near:
+                if cast("Attacker", named.stage).aim(pulses, echoes, at=at) is not None:
+                    waiting.remove(named)
+    for named in waiting:
+        reach = cast("Attacker", named.stage).reach
+        raise InputError(
+            f"attack {named.name}: its device is in the line of sight of no scanner within {reach:g} m in any"
+            " frame; move it, or change its reach, start or stop"
+        )
+
+
+def sent_only(sensor: Sensor, at: Situation) -> Seen:
+    """Pulses of a drive's frame without echoes, and the situation with the world between."""
+    none = artificial_echoes(np.empty(0, np.int32), np.empty(0), apparent=np.empty(0))
+    nothing = trace(none, Origin.SURFACE, source=np.empty(0, np.int32))
+    return pulses_of(sensor, firings(sensor, int(at.frame))), nothing, at

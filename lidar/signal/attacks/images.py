@@ -13,11 +13,11 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
-from lidar.sensors.camera.shade import linear_table
+from lidar.sensors.camera.shade import linear_table, srgb_bytes
 from lidar.sensors.rig.camera_model import pixel_rays
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.signal.attacks.attacker import checked_digest, degrees_of, point_of
-from lidar.signal.situation import Situation
+from lidar.signal.attacks.attacker import checked_digest
+from lidar.signal.situation import Situation, degrees_of, point_of
 from lidar.signal.stage import Stage
 
 _TINTS = {
@@ -63,7 +63,7 @@ class CameraBlind(Stage):
         angle = np.degrees(np.arccos(cosine)).reshape(frame.rgb.shape[:2])
         glare = self.power * self.core**2 / (angle**2 + self.core**2)
         light = linear_table()[frame.rgb] + glare[:, :, None] * _TINTS[self.tint]
-        return replace(frame, rgb=_encode(light))
+        return replace(frame, rgb=srgb_bytes(light))
 
 
 @dataclass(frozen=True)
@@ -187,11 +187,3 @@ def _sample(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uin
     column = np.minimum((u * width).astype(np.int64), width - 1)
     chosen: NDArray[np.uint8] = picture[row, column]
     return chosen
-
-
-def _encode(light: Float) -> NDArray[np.uint8]:
-    """Linear light as sRGB codes; values over 1 saturate."""
-    c = np.clip(light, 0, 1)
-    coded = np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055)
-    rounded: NDArray[np.uint8] = np.rint(255 * coded).astype(np.uint8)
-    return rounded

@@ -19,15 +19,17 @@ from lidar.geometry.poses import Trajectory
 from lidar.parameters import parameter
 from lidar.signal.attacks.attacker import checked_digest
 from lidar.signal.registry import Stages
+from lidar.signal.situation import degrees_of
 from lidar.signal.stage import Stage
 from lidar.world.actor_shapes import ActorShape
-from lidar.world.actors import Actors, join_actors
+from lidar.world.actors import Actors, first_feature, join_actors
 from lidar.world.ground import ground_height, ground_heights
 
 _CLASSES = (
     *(Class.OTHER_STRUCTURE, Class.CAR, Class.VAN, Class.TRUCK, Class.BUS, Class.MOTORCYCLE, Class.BICYCLE),
     *(Class.CYCLIST, Class.PEDESTRIAN, Class.MOTORCYCLIST, Class.TRAFFIC_SIGN, Class.POLE, Class.BOLLARD),
 )
+_PLACE = "LAT,LON"
 _KNOT_S = 0.05  # seconds between poses of an object that moves along
 _LARGEST = 100.0  # metres, longest side of an object
 
@@ -75,7 +77,7 @@ class PlacedObject(Stage):
         _read_mesh(self.mesh)
         object.__setattr__(self, "digest", checked_digest(self.mesh, known=self.digest))
         if self.place:
-            _position(self.place)
+            degrees_of(self.place, form=_PLACE)
 
     def scene(self, scene: Scene, trajectory: Trajectory) -> Actors:
         """The object on the ground of a scene, as a road user of kind ``placed_object``.
@@ -129,7 +131,7 @@ class PlacedObject(Stage):
         """Times (k,), positions (k, 3) on the ground and yaws (k,) of the object."""
         turn = np.radians(self.yaw)
         if self.place:
-            lat, lon = _position(self.place)
+            lat, lon = degrees_of(self.place, form=_PLACE)
             x, y = scene.frame.from_geographic(lon, lat)
             point = np.array([[float(x), float(y), ground_height(scene, x=float(x), y=float(y))]])
             if not np.isfinite(point).all():
@@ -153,8 +155,6 @@ def with_objects(
     placed = [named.stage for named in stages.stages if isinstance(named.stage, PlacedObject)]
     if not placed:
         return actors
-    from lidar.world.actors import first_feature  # noqa: PLC0415  (0.1 s)
-
     groups: Iterable[Actors] = [one.scene(scene, trajectory) for one in placed]
     return join_actors([*([] if actors is None else [actors]), *groups], first_feature=first_feature(scene))
 
@@ -175,17 +175,6 @@ def _read_mesh(path: str) -> tuple[Float, Ints]:
     if not len(faces) or not np.isfinite(vertices).all():
         raise InputError(f"{path}: has no faces, or vertices that are not finite")
     return vertices, faces
-
-
-def _position(place: str) -> tuple[float, float]:
-    """Latitude and longitude of a text; raises InputError for others."""
-    try:
-        lat, lon = (float(word) for word in place.replace(",", " ").split())
-    except ValueError:
-        raise InputError(f"place = {place!r} is not LAT,LON") from None
-    if not (abs(lat) <= 90 and abs(lon) <= 180):
-        raise InputError(f"place = {place!r} is not LAT,LON in degrees")
-    return lat, lon
 
 
 def _rates(position: Float, time_ns: Ints) -> Float:

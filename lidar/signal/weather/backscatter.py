@@ -61,11 +61,7 @@ def overlap(sensor: Sensor, distance: Float, *, lens: float = LENS) -> Float:
 def strength(sensor: Sensor, distance: Float, *, lens: float = LENS) -> Float:
     """Power (n,) over the threshold of a white layer, at distances in metres from the beam's start."""
     return overlap(sensor, distance, lens=lens) * amplitude(
-        1.0,
-        distance + sensor.pattern.range_offset,
-        reference_reflectance=sensor.reference_reflectance,
-        reference_range=sensor.reference_range,
-        falloff=sensor.falloff,
+        sensor, 1.0, distance=distance + sensor.pattern.range_offset
     )
 
 

@@ -23,10 +23,10 @@ from lidar.sensors.rig.camera_model import pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
 from lidar.signal.weather.fields import FARTHEST, Field, WeatherBeams, amounts, field_of
-from lidar.signal.weather.media import Medium, medium_of
+from lidar.signal.weather.glass import drops_on, through_drops
+from lidar.signal.weather.media import CLEAR, Medium, medium_of
 from lidar.signal.weather.setting import WeatherSetting
 from lidar.signal.weather.streaks import FallingParticles, streak_cover
-from lidar.signal.weather.window_drops import drops_on, through_drops
 
 EXPOSURE_NS = 5_000_000
 """Exposure of streaks for cameras that take an image in an instant (``exposure_ns`` = 0); typical by day."""
@@ -38,8 +38,6 @@ _LEAST = 3e-4
 
 _TOP = {"fog": 100.0, "dust": 100.0, "rain": 2000.0, "snow": 2000.0, "spray": 5.0}
 """Height of the weather above the camera in metres, through which the sky is seen; typical."""
-
-_CLEAR = Medium(0.0, 0.0, np.empty(0), np.empty(0), np.empty(0))
 
 _SKYLINE = 20_000.0  # metres through weather towards the horizon, at most
 _BETWEEN_NS = 20_000_000  # nanoseconds over which the camera's speed is measured
@@ -66,7 +64,7 @@ def add_weather(
     assert image.rgb is not None  # noqa: S101
     light, pose = linear_of()[image.rgb], at.poses(np.array([at.start_ns]))
     amount = setting.amount_at(at.start_ns / 1e9)
-    air = _CLEAR
+    air = CLEAR
     if amount and setting.kind in _TOP:
         air = medium_of(setting.kind, amount, wavelength_nm=_VISIBLE_NM, medium=setting.medium)
         light = _through_air(
@@ -74,7 +72,9 @@ def add_weather(
         )
     if setting.drops or setting.dirt:
         light = light + _glare(image, setting, air=air, at=at, pose=pose)
-        light = _through_window(light, setting, at=at)
+        drops = drops_on(at.camera, setting.drops, seconds=at.start_ns / 1e9, seed=at.seed)
+        light = through_drops(light, drops, camera=at.camera)
+        light = light * (1 - _dirt(setting, at.camera, seed=at.seed))
     has_ray = np.isfinite(pixel_rays(at.camera)[:, 2]).reshape(*image.rgb.shape[:2], 1)
     return replace(image, rgb=np.where(has_ray, _develop(light), image.rgb))
 
@@ -114,15 +114,6 @@ def _through_air(
     )[..., None]
     streaked: NDArray[np.float32] = light * (1 - cover) + added * cover
     return streaked
-
-
-def _through_window(
-    light: NDArray[np.float32], setting: WeatherSetting, *, at: Situation
-) -> NDArray[np.float32]:
-    """Light (h, w, 3) behind drops and dirt on the window."""
-    assert at.camera is not None  # noqa: S101
-    drops = drops_on(at.camera, setting.drops, seconds=at.start_ns / 1e9, seed=at.seed)
-    return through_drops(light, drops, camera=at.camera) * (1 - _dirt(setting, at.camera, seed=at.seed))
 
 
 def _expose(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]:

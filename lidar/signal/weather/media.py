@@ -1,10 +1,11 @@
-"""Extinction and back-scatter of rain, snow, fog, dust and spray at the wavelength of a laser."""
+"""Extinction and back-scatter of rain, snow, fog, dust and spray by wavelength; visibility on roads."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cache, lru_cache
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cache, lru_cache, partial
 from math import gamma, log, pi
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import ArrayLike
 
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.motion.road_conditions import DRY_GRIP, SNOW_GRIP, WET_GRIP, RoadConditions
 from lidar.signal.weather.mie import mie_efficiencies
+from lidar.signal.weather.setting import WeatherSetting
 
 CONTRAST = 3.912
 """Optical depth of the visibility, ln(1 / 0.02): where contrast has fallen to 2 % (Koschmieder 1924)."""
@@ -81,6 +84,9 @@ _SPHERE, _OBLATE = 0.3, 1.0  # mm, drops are spheres up to the first and oblate 
 _SNOW_REFLECTANCE = ((400.0, 1100.0, 1500.0), (0.85, 0.85, 0.07))  # nm and reflectance, typical values
 
 
+_no_numbers = partial(np.empty, 0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Medium:
     """Homogeneous air with particles; equal only to itself, so that its back-scatter is cached.
@@ -94,9 +100,9 @@ class Medium:
 
     extinction: float
     backscatter: float
-    diameter: Float
-    number: Float
-    section: Float
+    diameter: Float = field(default_factory=_no_numbers)
+    number: Float = field(default_factory=_no_numbers)
+    section: Float = field(default_factory=_no_numbers)
 
 
 def water_index(wavelength_nm: float) -> complex:
@@ -115,11 +121,6 @@ def _index(table: Float, wavelength_nm: float) -> complex:
         np.interp(wavelength_nm, wavelength, real),
         np.exp(np.interp(wavelength_nm, wavelength, np.log(imaginary))),
     )
-
-
-def decibels_per_km(extinction: ArrayLike) -> Float:
-    """Attenuation in dB/km, one way, of an extinction in 1/m."""
-    return _DB_PER_KM * np.asarray(extinction, float)
 
 
 # Rain and snow: exponential distributions of diameters.
@@ -291,9 +292,7 @@ def fog_ratio(wavelength_nm: float, *, medium: str = "kim") -> float:
 
 # Media of the kinds of weather.
 
-_NONE = np.empty(0)
-
-CLEAR = Medium(0.0, 0.0, _NONE, _NONE, _NONE)
+CLEAR = Medium(0.0, 0.0)
 """Air without particles."""
 
 
@@ -306,10 +305,10 @@ def medium_of(kind: str, amount: float, *, wavelength_nm: float, medium: str) ->
         return snow(amount, wavelength_nm, medium=medium)
     if kind == "fog":
         alpha = fog_extinction(amount, wavelength_nm, medium=medium)
-        return Medium(alpha, alpha / fog_ratio(wavelength_nm, medium=medium), _NONE, _NONE, _NONE)
+        return Medium(alpha, alpha / fog_ratio(wavelength_nm, medium=medium))
     if kind == "dust":
         alpha = CONTRAST / amount
-        return Medium(alpha, alpha / _DUST_RATIO, _NONE, _NONE, _NONE)
+        return Medium(alpha, alpha / _DUST_RATIO)
     if kind == "spray":
         return spray(amount, wavelength_nm)
     return CLEAR
@@ -320,7 +319,7 @@ def spray(water_mm: float, wavelength_nm: float) -> Medium:
     """Droplets that tyres throw up from water on the road, as dense as behind the axle at 100 km/h."""
     extinction = _SPRAY_EXTINCTION * min(water_mm, _SPRAY_DEEPEST)
     ratio = droplet_optics("strong-spray", wavelength_nm)[1]
-    return Medium(extinction, extinction / ratio, _NONE, _NONE, _NONE)
+    return Medium(extinction, extinction / ratio)
 
 
 def rain(rate: float, wavelength_nm: float, *, medium: str = "marshall-palmer") -> Medium:
@@ -361,10 +360,27 @@ def _particles(extinction: float, diameter: Float, *, number: Float, efficiency:
     return Medium(extinction, backscatter, metres, number[keep], section)
 
 
-def visibility_of(kind: str, amount: float, *, medium: str) -> float:
-    """Visibility in metres at 550 nm and 2 % contrast; infinite in clear air."""
-    if kind in ("fog", "dust"):
-        return amount
-    if kind in ("spray", "clear") or amount <= 0:
-        return float("inf")
-    return CONTRAST / medium_of(kind, amount, wavelength_nm=550.0, medium=medium).extinction
+_GREEN_NM = 550.0
+"""Wavelength of visibilities, nanometres."""
+
+
+def road_conditions(weather: Iterable[WeatherSetting], *, wetness: float, snow: float) -> RoadConditions:
+    """Grip of wet and snowy ground, and the visibility in all weather that is everywhere, at its worst.
+
+    wetness : share of the ground that is soaked, see `lidar.world.settings.WorldSettings`
+    snow    : share of it that is under snow
+
+    Weather of a place, and plumes behind vehicles, do not lower the visibility.
+    """
+    extinction = sum(
+        max(
+            medium_of(setting.kind, amount, wavelength_nm=_GREEN_NM, medium=setting.medium).extinction
+            for amount in (setting.amount, setting.amount_to)
+            if amount >= 0
+        )
+        for setting in weather
+        if setting.kind != "clear" and setting.medium != "plumes"
+        if not (setting.radius or setting.polygon)
+    )
+    grip = (1 - snow) * (DRY_GRIP + wetness * (WET_GRIP - DRY_GRIP)) + snow * SNOW_GRIP
+    return RoadConditions(grip, CONTRAST / extinction if extinction else math.inf)

@@ -20,8 +20,7 @@ from lidar.dataset.recorded import Stream, cloud_points, clouds_in, color_images
 from lidar.errors import DatasetError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses, Trajectory
-from lidar.sensors.physics.intensity import apparent_of_code
-from lidar.sensors.physics.link import amplitude
+from lidar.sensors.physics.link import amplitude, apparent_of_code
 from lidar.sensors.rig.devices import Scanner, cameras, scanners
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor, firings
@@ -127,13 +126,7 @@ class Observation:
 
     def power(self, apparent: Float, distance: Float) -> Float:
         """Power over the detection threshold of targets of an apparent reflectance, metres away."""
-        return amplitude(
-            apparent,
-            distance,
-            reference_reflectance=self.sensor.reference_reflectance,
-            reference_range=self.sensor.reference_range,
-            falloff=self.sensor.falloff,
-        )
+        return amplitude(self.sensor, apparent, distance=distance)
 
     @functools.cached_property
     def distance(self) -> Float:

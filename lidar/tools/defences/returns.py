@@ -13,8 +13,8 @@ from scipy.spatial import cKDTree
 
 from geoscene.typing import Bools, Float
 from lidar.parameters import parameter
-from lidar.sensors.physics.intensity import apparent_of_code
-from lidar.sensors.physics.range_error import signal_sigma
+from lidar.sensors.physics.detector import signal_sigma
+from lidar.sensors.physics.link import apparent_of_code
 from lidar.tools.defences.defence import Defence, Gaps, Verdict, Window, greatest, of_returns
 from lidar.tools.defences.observation import Observation
 from lidar.tools.integrity.keys import read_secret

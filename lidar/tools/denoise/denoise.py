@@ -30,10 +30,10 @@ from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.recorded import cloud_points
 from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
-from lidar.signal.run import Altered, cloud_truth, trace_unaltered, write_truth
+from lidar.signal.truth import Altered, cloud_truth, trace_unaltered, write_truth
 from lidar.simulation.boxes import merge_box_files
 from lidar.tools.denoise.filters import Bools, Filter
 from lidar.tools.denoise.scores import FilterTally

@@ -19,7 +19,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import gps_seconds
 from lidar.options import MapOptions, classes_of
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 
 _STEP_DEG = 1e-3
 """Degrees between points of a region's edges, about 100 m: edges are straight in longitude and latitude."""

@@ -13,8 +13,7 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.layout import Dataset
 from lidar.errors import DatasetError, InputError
-from lidar.sensors.rig.imu_grades import PRESETS, Noise
-from lidar.sensors.rig.specs import ImuSpec, rig_of
+from lidar.sensors.rig.specs import PRESETS, ImuSpec, Noise, rig_of
 from lidar.tools.odometry.estimate import MotionEstimate
 from lidar.tools.odometry.fusion import Fixed, fixes_of, fuse_measurements, unit_of
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar.errors import InputError
-from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.tools.maps.picture import PictureView, Pixels, camera_around, view_named
 from lidar.world.world import World
 
@@ -21,7 +22,7 @@ def scene_picture(
     size: tuple[int, int] = (1600, 1000),
     bounds: tuple[float, float, float, float] | None = None,
     sun: ArrayLike = AFTERNOON,
-    options: RenderOptions | None = None,
+    settings: CameraSettings = CameraSettings(supersample=2, haze=np.inf),  # noqa: B008 - frozen
 ) -> Pixels:
     """A rendered picture (h, w, 3) of a scene.
 
@@ -36,8 +37,7 @@ def scene_picture(
     low, high = _heights(world, area)
     corners = np.array([[x, y, z] for x in area[0::2] for y in area[1::2] for z in (low, high)])
     camera, pose = camera_around(corners, view_named(view), size=size)
-    settings = options or RenderOptions(supersample=2, visibility=np.inf)
-    picture = render(camera, pose, world=world, sun=sun, options=settings).rgb
+    picture = render(camera, pose, world=world, sun=sun, settings=settings).rgb
     if picture is None:
         raise InputError("the camera of a picture records colour")
     return picture

@@ -23,7 +23,7 @@ from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError
 from lidar.geometry.mounts import Mount
 from lidar.options import PlotOptions
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.tools.maps.colors import ramp
 from lidar.tools.plots.drawn import (
     WIDE,

@@ -13,10 +13,16 @@ from lidar.geometry.mounts import Mount
 from lidar.geometry.random_streams import generator, normal_of, uniform_of
 from lidar.sensors.navigation.gnss import gauss_markov
 from lidar.sensors.navigation.imu import inertial_noise
-from lidar.sensors.physics.detector import Deviates, detect_echoes, measured_range, receive
+from lidar.sensors.physics.detector import (
+    Deviates,
+    detect_echoes,
+    measured_range,
+    receive,
+    signal_sigma,
+    stretch_sigma,
+)
 from lidar.sensors.physics.echoes import Echoes, artificial_echoes
 from lidar.sensors.physics.link import daylight_noise, detection_probability, noise_of
-from lidar.sensors.physics.range_error import signal_sigma, stretch_sigma
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.sensors.rig.specs import ImuSpec

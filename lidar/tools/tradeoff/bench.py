@@ -13,10 +13,9 @@ from geoscene.scene import Scene
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
+from lidar.sensors.camera.light import Lamps, sun_direction
 from lidar.sensors.camera.render import CameraImage, render
 from lidar.sensors.camera.settings import CameraSettings
-from lidar.sensors.camera.signal_lamps import Lamps
-from lidar.sensors.camera.sun import sun_direction
 from lidar.sensors.laser.scan import DetectedEchoes, Sweep, cast, detect, deviates_of
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.camera_model import exposure_times
@@ -289,7 +288,7 @@ def _render(
         sun=shot.sun,
         lamps=shot.lamps,
         times=np.clip((times - start) / shot.camera.period_ns, 0.0, 1.0),
-        options=settings.options(spec),
+        settings=settings,
     )
 
 

@@ -38,7 +38,7 @@ from lidar.tools.tradeoff.pick import (
     workers_text,
 )
 from lidar.tools.tradeoff.sample import DriveSample, sensors_with
-from lidar.world.thread_worlds import Worlds
+from lidar.world.world import Worlds
 
 SAMPLES = (12, 24, 48, 96)
 """Frames of the sample, which grows until it answers."""

@@ -108,7 +108,7 @@ def pack_sweep(
 ) -> bytes:
     """A sweep as deflated bytes: JSON with its length before it, then the planes of `COLUMNS`.
 
-    origin : (n,) `lidar.sensors.physics.origin.Origin` of each return; None if no stage changed the sweep
+    origin : (n,) `lidar.sensors.physics.echoes.Origin` of each return; None if no stage changed the sweep
     head   : further entries of the JSON
 
     Returns are sorted by ring, column and echo.

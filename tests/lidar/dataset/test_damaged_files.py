@@ -24,7 +24,7 @@ from lidar.sensors.rig.devices import cameras, scanners
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import load_rig, rig_digest
 from lidar.signal.registry import read_stages
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.redteam.plan import read_plan
 from lidar.tools.sweep.grid import read_grid

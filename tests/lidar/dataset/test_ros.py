@@ -33,7 +33,7 @@ from lidar.errors import DatasetError, FormatError, InputError
 from lidar.options import DriveOptions
 from lidar.sensors.navigation.measurements import fix_variances
 from lidar.sensors.rig.camera_model import project
-from lidar.sensors.rig.patterns.scanner2d import Scan2d
+from lidar.sensors.rig.patterns.repeating import Scan2d
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive
 from lidar.tools.convert import convert

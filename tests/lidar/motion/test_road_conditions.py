@@ -9,7 +9,7 @@ from lidar.errors import InputError
 from lidar.motion.road_conditions import DRY, ROADS, RoadConditions, vehicle_on
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 from lidar.traffic.trips import DRIVERS, driver_on
 
 CAR = load_vehicle("car")

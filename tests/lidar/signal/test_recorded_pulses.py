@@ -9,7 +9,7 @@ from helpers.sensor_worlds import box, driven, world
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import firings, load_sensor
-from lidar.signal.recorded_pulses import complete, recorded_pulses
+from lidar.signal.recorded import complete, recorded_pulses
 
 ROAD = box((-60, -60, -1), (60, 60, 0))
 WALLS = [box((20, -60, 0), (22, 60, 30)), box((-60, 12, 0), (20, 14, 5))]

@@ -16,10 +16,10 @@ from lidar.dataset.png import read_png
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.parameters import parameter
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.signal.registry import NamedStage, number_stages, read_stages
 from lidar.signal.stage import Stage
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 from lidar.simulation import frame_loop
 from lidar.simulation.drive import drive
 from lidar.simulation.frame_loop import chunks, recording_chunks

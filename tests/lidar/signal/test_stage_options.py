@@ -7,7 +7,7 @@ from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.signal.attacks.inject import Inject
 from lidar.signal.registry import NamedStage, read_attacks, read_stages
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 
 LOSSY = read_stages(["dropped_packets:loss=0.1"]).stages
 

@@ -15,16 +15,16 @@ from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast, scan
-from lidar.sensors.physics.echoes import join
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin, join
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
-from lidar.signal.dropped_packets import DroppedPackets
+from lidar.signal.faults import DroppedPackets
 from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_stage, read_stages, stage_rows, stages_of
-from lidar.signal.run import altered_image, altered_sweep, cloud_truth, image_truth
+from lidar.signal.run import altered_image, altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage, added_echoes
+from lidar.signal.truth import cloud_truth, image_truth
 
 ROOF = Mount((1.2, 0.0, 1.9))
 ROOM = world(

@@ -18,7 +18,8 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.mounts import Mount
 from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
 from lidar.motion.vehicle import load_vehicle
-from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
@@ -320,7 +321,7 @@ def test_image_boxes_give_the_visible_share(actors, scene, ego):
             np.concatenate([transform[mine], board]),
             feature=np.append(feature[mine], np.int32(10**6)),
         )
-        image = render(camera, pose, world=world, sun=(0.0, 0.0, 1.0), options=RenderOptions())
+        image = render(camera, pose, world=world, sun=(0.0, 0.0, 1.0), settings=CameraSettings())
         boxes = image_boxes(actors, camera, pose=pose, time_ns=0, instance=image.feature)
         row = int(np.flatnonzero(boxes.row == k)[0])
         shown.append(boxes.visibility[row])

@@ -19,6 +19,7 @@ from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.scene import Float64Scene
 from lidar.world.settings import WorldSettings, origin_limit
 from lidar.world.surfaces import FOLIAGE, GLASS, OPEN
+from lidar.world.tiles import load_tile
 from lidar.world.world import World
 
 TILE = 100.0
@@ -161,8 +162,13 @@ def test_following_keeps_only_the_tiles_around(scene):
 
 
 def test_worlds_read_the_tiles_of_an_open_scene_once(scene, monkeypatch):
-    read, ranks = World._read, []
-    monkeypatch.setattr(World, "_read", lambda self, rank: ranks.append(rank) or read(self, rank))
+    ranks = []
+
+    def load(scene, rank, **given):
+        ranks.append(rank)
+        return load_tile(scene, rank, **given)
+
+    monkeypatch.setattr("lidar.world.world.load_tile", load)
     opened = open_scene(scene.path)
     for x in (110.0, 150.0, 180.0):
         World.load(opened, region=(x, 50, x, 60))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,21 +46,30 @@ def from_origin(
     return Firings(time_ns, direction, np.zeros_like(direction), channel, column, channel, order)
 
 
+def chosen(pulses: Firings, keep: NDArray[np.bool_]) -> Firings:
+    """Some of the pulses, in the same order."""
+    kept, order = pulses.take(keep), pulses.order[keep[pulses.order]]
+    rank = np.cumsum(keep, dtype=np.int32) - 1
+    return replace(kept, order=rank[order])
+
+
 def unit_vectors(azimuth: Float, elevation: Float) -> Float:
     """Unit vectors (..., 3) of angles in radians, counter-clockwise from forward, and up."""
     level = np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
 
 
-class Pattern(Protocol):
-    """Firing pattern of a scanner."""
+class Pattern:
+    """Firing pattern of a scanner.
 
-    @property
-    def range_offset(self) -> float:
-        """Metres that the sensor adds to the distance from the beam's start."""
+    range_offset : metres that the sensor adds to the distance from the beam's start
+    """
+
+    range_offset: float = 0.0
 
     def fire(self, frame: int, rate_hz: float, *, start_ns: int) -> Firings:
         """The pulses that are fired within `frame_window_ns` of frame ``frame``."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,21 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.sensors.rig.patterns.beams import Firings, blocks, frame_ns, frame_window_ns, frozen, ranks
+from lidar.sensors.rig.patterns.beams import (
+    Firings,
+    Pattern,
+    blocks,
+    chosen,
+    frame_ns,
+    frame_window_ns,
+    frozen,
+    ranks,
+)
 from lidar.toml_table import Table
 
 
 @dataclass(frozen=True, eq=False)
-class Spinning:
+class Spinning(Pattern):
     """A rotating column of lasers. Laser k fires ``fire_ns[k]`` after the start of each block.
 
     Blocks follow each other without a pause. At the time t of a pulse the encoder's angle is
@@ -92,7 +101,7 @@ class Spinning:
             return pulses
         first, last = np.flatnonzero(during)[[0, -1]].tolist() if during.any() else (0, -1)
         if not during[first : last + 1].all():
-            return _chosen(pulses, during)
+            return chosen(pulses, during)
         among = _order_among(self, len(block), first=first, stop=last + 1)
         return replace(pulses.take(slice(first, last + 1)), order=among)
 
@@ -119,13 +128,6 @@ def _order_among(pattern: Spinning, count: int, *, first: int, stop: int) -> NDA
     """Ring-major order of the pulses ``first`` to ``stop`` of ``count`` blocks, among themselves."""
     order = _labels(pattern, count)[3]
     return frozen(order[(order >= first) & (order < stop)] - np.int32(first))
-
-
-def _chosen(pulses: Firings, chosen: NDArray[np.bool_]) -> Firings:
-    """Some of the pulses, in the same order."""
-    kept, order = pulses.take(chosen), pulses.order[chosen[pulses.order]]
-    rank = np.cumsum(chosen, dtype=np.int32) - 1
-    return replace(kept, order=rank[order])
 
 
 @njit(cache=True, nogil=True)

@@ -23,12 +23,13 @@ from lidar.sensors.camera.ground_texture import (
     draw_cracks,
     ground,
 )
-from lidar.sensors.camera.render import RenderOptions, render
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.specs import CameraSpec
 
 KINDS = (ASPHALT, CONCRETE, PAVING, SETTS, LOOSE, GREEN)
 DOWN = CameraSpec("down", Mount(), 320, 240, 400.0, 400.0, 159.5, 119.5)
-OPTIONS = RenderOptions(visibility=np.inf)
+SETTINGS = CameraSettings(haze=np.inf)
 NOON = (0.0, -1.0, 1.0)
 places = st.floats(-5000.0, 5000.0)
 
@@ -113,7 +114,7 @@ def test_cracks_are_rare_narrow_and_as_wide_from_along_as_from_across():
 def test_ground_looks_the_same_from_another_pose(material):
     town = level(material)
     shots = [
-        render(DOWN, above(*at), world=town, sun=NOON, options=OPTIONS).rgb[:, :, 1].astype(float)
+        render(DOWN, above(*at), world=town, sun=NOON, settings=SETTINGS).rgb[:, :, 1].astype(float)
         for at in ((3.0, 5.0), (3.5, 5.0))
     ]
     # Half a metre along x at a height of 4 m is 400 / 4 / 2 = 50 pixels; image x is scene x.
@@ -124,14 +125,14 @@ def test_ground_looks_the_same_from_another_pose(material):
 
 
 def test_detail_off_leaves_the_ground_plain():
-    flat = replace(OPTIONS, detail=False)
-    image = render(DOWN, above(0, 0), world=level("asphalt"), sun=NOON, options=flat).rgb
+    flat = replace(SETTINGS, detail=False)
+    image = render(DOWN, above(0, 0), world=level("asphalt"), sun=NOON, settings=flat).rgb
     assert np.ptp(image.reshape(-1, 3).astype(int), axis=0).max() <= 1
 
 
 def test_oblique_ground_is_as_bright_as_ground_seen_from_above():
     town = level("asphalt", half=400.0)
     ahead = Poses(np.array([[0.0, 0.0, 1.6]]), OPTICAL[None], np.ones((1, 3)))
-    frame = render(replace(DOWN, cy=20.0), ahead, world=town, sun=NOON, options=OPTIONS)
+    frame = render(replace(DOWN, cy=20.0), ahead, world=town, sun=NOON, settings=SETTINGS)
     near, far = frame.rgb[200:, :, 1].mean(), frame.rgb[30:60, :, 1].mean()
     assert far == pytest.approx(near, rel=0.05)

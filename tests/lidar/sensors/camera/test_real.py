@@ -12,8 +12,9 @@ from geoscene.sources import read_osm
 from lidar.dataset.png import depth_to_counts, encode_png
 from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.sensors.camera.render import RenderOptions, render
-from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.camera.light import sun_direction
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.plots.scene_picture import scene_picture
@@ -96,7 +97,7 @@ def test_frames_of_a_real_place_are_the_same_every_time(column):
             _street_view(world, yaw=2.0),
             world=world,
             sun=(1, 0, 1),
-            options=RenderOptions(threads=threads),
+            threads=threads,
         )
         shots.append((encode_png(frame.rgb), encode_png(depth_to_counts(frame.depth))))
     assert shots[0] == shots[1]
@@ -114,7 +115,7 @@ def test_an_image_does_not_depend_on_the_tiles_that_were_loaded_before(column):
 
 def test_the_scene_fills_its_picture(column):
     _, world = column
-    image = scene_picture(world, size=(320, 200), options=RenderOptions(visibility=np.inf))
+    image = scene_picture(world, size=(320, 200), settings=CameraSettings(haze=np.inf))
     plain = (image == image[0, 0]).all(axis=2)
     assert plain.mean() < 0.7
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 500

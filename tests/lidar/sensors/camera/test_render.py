@@ -16,14 +16,15 @@ from lidar.geometry.mounts import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels
-from lidar.sensors.camera.render import RenderOptions, _shared_rays, optical_flow, render
+from lidar.sensors.camera.render import _shared_rays, optical_flow, render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.camera.shade import straight_rays
 from lidar.sensors.rig.camera_model import exposure_times, pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 
 CAMERA = CameraSpec("c", Mount(), 160, 120, 100.0, 100.0, 79.5, 59.5)
-FLAT = RenderOptions(detail=False, visibility=np.inf, edge_rays=1)
+FLAT = CameraSettings(detail=False, haze=np.inf, edge_rays=1)
 NOON = (0.0, -1.0, 1.0)  # half way up in the south
 
 
@@ -83,11 +84,11 @@ LENSES = (
 
 @pytest.mark.parametrize("camera", LENSES)
 def test_frames_are_the_same_if_their_rays_are_too_many_to_keep(camera, monkeypatch):
-    options = RenderOptions(supersample=2)
+    settings = CameraSettings(supersample=2)
     frames = []
     for shared in (1 << 23, 0):
         monkeypatch.setattr("lidar.sensors.camera.render._SHARED", shared)
-        frames.append(render(camera, looking((0, 0, 1.5)), world=street(), sun=NOON, options=options))
+        frames.append(render(camera, looking((0, 0, 1.5)), world=street(), sun=NOON, settings=settings))
     np.testing.assert_allclose(frames[0].depth, frames[1].depth, rtol=1e-6)
     np.testing.assert_array_equal(frames[0].feature, frames[1].feature)
     np.testing.assert_allclose(frames[0].rgb.astype(int), frames[1].rgb, atol=1)
@@ -175,7 +176,7 @@ def test_shadows_point_away_from_the_sun_with_the_computed_length(azimuth_deg):
     elevation, azimuth = np.radians(30), np.radians(azimuth_deg)
     flat = np.array([np.sin(azimuth), np.cos(azimuth)])
     sun = [*np.cos(elevation) * flat, np.sin(elevation)]
-    frame = render(CAMERA, _above(), world=town, sun=sun, options=FLAT)
+    frame = render(CAMERA, _above(), world=town, sun=sun, settings=FLAT)
     bright = frame.rgb.astype(int).sum(axis=2)
 
     def at(xy):
@@ -189,16 +190,17 @@ def test_shadows_point_away_from_the_sun_with_the_computed_length(azimuth_deg):
     assert at(-flat * (length + 2.5)) == lit
     across = np.array([flat[1], -flat[0]])
     assert at(-flat * 5 + across * 4) == lit
-    unshaded = render(CAMERA, _above(), world=town, sun=sun, options=replace(FLAT, shadows=False))
+    unshaded = render(CAMERA, _above(), world=town, sun=sun, settings=replace(FLAT, shadows=False))
     assert (unshaded.rgb[frame.feature == 0].astype(int).sum(axis=1) == lit).all()
 
 
 def test_a_mid_grey_floor_in_sun_and_sky_is_a_quarter_of_full_scale():
     # sRGB 118 is 18 % reflectance; a quarter of full scale is sRGB 137.
     for sun in ((0, -1, 1), (1, 0, 0.3), (0.0, 0.0, 1.0)):
-        frame = render(CAMERA, _above(), world=world(ground()), sun=sun, options=FLAT)
+        frame = render(CAMERA, _above(), world=world(ground()), sun=sun, settings=FLAT)
         assert frame.rgb.mean() == pytest.approx(137, abs=4)
-    brighter = render(CAMERA, _above(), world=world(ground()), sun=NOON, options=replace(FLAT, exposure=1.0))
+    camera = replace(CAMERA, exposure_ev=1.0)
+    brighter = render(camera, _above(), world=world(ground()), sun=NOON, settings=FLAT)
     # A stop doubles linear light: 0.5 of full scale is sRGB 188.
     assert brighter.rgb.mean() == pytest.approx(188, abs=5)
 
@@ -208,9 +210,9 @@ def test_a_wall_is_lit_by_the_cosine_of_the_suns_angle():
     for turn in np.radians([0, 30, 60]):
         sun = (-np.cos(turn), np.sin(turn), 1e-3)
         wall = world(plate(10.0))
-        shade = render(CAMERA, looking(), world=wall, sun=(1.0, 0, 1e-3), options=FLAT).rgb
+        shade = render(CAMERA, looking(), world=wall, sun=(1.0, 0, 1e-3), settings=FLAT).rgb
         assert shade.max() < 255
-        raw = render(CAMERA, looking(), world=wall, sun=sun, options=replace(FLAT, exposure=-3.0)).rgb
+        raw = render(replace(CAMERA, exposure_ev=-3.0), looking(), world=wall, sun=sun, settings=FLAT).rgb
         s = raw[60, 80] / 255
         light.append(np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)[0])
     assert light[0] > light[1] > light[2]
@@ -218,18 +220,18 @@ def test_a_wall_is_lit_by_the_cosine_of_the_suns_angle():
 
 def test_same_input_same_bytes_on_any_number_of_threads():
     town, poses = street(), looking(yaw=0.2)
-    a, b = (render(CAMERA, poses, world=town, sun=NOON, options=RenderOptions(threads=n)) for n in (1, 3))
+    a, b = (render(CAMERA, poses, world=town, sun=NOON, threads=n) for n in (1, 3))
     assert encode_png(a.rgb) == encode_png(b.rgb)
     for name in ("depth", "klass", "feature"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def test_noise_follows_its_seed_and_the_light():
-    options = replace(FLAT, full_well=2000.0)
+    camera, settings = replace(CAMERA, full_well=2000.0), replace(FLAT, camera_noise=True)
 
     def shot(key):
         random = np.random.Generator(np.random.Philox(key=key))
-        return render(CAMERA, _above(), world=world(ground()), sun=NOON, random=random, options=options).rgb
+        return render(camera, _above(), world=world(ground()), sun=NOON, random=random, settings=settings).rgb
 
     np.testing.assert_array_equal(shot(5), shot(5))
     assert (shot(5) != shot(6)).mean() > 0.5
@@ -238,13 +240,13 @@ def test_noise_follows_its_seed_and_the_light():
     slope = 255 * 1.055 / 2.4 * 0.25 ** (1 / 2.4 - 1)
     assert spread == pytest.approx(slope * np.sqrt(500 + 16) / 2000, rel=0.1)
     with pytest.raises(InputError, match="random"):
-        render(CAMERA, _above(), world=world(ground()), sun=NOON, options=options)
+        render(camera, _above(), world=world(ground()), sun=NOON, settings=settings)
 
 
 def test_supersampling_softens_edges_and_keeps_labels():
     town, poses = street(), looking(yaw=0.2)
-    plain = render(CAMERA, poses, world=town, sun=NOON, options=FLAT)
-    soft = render(CAMERA, poses, world=town, sun=NOON, options=replace(FLAT, supersample=2))
+    plain = render(CAMERA, poses, world=town, sun=NOON, settings=FLAT)
+    soft = render(CAMERA, poses, world=town, sun=NOON, settings=replace(FLAT, supersample=2))
     np.testing.assert_array_equal(plain.depth, soft.depth)
     np.testing.assert_array_equal(plain.feature, soft.feature)
     a, b = plain.rgb.astype(float), soft.rgb.astype(float)
@@ -257,8 +259,8 @@ def test_rays_at_edges_alone_come_close_to_rays_everywhere():
     town, poses = street(), looking(yaw=0.2)
 
     def shot(**rays):
-        options = replace(FLAT, **rays)
-        return render(CAMERA, poses, world=town, sun=NOON, options=options).rgb.astype(float)
+        settings = replace(FLAT, **rays)
+        return render(CAMERA, poses, world=town, sun=NOON, settings=settings).rgb.astype(float)
 
     one, few, all_ = shot(), shot(edge_rays=2), shot(supersample=2)
     changed = (one != few).any(axis=2)
@@ -305,8 +307,8 @@ def test_a_finite_exposure_blurs_motion():
     # 20 m/s for 10 ms is 0.2 m, 2 pixels at 10 m: the edge takes steps instead of one jump.
     poses = stacked([looking((0.0, 20.0 * t * 1e-9, 1.5)) for t in times])
     edge = world(box((10, -50, -50), (11, 0, 50), feature=1, material="tyre"))
-    still = render(CAMERA, poses.take([2]), world=edge, sun=NOON, options=FLAT)
-    moved = render(camera, poses, world=edge, sun=NOON, options=FLAT)
+    still = render(CAMERA, poses.take([2]), world=edge, sun=NOON, settings=FLAT)
+    moved = render(camera, poses, world=edge, sun=NOON, settings=FLAT)
     row = moved.rgb[60].astype(int).sum(axis=1)
     sharp = still.rgb[60].astype(int).sum(axis=1)
     assert (np.diff(sharp) != 0).sum() <= 1 + (np.abs(np.diff(sharp)) < 10).sum()
@@ -347,9 +349,9 @@ def test_detail_gives_odometry_features_to_track():
     camera = replace(CAMERA, width=640, height=480, fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     town, poses = street(), looking((-20, 0, 1.5), yaw=0.1)
     windows = MeshWorld(town.mesh, relief=with_windows(town.mesh))
-    smooth = RenderOptions(supersample=3)
-    drawn = _corners(render(camera, poses, world=windows, sun=NOON, options=smooth).rgb)
-    plain = _corners(render(camera, poses, world=town, sun=NOON, options=replace(smooth, detail=False)).rgb)
+    smooth = CameraSettings(supersample=3)
+    drawn = _corners(render(camera, poses, world=windows, sun=NOON, settings=smooth).rgb)
+    plain = _corners(render(camera, poses, world=town, sun=NOON, settings=replace(smooth, detail=False)).rgb)
     assert drawn > 300
     assert drawn > 10 * plain
 
@@ -358,9 +360,9 @@ def test_detail_stays_in_its_place_when_the_camera_moves():
     mesh = house((10, -20, -20), (12, 20, 20), material="plaster")
     wall = MeshWorld(mesh, relief=with_windows(mesh))
     camera = replace(CAMERA, width=320, fx=200.0, fy=200.0, cx=159.5)
-    options = RenderOptions(supersample=3, visibility=np.inf)
+    settings = CameraSettings(supersample=3, haze=np.inf)
     a, b = (
-        render(camera, looking((0, y, 0.0)), world=wall, sun=(-1, -0.5, 0.8), options=options)
+        render(camera, looking((0, y, 0.0)), world=wall, sun=(-1, -0.5, 0.8), settings=settings)
         .rgb[:, :, 1]
         .astype(float)
         for y in (0.0, 1.0)
@@ -379,20 +381,20 @@ def test_far_detail_fades_instead_of_flickering():
     for height in (20.0, 100.0, 800.0):
         poses = _above()
         poses = Poses(np.array([[0.0, 0.0, height]]), poses.rotation, poses.scale)
-        rgb = render(camera, poses, world=world(ground()), sun=NOON, options=replace(FLAT, detail=True)).rgb
+        rgb = render(camera, poses, world=world(ground()), sun=NOON, settings=replace(FLAT, detail=True)).rgb
         contrast.append(np.abs(np.diff(rgb.astype(float), axis=1)).mean())
     assert all(near > far for near, far in pairwise(contrast))
 
 
 def test_haze_removes_98_percent_of_contrast_at_the_visibility():
     def contrast(visibility):
-        options = RenderOptions(detail=False, visibility=visibility)
+        settings = CameraSettings(detail=False, haze=visibility)
         pair = world(
             replace(plate(200.0, half=99, feature=1), color=np.full((2, 3), 40, np.uint8)),
             box((199.9, 0, -99), (200.5, 99, 99), feature=2),
         )
         middle = replace(CAMERA, width=20, height=20, cx=9.5, cy=9.5)
-        frame = render(middle, looking((0, 0, 0)), world=pair, sun=(-1, 0, 0.5), options=options)
+        frame = render(middle, looking((0, 0, 0)), world=pair, sun=(-1, 0, 0.5), settings=settings)
         s = frame.rgb / 255
         light = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)[..., 1]
         return abs(light[frame.feature == 1].mean() - light[frame.feature == 2].mean())
@@ -498,15 +500,15 @@ def test_a_camera_that_does_not_record_colour_skips_it():
 
 
 def test_night_is_dark_but_not_empty():
-    frame = render(CAMERA, looking(), world=street(), sun=(0.5, 0.0, -0.8), options=FLAT)
+    frame = render(CAMERA, looking(), world=street(), sun=(0.5, 0.0, -0.8), settings=FLAT)
     assert 0 < frame.rgb.mean() < 255
     assert np.ptp(frame.rgb) > 10
 
 
-def test_options_out_of_range_are_refused():
-    for bad in ({"supersample": 0}, {"edge_rays": 17}, {"visibility": 0.0}, {"threads": 0}):
+def test_settings_out_of_range_are_refused():
+    for bad in ({"supersample": 0}, {"edge_rays": 17}, {"haze": 0.0}, {"cloud": 1.1}):
         with pytest.raises(InputError):
-            RenderOptions(**bad)
+            CameraSettings(**bad)
 
 
 def test_the_whole_street_is_one_mesh():
@@ -517,7 +519,7 @@ def test_the_whole_street_is_one_mesh():
 def test_wet_ground_is_darker_and_mirrors_what_stands_on_it():
     tower = replace(house((30, -3, 0), (34, 3, 60)), color=np.tile(np.uint8([220, 20, 20]), (12, 1)))
     dry, damp, wet = (
-        render(CAMERA, looking(), world=world(ground(), tower, wetness=w), sun=NOON, options=FLAT).rgb
+        render(CAMERA, looking(), world=world(ground(), tower, wetness=w), sun=NOON, settings=FLAT).rgb
         for w in (0.0, 0.4, 1.0)
     )
     near = slice(112, 120), slice(60, 100)
@@ -530,7 +532,7 @@ def test_wet_ground_is_darker_and_mirrors_what_stands_on_it():
 
 def test_snow_covers_its_share_of_the_ground_and_none_of_the_walls():
     scene = ground(material="soil", color=(60, 50, 40)), house((30, -80, 0), (34, -20, 40))
-    look = {"sun": NOON, "options": FLAT}
+    look = {"sun": NOON, "settings": FLAT}
     above = looking((0, 0, 40), down=np.pi / 2)
     for share in (0.2, 0.5, 0.8):
         rgb = render(CAMERA, above, world=world(*scene, snow=share), **look).rgb

@@ -17,9 +17,9 @@ from lidar.geometry.poses import Poses
 from lidar.raycast.relief import pairs_of, tables_of
 from lidar.sensors.camera import shade
 from lidar.sensors.camera.facades import RenderedFacades
-from lidar.sensors.camera.light import daylight
-from lidar.sensors.camera.render import RenderOptions, render
-from lidar.sensors.camera.sun import sun_direction
+from lidar.sensors.camera.light import daylight, sun_direction
+from lidar.sensors.camera.render import render
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 from lidar.world.world import World
@@ -132,7 +132,7 @@ def street(shared_osm, tmp_path_factory):
     ("weather", "chosen"),
     [
         ({}, {}),
-        ({"wetness": 0.8}, {"supersample": 2, "visibility": 800.0}),
+        ({"wetness": 0.8}, {"supersample": 2, "haze": 800.0}),
         ({"snow": 0.6}, {"cloud": 0.7}),
         ({"relief": "off"}, {"detail": False, "shadows": False}),
     ],
@@ -147,7 +147,7 @@ def test_images_of_a_real_place_have_the_colours_of_the_cpu_with_the_same_hits(s
             poses,
             world=World.load(street, settings=WorldSettings(device=name, **weather), **casting),
             sun=sun,
-            options=replace(RenderOptions(), **chosen),
+            settings=replace(CameraSettings(), **chosen),
         ).rgb.astype(int)
         for name, casting in (("cpu", {"backend": "float64"}), (DEVICE, {}))
     ]

@@ -6,8 +6,8 @@ from helpers.sensor_worlds import LEAVES, box, driven, plate, world
 
 from geoscene.classes import Class
 from lidar.geometry.mounts import Mount
-from lidar.sensors.laser.foliage import PROJECTION
 from lidar.sensors.laser.scan import scan
+from lidar.sensors.laser.surface_echoes import PROJECTION
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 

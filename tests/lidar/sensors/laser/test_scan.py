@@ -8,8 +8,6 @@ from helpers.sensor_worlds import MeshWorld, box, driven, plate, world
 
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
-from lidar.sensors.laser.rays import beam_of
-from lidar.sensors.laser.reflection import EchoCollector, SurfaceOptics
 from lidar.sensors.laser.scan import cast, scan
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
@@ -267,16 +265,3 @@ def test_walls_stay_dry_and_without_snow():
 def test_snow_is_bright_at_905_nm():
     (dry, road), (snowy, under) = on_road(), on_road(snow=1.0)
     assert np.median(snowy.intensity[under][:100]) > 3 * np.median(dry.intensity[road][:100])
-
-
-def test_collected_echoes_of_wet_ground_are_those_of_single_surfaces():
-    """The compiled collector and the look-up of single hits agree."""
-    wet = world(ROAD, BEYOND, wetness=0.6, snow=0.2)
-    optics = SurfaceOptics(wet, 905.0, settings=PLAIN, seed=1)
-    down = np.array([[0.3, 0.1, -1.0], [1.0, 0.0, -0.2], [0.9, 0.1, 0.0]])
-    hits = wet.caster.cast(np.array([0.0, 0.0, 2.0]), down / np.linalg.norm(down, axis=1, keepdims=True))
-    single, _ = optics.at(hits)
-    beam = beam_of(1, divergence=(0.0, 0.0), aperture=(0.0, 0.0), turn=np.empty(0))
-    collector = EchoCollector(optics, beam, separation=0.5, pulses=3)
-    collector.take(hits, 0)
-    np.testing.assert_allclose(collector.echoes()[0].apparent, single.apparent, rtol=1e-12)

@@ -13,7 +13,7 @@ from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.doppler import radial_velocity
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.patterns.beams import blocks, frame_window_ns
-from lidar.sensors.rig.patterns.scanner2d import Scan2d
+from lidar.sensors.rig.patterns.repeating import Scan2d
 from lidar.sensors.rig.scanner import firings, load_sensor, sensor_names
 
 

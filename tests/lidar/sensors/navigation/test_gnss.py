@@ -18,18 +18,19 @@ from lidar.geometry.attitude import quat_from_euler
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
-from lidar.sensors.navigation.constellations import constellations, satellite_names, satellites
-from lidar.sensors.navigation.geoid import geoid_at
 from lidar.sensors.navigation.gnss import antenna_motion, epochs, gauss_markov, gnss_columns, observe_gnss
 from lidar.sensors.navigation.measurements import NAMES, STATES
-from lidar.sensors.navigation.nmea import checksum, height_note, latitude, longitude, nmea, sentence
+from lidar.sensors.navigation.nmea import checksum, geoid_at, height_note, latitude, longitude, nmea, sentence
 from lidar.sensors.navigation.satellite_visibility import (
     Sky,
+    constellations,
     dilution,
     ecef,
     enu_axes,
     look_up,
     open_sky,
+    satellite_names,
+    satellites,
     sky_view,
 )
 from lidar.sensors.rig.specs import SYSTEMS, GnssSpec

@@ -10,8 +10,8 @@ from helpers.sensor_worlds import box, driven, plate, world
 from geoscene.classes import Class, materials
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
-from lidar.sensors.physics.fresnel import pane_reflection
 from lidar.sensors.physics.link import detection_probability
+from lidar.sensors.physics.reflect import pane_reflection
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 

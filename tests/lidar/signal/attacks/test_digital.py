@@ -16,11 +16,12 @@ from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.measurements import Fixes
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.registry import stages_of
-from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered
+from lidar.signal.run import altered_cloud
 from lidar.signal.situation import Situation
+from lidar.signal.truth import Altered, cloud_truth, trace_unaltered
 
 CAMERA = CameraSpec("front", Mount(), 80, 60, 40.0, 40.0, 39.5, 29.5)
 

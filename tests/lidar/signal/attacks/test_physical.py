@@ -13,17 +13,17 @@ from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.origin import Origin
-from lidar.sensors.physics.pulse_identity import METRES_PER_NS
+from lidar.sensors.physics.detector import METRES_PER_NS
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.scanner import firings, load_sensor
-from lidar.signal.attacks.attacker import DEVICES
-from lidar.signal.attacks.sight import check_sight, sent_only
+from lidar.signal.attacks.attacker import DEVICES, check_sight, sent_only
 from lidar.signal.recorded import altered_recording
 from lidar.signal.registry import NamedStage, Stages, read_attacks, read_stage, stages_of
-from lidar.signal.run import altered_sweep, cloud_truth
+from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Stage
+from lidar.signal.truth import cloud_truth
 from lidar.signal.weather.media import medium_of
 
 ROOF = Mount((1.2, 0.0, 1.9))

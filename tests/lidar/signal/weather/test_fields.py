@@ -13,20 +13,18 @@ from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import trace
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin, trace
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import NamedStage, Stages, number_stages
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, ROAD_USERS, pulses_of
-from lidar.signal.weather.air import through_air
 from lidar.signal.weather.fields import Field, WeatherBeams, _add_spray, amounts, plume_pattern
 from lidar.signal.weather.glass import glare_noise, through_glass
 from lidar.signal.weather.media import medium_of, rain
-from lidar.signal.weather.read import read_weather
-from lidar.signal.weather.stage import Weather
+from lidar.signal.weather.setting import read_weather
+from lidar.signal.weather.stage import Weather, through_air
 
 GEO = Frame.at(7.0, 50.0)
 SENSOR = load_sensor("vlp16")

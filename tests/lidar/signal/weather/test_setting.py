@@ -3,8 +3,7 @@ from helpers import ROOT
 
 from lidar.errors import InputError
 from lidar.signal.registry import read_stage
-from lidar.signal.weather.read import read_weather
-from lidar.signal.weather.setting import KINDS, WeatherSetting
+from lidar.signal.weather.setting import KINDS, WeatherSetting, read_weather
 
 
 def test_texts_give_kind_and_amount_in_its_unit():

@@ -13,7 +13,7 @@ from lidar.geometry.poses import Poses
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
@@ -21,7 +21,7 @@ from lidar.signal.registry import Stages
 from lidar.signal.run import altered_sweep
 from lidar.signal.situation import Situation
 from lidar.signal.weather.camera import add_weather
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 
 GROUND = box((-90, -90, -1), (90, 90, 0))
 WALL = box((40, -20, 0), (42, 20, 20), feature=8)

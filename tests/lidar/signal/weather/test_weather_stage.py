@@ -14,7 +14,7 @@ from geoscene.classes import Class
 from lidar.geometry.mounts import Mount
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.recorded import altered_recording
@@ -32,7 +32,7 @@ from lidar.signal.weather.backscatter import (
 )
 from lidar.signal.weather.fields import Field
 from lidar.signal.weather.media import fog_extinction, medium_of, rain, snow
-from lidar.signal.weather.read import read_weather
+from lidar.signal.weather.setting import read_weather
 
 ROOM = world(
     box((-40, -30, -1), (40, 30, 0), feature=7, klass=Class.ROAD, material="asphalt"),

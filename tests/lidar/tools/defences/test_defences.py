@@ -12,7 +12,7 @@ from geoscene.classes import Class
 from lidar.dataset.png import write_png
 from lidar.errors import InputError
 from lidar.geometry.mounts import Mount
-from lidar.sensors.physics.pulse_identity import METRES_PER_NS
+from lidar.sensors.physics.detector import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.defences.boxes import Occlusion, Shadow, Temporal

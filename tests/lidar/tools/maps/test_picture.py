@@ -12,7 +12,7 @@ from geoscene.classes import Class, class_codes
 from geoscene.geometry.mesh import Mesh, concatenate
 from lidar.errors import InputError
 from lidar.motion.vehicle import load_vehicle
-from lidar.sensors.camera.render import RenderOptions
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.camera_model import project
 from lidar.tools.maps.picture import (
     BACKGROUND,
@@ -29,7 +29,7 @@ from lidar.tools.maps.picture import (
 from lidar.tools.plots.scene_picture import scene_picture
 
 RED, GREEN, BLUE = (255, 0, 0), (0, 255, 0), (0, 0, 255)
-PLAIN = RenderOptions(detail=False, visibility=np.inf)
+PLAIN = CameraSettings(detail=False, haze=np.inf)
 
 
 def _where(image, color):
@@ -130,7 +130,7 @@ def _village():
 
 
 def test_a_scene_from_above_is_a_map():
-    image = scene_picture(_village(), view="top", size=(400, 300), sun=(0, 0, 1), options=PLAIN)
+    image = scene_picture(_village(), view="top", size=(400, 300), sun=(0, 0, 1), settings=PLAIN)
     redness = (image[..., 0] > 150) & (image[..., 1] < 60)
     v, u = np.nonzero(redness)
     scale = 300 / 100 * 0.98  # pixels per metre: the height of the picture is the tighter fit
@@ -141,12 +141,12 @@ def test_a_scene_from_above_is_a_map():
 
 
 def test_an_oblique_picture_shows_walls_and_shadows():
-    image = scene_picture(_village(), size=(320, 200), options=PLAIN).astype(int)
+    image = scene_picture(_village(), size=(320, 200), settings=PLAIN).astype(int)
     red = (image[..., 0] > 2 * image[..., 1]) & (image[..., 0] > 60)
     assert len(np.unique(image[red][:, 0])) >= 2  # roof and walls are lit differently
     grey = np.abs(np.diff(image, axis=2)).max(axis=2) < 40
     assert (image[grey & ~red].sum(axis=1) < 200).any()  # the shadow on the ground
-    plain = scene_picture(_village(), size=(320, 200), options=replace(PLAIN, shadows=False)).astype(int)
+    plain = scene_picture(_village(), size=(320, 200), settings=replace(PLAIN, shadows=False)).astype(int)
     assert image.sum() < plain.sum()
 
 

@@ -14,7 +14,7 @@ from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.truth_files import read_truth
 from lidar.options import PlaybackOptions
-from lidar.sensors.physics.origin import Origin
+from lidar.sensors.physics.echoes import Origin
 from lidar.tools.view import view_drive
 from lidar.tools.view.server import DriveServer
 from lidar.tools.view.sweeps import ANGLE_STEP, RANGE_STEP, TIME_STEP_NS

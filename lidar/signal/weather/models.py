@@ -1,4 +1,7 @@
-"""Fog (Hahner et al., ICCV 2021) and snowfall (Hahner et al., CVPR 2022) on measured returns."""
+"""Published models of weather on measured returns.
+
+LISA (Kilic et al. 2021), Goodin et al. 2019; fog of Hahner et al. (ICCV 2021), snowfall (CVPR 2022).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,137 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.signal.weather.lisa import SCATTERED, TARGET, RemainingReturns
+from lidar.signal.weather.media import ice_index, rain_slope, snow_slope, water_index
+
+LOST, SCATTERED, TARGET = 0, 1, 2
+
+_LEAST_DIAMETER = 0.05  # mm
+_TAIL = 28.0  # slopes of diameter beyond which a particle is met once in 10^12
+
+
+@dataclass(frozen=True, slots=True)
+class Lidar:
+    """The scanner of a model; the defaults are LISA's.
+
+    wavelength_nm : nanometres
+    max_range     : metres at which a target of the reflectance 0.9 is just seen in clear air
+    min_range     : metres from which on particles are seen
+    divergence    : radians
+    accuracy      : metres, of a return at the threshold
+    last          : reports the last return rather than the strongest
+    """
+
+    wavelength_nm: float = 905.0
+    max_range: float = 200.0
+    min_range: float = 1.5
+    divergence: float = 3e-3
+    accuracy: float = 0.09
+    last: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RemainingReturns:
+    """Returns of a cloud that remain after a weather model.
+
+    state       : (n,) uint8, LOST, SCATTERED or TARGET
+    range       : (n,) metres
+    reflectance : (n,) as measured
+    """
+
+    state: NDArray[np.uint8]
+    range: Float
+    reflectance: Float
+
+
+def particle_count(rate: float, distance: Float, *, kind: str = "rain", lidar: Lidar) -> Float:
+    """Mean number (n,) of particles in beams that end at distances in metres."""
+    n0, slope = rain_slope(rate) if kind == "rain" else snow_slope(rate)
+    density = n0 / slope * np.exp(-slope * _LEAST_DIAMETER)
+    volume = pi / 3 * distance * (distance * np.tan(lidar.divergence) / 2) ** 2
+    count: Float = density * volume
+    return count
+
+
+def lisa(
+    distance: Float,
+    reflectance: Float,
+    *,
+    kind: str,
+    rate: float,
+    extinction: float,
+    rng: np.random.Generator,
+    lidar: Lidar,
+) -> RemainingReturns:
+    """The returns in rain or snow (rate in mm/h) or fog, which only dims.
+
+    A particle matters only if it returns more than the threshold, which it cannot beyond a distance; so of
+    the particles of a beam only those nearer than that are drawn.
+    """
+    threshold = 0.9 / lidar.max_range**2
+    power = reflectance * np.exp(-2 * extinction * distance) / distance**2
+    seen = power >= threshold
+    sigma = lidar.accuracy / np.sqrt(2 * np.maximum(power / threshold, 1.0))
+    noisy = distance + sigma * rng.standard_normal(len(distance))
+    measured = reflectance * np.exp(-2 * extinction * distance)
+    best, place, bright = np.zeros((3, len(distance)))
+    if kind in ("rain", "snow"):
+        best, place, bright = _chosen_particles(
+            distance, kind=kind, rate=rate, extinction=extinction, rng=rng, lidar=lidar
+        )
+    hit = (best > threshold) & (~seen if lidar.last else (best > power))
+    state = np.where(hit, SCATTERED, np.where(seen, TARGET, LOST)).astype(np.uint8)
+    return RemainingReturns(state, np.where(hit, place, noisy), np.where(hit, bright, measured))
+
+
+def _chosen_particles(
+    distance: Float, *, kind: str, rate: float, extinction: float, rng: np.random.Generator, lidar: Lidar
+) -> tuple[Float, Float, Float]:
+    """Power, range and reflectance (n,) of the particle that each beam reports; power 0 for none."""
+    slope = (rain_slope(rate) if kind == "rain" else snow_slope(rate))[1]
+    n = (water_index if kind == "rain" else ice_index)(lidar.wavelength_nm).real
+    fresnel = ((n - 1) / (n + 1)) ** 2
+    threshold = 0.9 / lidar.max_range**2
+    largest = (_LEAST_DIAMETER + _TAIL / slope) / 1000
+    wide = np.tan(lidar.divergence)
+    cut = min((fresnel / threshold) ** 0.5, (fresnel * (largest / wide) ** 2 / threshold) ** 0.25)
+    mean = particle_count(rate, distance, kind=kind, lidar=lidar)
+    whole = np.floor(mean + rng.random(len(mean))).astype(np.int64)
+    near = np.minimum(distance, cut)
+    count = rng.binomial(whole, (near / distance) ** 3)
+    beam = np.repeat(np.arange(len(distance)), count)
+    r = near[beam] * np.cbrt(rng.random(len(beam)))
+    diameter = (_LEAST_DIAMETER + rng.standard_exponential(len(beam)) / slope) / 1000
+    share = np.minimum((diameter / np.maximum(r * wide, 1e-12)) ** 2, 1.0)
+    bright = fresnel * np.exp(-2 * extinction * r) * share
+    power = np.where(r > lidar.min_range, bright / np.maximum(r, 1e-6) ** 2, 0.0)
+    usable = power > threshold
+    beam, r, bright, power = beam[usable], r[usable], bright[usable], power[usable]
+    order = np.lexsort((r if lidar.last else power, beam))
+    final = order[np.append(beam[order][1:] != beam[order][:-1], True)] if len(order) else order
+    chosen = np.zeros((3, len(distance)))
+    chosen[:, beam[final]] = power[final], r[final], bright[final]
+    return chosen[0], chosen[1], chosen[2]
+
+
+def goodin(
+    distance: Float, reflectance: Float, *, rate: float, rng: np.random.Generator, max_range: float = 100.0
+) -> RemainingReturns:
+    """The returns in rain by Goodin et al. 2019: extinction 0.01 R^0.6 and noise that grows with range.
+
+    The extinction was fitted to lost returns; that of the air is about 25 times less.
+    """
+    extinction = goodin_extinction(rate)
+    dimmed = reflectance * np.exp(-2 * extinction * distance)
+    seen = dimmed / pi / distance**2 > 0.9 / (pi * max_range**2)
+    sigma = 0.02 * distance * (1 - np.exp(-rate)) ** 2
+    noisy = distance + sigma * rng.standard_normal(len(distance))
+    return RemainingReturns(np.where(seen, TARGET, LOST).astype(np.uint8), noisy, dimmed)
+
+
+def goodin_extinction(rate: float) -> float:
+    """Extinction of Goodin's rain, 1/m; rate in mm/h."""
+    return 0.01 * math.pow(rate, 0.6)
+
 
 _LIGHT = 0.299792458  # metres per nanosecond
 _MOR = log(20)  # optical depth of the meteorological optical range
@@ -30,22 +163,12 @@ _WAVEFORM_END = 120.0  # metres
 _SAME = 0.2  # metres within which the return is still the target's
 
 
-@dataclass(frozen=True, slots=True)
-class FogResponse:
-    """The soft response of fog, by the range of the target.
+def fog_response(extinction: float) -> tuple[Float, Float, Float]:
+    """The maximum over R of the integral of the pulse with the fog before the target, for all targets.
 
-    target   : (k,) metres, ascending; beyond the last row nothing changes
-    range    : (k,) metres of the fog's return
-    integral : (k,) s/m^2, maximum of the integral over the pulse
+    Ranges (k,) of the target in metres, ascending, beyond the last of which nothing changes; ranges (k,) of
+    the fog's return; and the integral (k,), s/m^2.
     """
-
-    target: Float
-    range: Float
-    integral: Float
-
-
-def fog_response(extinction: float) -> FogResponse:
-    """The maximum over R of the integral of the pulse with the fog before the target, for all targets."""
     step = 0.01
     r = step * np.arange(1, 3001)
     ramp = np.clip((r - 0.9) / 0.1, 0, 1)
@@ -60,7 +183,7 @@ def fog_response(extinction: float) -> FogResponse:
         response = np.convolve(sent_back[r <= end], pulse)[:: round(0.1 / step)]
         peak = int(np.argmax(response))
         found[:, row] = r[0] + 0.1 * peak - length / 2, response[peak]
-    return FogResponse(target, found[0], found[1])
+    return target, found[0], found[1]
 
 
 def hahner_fog(
@@ -71,13 +194,13 @@ def hahner_fog(
     intensity : (n,) codes 0 to 255
     rng       : for the spread of the fog's returns, 10 m times Beta(2, 20) beyond them; None for none
     """
-    response = fog_response(extinction)
-    row = np.clip(np.searchsorted(response.target, distance), 0, len(response.target) - 1)
+    target, fog, integral = fog_response(extinction)
+    row = np.clip(np.searchsorted(target, distance), 0, len(target) - 1)
     ratio = _BACKSCATTER * extinction / _MOR / (_DIFFERENTIAL_REFLECTIVITY / pi)
-    soft = np.minimum(intensity * distance**2 * ratio * response.integral[row], 255.0)
+    soft = np.minimum(intensity * distance**2 * ratio * integral[row], 255.0)
     hard = np.round(intensity * np.exp(-2 * extinction * distance))
     replaced = soft > hard
-    place = response.range[row]
+    place = fog[row]
     if rng is not None:
         place = place + 10 * rng.beta(2, 20, len(distance))
     replaced &= place < distance

@@ -1,17 +1,24 @@
 """What drives use of the relief of a scene: all of it, none, or what plain relief has."""
 
+import gc
+import threading
+import time
+import weakref
+
 import numpy as np
 import pytest
 
+from geoscene.classes import Class
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.relief import RELIEFS
 from geoscene.sources import demo_path, read_osm
+from geoscene.sources.data import OsmData, TaggedNode, Way
 from lidar.errors import InputError
 from lidar.options import DriveOptions
 from lidar.simulation.plan import plan_drive
 from lidar.world.settings import WorldSettings
-from lidar.world.tile_selection import selected_tile
+from lidar.world.tiles import SharedTiles, selected_tile
 from lidar.world.world import World
 
 BOX = (24.9405, 60.1655, 24.9440, 60.1675)
@@ -89,3 +96,52 @@ def test_the_option_is_short_for_the_setting_and_in_no_other_way_part_of_the_rec
         DriveOptions(relief="plain", settings=(("relief", "off"),), **given)
     with pytest.raises(InputError, match="relief = 'rough' is none of scene, off, plain, full, mesh"):
         DriveOptions(relief="rough", **given)
+
+
+class _Value:
+    pass
+
+
+def test_a_tile_is_loaded_again_only_when_no_one_holds_it():
+    shared = SharedTiles()
+    held = shared.get("a", _Value)
+    assert shared.get("a", _Value) is held
+    shared.keep([held])
+    known = weakref.ref(held)
+    del held
+    gc.collect()
+    assert shared.get("a", _Value) is known()
+    shared.keep([])
+    gc.collect()
+    assert known() is None
+
+
+def test_threads_load_a_tile_once():
+    shared = SharedTiles()
+    made = []
+
+    def make():
+        time.sleep(0.05)
+        made.append(_Value())
+        return made[-1]
+
+    threads = [threading.Thread(target=shared.get, args=("a", make)) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(made) == 1
+
+
+def test_leaves_let_rays_pass_and_limbs_do_not(tmp_path):
+    """A crown holds leaf clusters and limbs; only the faces of clusters have leaves behind them."""
+    road = Way("way/1", {"highway": "residential"}, np.arange(2), np.array([[11.0, 50.0], [11.001, 50.0]]))
+    tree = TaggedNode("node/9", {"natural": "tree"}, 11.0005, 50.0002)
+    osm = OsmData((11.0, 49.9995, 11.001, 50.0005), [road], [], [tree], [])
+    scene = build(osm, tmp_path / "scene", options=BuildOptions(relief="plain"))
+    world = World.load(scene)
+    faces = world.faces
+    klass, leaves = (faces.packed >> 8) & 255, faces.leaves[(faces.packed >> 16) & 255]
+    assert (leaves[klass == Class.TREE_CROWN] > 1.0).sum() > 1000
+    assert (leaves[klass == Class.TREE_CROWN] > 0).all()
+    assert (leaves[klass == Class.TRUNK] == 0).all()
