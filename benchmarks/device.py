@@ -26,7 +26,7 @@ import numpy as np
 from geoscene.errors import SceneFormatError, need
 from geoscene.scene import Scene, open_scene
 from lidar import DriveOptions, drive
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast.device import WARP_CPU, device
 from lidar.raycast.hits import Hits

@@ -28,11 +28,10 @@ from geoscene.scene import open_scene
 from lidar.options import DriveOptions
 from lidar.sensors.rig.devices import Camera
 from lidar.simulation.frame_loop import chunks
-from lidar.simulation.measured import MeasuredImages
 from lidar.simulation.plan import plan_drive
 from lidar.simulation.record_images import measure_images
-from lidar.simulation.recording import Recording
-from lidar.traffic.populate import TrafficOptions
+from lidar.simulation.recording import MeasuredImages, Recording
+from lidar.traffic.options import TrafficOptions
 from lidar.world.world import Worlds
 
 GROUND = (

@@ -16,7 +16,7 @@ import numpy as np
 
 from geoscene.options import RELIEFS
 from geoscene.scene import open_scene
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.options import DriveOptions
 from lidar.sensors.camera.light import sun_direction

@@ -15,17 +15,16 @@ from geoscene.scene.geopackage import read_layer
 from geoscene.scene.layout import SceneFiles, open_scene
 from geoscene.scene.tile_files import read_shapes, read_tile
 from geoscene.sources import read_osm, read_source
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.checksums import differences, read_checksums
 from lidar.dataset.formats import FORMATS, MAPS, format_of, read_table
 from lidar.dataset.formats.table import rows
+from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset, read_rows, read_sensors
 from lidar.dataset.png import read_png
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import FormatError
-from lidar.geometry.trajectory_tum import read_tum
+from lidar.geometry.trajectory_files import read_tum
 from lidar.motion.replay import read_replay
 from lidar.motion.vehicle import load_vehicle
 from lidar.motion.waypoints import read_track

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.scene import open_scene
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.sensors.camera.render import render
 from lidar.sensors.camera.settings import CameraSettings

@@ -1,10 +1,10 @@
-"""Time and size of ROS 2 recordings of a drive, against rosbags alone with the same messages in memory.
+"""Time and size of ROS 2 recordings (MCAP), against rosbags alone with the same messages in memory.
 
     python benchmarks/ros_export.py DRIVE --repetitions 5
 
 Both sides write every message of the drive, by turns: once uncounted, then in each repetition beginning with
 the other side. The export reads the drive's files and makes the messages one after the other; for rosbags
-they are made before, and it encodes and writes them with the same storage and compression.
+they are made before, and it encodes and writes them with the same compression.
 
 MB/s     encoded messages, 10^6 bytes, over CPU time
 points/s points of clouds over CPU time
@@ -27,9 +27,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from geoscene.support.progress import silent
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.layouts import ros2
-from lidar.dataset.layouts.ros_drive import RosDrive, Topic
 from lidar.dataset.layouts.ros_messages import encode, typestore
-from lidar.dataset.layouts.ros_topics import topics_of
+from lidar.dataset.layouts.ros_topics import RosDrive, Topic, topics_of
 
 Messages = list[tuple[int, int, Any]]
 
@@ -41,11 +40,10 @@ def in_memory(dataset: Dataset) -> tuple[list[Topic], Messages]:
     return topics, [(drive.stamp(time_ns), k, make()) for time_ns, k, make in ros2.merge_messages(topics)]
 
 
-def write_alone(folder: Path, topics: list[Topic], *, messages: Messages, storage: str) -> None:
+def write_alone(folder: Path, topics: list[Topic], *, messages: Messages) -> None:
     """Write messages by rosbags alone."""
-    bag = Writer(folder / "drive", version=8, storage_plugin=StoragePlugin[storage])
-    if storage == "MCAP":
-        bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    bag = Writer(folder / "drive", version=8, storage_plugin=StoragePlugin.MCAP)
+    bag.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
     store = typestore()
     with bag:
         connections = [bag.add_connection(t.name, t.kind, typestore=store) for t in topics]
@@ -75,27 +73,22 @@ def main(arguments: list[str] | None = None) -> None:
     volume = sum(len(encode(message)) for _, _, message in messages)
     points = sum(message.width for _, k, message in messages if topics[k].kind.endswith("PointCloud2"))
     print(f"{len(messages):,} messages, {volume / 1e6:.1f} MB, {points:,} points")
-    for storage in ("MCAP", "SQLITE3"):
-        sides: dict[str, Callable[[Path], object]] = {
-            "export": lambda folder, kind=storage: ros2.write_recording(
-                dataset, folder, storage=kind, progress=silent
-            ),
-            "rosbags": lambda folder, kind=storage: write_alone(
-                folder, topics, messages=messages, storage=kind
-            ),
-        }
-        seconds: dict[str, list[float]] = {name: [] for name in sides}
-        sizes = {name: measured(side)[1] for name, side in sides.items()}
-        for repetition in range(given.repetitions):
-            for name in list(sides)[:: -1 if repetition % 2 == 0 else 1]:
-                seconds[name].append(measured(sides[name])[0])
-        for name, spent in seconds.items():
-            middle = statistics.median(spent)
-            print(
-                f"{storage:8}{name:9}{middle:7.2f} s ({min(spent):.2f} to {max(spent):.2f})"
-                f"{volume / middle / 1e6:8.1f} MB/s{points / middle:12,.0f} points/s"
-                f"{sizes[name] / max(points, 1):8.2f} B/point"
-            )
+    sides: dict[str, Callable[[Path], object]] = {
+        "export": lambda folder: ros2.write_recording(dataset, folder, progress=silent),
+        "rosbags": lambda folder: write_alone(folder, topics, messages=messages),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in sides}
+    sizes = {name: measured(side)[1] for name, side in sides.items()}
+    for repetition in range(given.repetitions):
+        for name in list(sides)[:: -1 if repetition % 2 == 0 else 1]:
+            seconds[name].append(measured(sides[name])[0])
+    for name, spent in seconds.items():
+        middle = statistics.median(spent)
+        print(
+            f"{name:9}{middle:7.2f} s ({min(spent):.2f} to {max(spent):.2f})"
+            f"{volume / middle / 1e6:8.1f} MB/s{points / middle:12,.0f} points/s"
+            f"{sizes[name] / max(points, 1):8.2f} B/point"
+        )
 
 
 if __name__ == "__main__":

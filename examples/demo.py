@@ -37,7 +37,7 @@ from lidar.tools.maps.picture import (
     with_legend,
 )
 from lidar.tools.plots.scene_picture import scene_picture
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 from lidar.world.world import World
 
 ROUTE = ((60.16765, 24.94750), (60.16640, 24.94350))

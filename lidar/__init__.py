@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from lidar.tools.maps.aggregate import aggregate as aggregate
     from lidar.tools.training_data import TrainingData as TrainingData
     from lidar.tools.training_data import training_data as training_data
-    from lidar.traffic.populate import TrafficOptions as TrafficOptions
+    from lidar.traffic.options import TrafficOptions as TrafficOptions
 
 _HOMES = {
     "Dataset": "dataset.layout",
@@ -35,7 +35,7 @@ _HOMES = {
     "DriveOptions": "options",
     "MapOptions": "options",
     "Simulation": "simulation.frames",
-    "TrafficOptions": "traffic.populate",
+    "TrafficOptions": "traffic.options",
     "TrainingData": "tools.training_data",
     "aggregate": "tools.maps.aggregate",
     "convert": "tools.convert",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
@@ -25,19 +25,18 @@ from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
 from lidar.geometry.time_scales import LONGEST_S
-from lidar.grammar import split_pairs
+from lidar.parameters import split_pairs
 from lidar.sensors.rig.specs import PRESETS
 
 if TYPE_CHECKING:
     from geoscene.pipeline.reach import RoadMap
     from geoscene.scene import Scene
-    from lidar.motion.road_conditions import RoadConditions
     from lidar.motion.route import Side, Spec
+    from lidar.motion.vehicle import RoadConditions
     from lidar.settings import RecordingSettings
     from lidar.signal.registry import NamedStage
     from lidar.signal.weather.setting import WeatherSetting
-    from lidar.traffic.fcd import TrafficFile
-    from lidar.traffic.populate import TrafficOptions
+    from lidar.traffic.options import TrafficFile, TrafficOptions
 
     Traffic = TrafficOptions | TrafficFile
     StageList = tuple[NamedStage, ...]
@@ -79,6 +78,9 @@ METHODS = ("kiss-icp", "genz-icp", "small_gicp", "orb", "orb+depth", "stereo", "
 
 FUSE = ("harmonic", "max", "fisher", "none")
 """Verdicts of several defences together."""
+
+ALIGNMENTS = ("none", "origin", "se3", "sim3", "yaw-position")
+"""Motions of an estimated trajectory onto the true one."""
 
 ECHOES = ("all", "first", "last", "single")
 """Echoes of a pulse that a map can be made of."""
@@ -169,6 +171,36 @@ def _outliers(_: object, tokens: Sequence[Token]) -> tuple[int, float]:
         raise ValueError(f"{text}: give a number of neighbours and a factor, such as 16,2") from None
 
 
+def _check_words(options: object, **known: Collection[str]) -> None:
+    """Raise InputError if an option, or a word of it, is not among the known words by its name."""
+    for name, words in known.items():
+        value = getattr(options, name)
+        for word in (value,) if isinstance(value, str) else value:
+            if word not in words:
+                raise InputError(unknown_name(f"`{name}`", word, known=[one for one in words if one]))
+
+
+def _check_whole(options: object, **bounds: tuple[int, int]) -> None:
+    """Raise InputError if an option is not within its bounds, both allowed."""
+    for name, (low, high) in bounds.items():
+        if not low <= getattr(options, name) <= high:
+            raise InputError(f"`{name}` {getattr(options, name)}: give {low} to {high}")
+
+
+def _check_positive(options: object, **units: str) -> None:
+    """Raise InputError if an option that is given is not positive and finite; ``units`` follow "number"."""
+    for name, unit in units.items():
+        value = getattr(options, name)
+        if value is not None and not 0 < value < math.inf:
+            raise InputError(f"`{name}` {value:g}: give a positive number{unit}")
+
+
+def _check_seed(seed: int) -> None:
+    """Raise InputError for a seed that random number generators do not take."""
+    if not 0 <= seed < 1 << 63:
+        raise InputError(f"`seed` {seed}: give a non-negative integer")
+
+
 def _lower(_: object, tokens: Sequence[Token]) -> str:
     return tokens[0].value.lower()
 
@@ -225,7 +257,7 @@ def with_stage_settings(
 
 
 def _traffic(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.traffic.read import read_traffic  # noqa: PLC0415
+    from lidar.traffic.options import read_traffic  # noqa: PLC0415
 
     return read_traffic(tokens[0].value)
 
@@ -371,25 +403,20 @@ class DriveOptions:
                 f"`duration` {self.duration}: give 0.1 to {LONGEST_S:.0f} seconds (four hours), and record"
                 " several drives for more"
             )
-        if self.side not in ("", "left", "right"):
-            raise InputError(unknown_name("`side`", self.side, known=("left", "right")))
-        if not 1 <= self.workers <= 256:
-            raise InputError(f"`workers` {self.workers}: give 1 to 256")
-        if not 0 <= self.seed < 1 << 63:
-            raise InputError(f"`seed` {self.seed}: give a non-negative integer")
+        _check_words(self, side=("", "left", "right"), road=_ROADS)
+        _check_whole(self, workers=(1, 256))
+        _check_seed(self.seed)
         if self.altitude is not None and not 0 < self.altitude <= 20_000:
             raise InputError(f"`altitude` {self.altitude:g}: give metres above the ground, up to 20000")
         if not 0 <= self.overlap < 1:
             raise InputError(f"`overlap` {self.overlap:g}: give a share from 0 to less than 1")
-        if self.road not in _ROADS:
-            raise InputError(unknown_name("`road`", self.road, known=_ROADS))
         if self.road == "by-weather" and not self._weather():
             raise InputError("`road` by-weather: give `weather`, too")
         _ = self.recording_settings
 
     def road_conditions(self) -> RoadConditions:
         """Grip and visibility that vehicles drive with."""
-        from lidar.motion.road_conditions import ROADS  # noqa: PLC0415
+        from lidar.motion.vehicle import ROADS  # noqa: PLC0415
 
         if self.road != "by-weather":
             return ROADS[self.road]
@@ -399,7 +426,6 @@ class DriveOptions:
         return road_conditions(self._weather(), wetness=ground.wetness, snow=ground.snow)
 
     def _weather(self) -> tuple[WeatherSetting, ...]:
-        """Weather among the stages."""
         from lidar.signal.weather.setting import WeatherSetting  # noqa: PLC0415
 
         stages = (named.stage for named in self.all_stages)
@@ -667,15 +693,8 @@ class TradeoffOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name, low, high in (
-            ("frames", 2, 1000),
-            ("pulses", 100, 10**7),
-            ("pixels", 256, 10**7),
-            ("reference_rays", 7, 665),
-            ("repetitions", 3, 100),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"`{name}` {getattr(self, name)}: give {low} to {high}")
+        _check_whole(self, frames=(2, 1000), pulses=(100, 10**7), pixels=(256, 10**7))
+        _check_whole(self, reference_rays=(7, 665), repetitions=(3, 100))
 
 
 @Parameter(name="*")
@@ -755,13 +774,8 @@ class MapOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name, known in (("color", COLORS), ("echo", ECHOES), ("tile_format", TILE_FORMATS)):
-            if getattr(self, name) not in known:
-                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
-        for name in ("voxel", "resolution"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"`{name}` {value}: give a positive number of metres")
+        _check_words(self, color=COLORS, echo=ECHOES, tile_format=TILE_FORMATS)
+        _check_positive(self, voxel=" of metres", resolution=" of metres")
         if self.outliers is not None:
             neighbours, factor = self.outliers
             if not (1 <= neighbours <= MOST_NEIGHBOURS and 0 <= factor < math.inf):
@@ -773,9 +787,7 @@ class MapOptions:
             raise InputError(f"`tiles` {self.tiles}: give 1 to {LARGEST_TILE} metres")
         classes_of(self.without)
         classes_of(self.only, option="only")
-        for name, words in (("origin", ORIGINS), ("raster", RASTERS)):
-            if unknown := [word for word in getattr(self, name) if word not in words]:
-                raise InputError(unknown_name(f"`{name}`", unknown[0], known=words))
+        _check_words(self, origin=ORIGINS, raster=RASTERS)
         if self.poses != "truth" and not self.poses.lower().endswith(".tum"):
             raise InputError(
                 f"`poses` {self.poses}: give truth or FILE.tum; lidar odometry --method fused writes"
@@ -828,22 +840,35 @@ class OdometryOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.method not in METHODS:
-            raise InputError(unknown_name("`method`", self.method, known=METHODS))
         others = [name for name in METHODS if name != "fused"]
-        if self.relative not in ("", "none", *others):
-            raise InputError(unknown_name("`relative`", self.relative, known=["none", *others]))
-        if self.imu_grade not in ("", *PRESETS):
-            raise InputError(unknown_name("`imu_grade`", self.imu_grade, known=PRESETS))
+        _check_words(self, method=METHODS, relative=("", "none", *others), imu_grade=("", *PRESETS))
         if self.method != "fused" and (self.relative or self.imu_grade):
             raise InputError("`relative` and `imu_grade` are for the `method` fused")
         if self.method == "fused" and self.start_pose is not None:
             raise InputError("`start_pose`: fused begins where the fixes are; leave it out")
 
 
+class _OfFrames:
+    """Base of options with ``frames``, a text FIRST:END."""
+
+    __slots__ = ()
+    frames: str
+
+    @property
+    def limits(self) -> tuple[int, float]:
+        """The first frame, and the one after the last; infinity for all further ones.
+
+        Raises InputError for another text.
+        """
+        if not re.fullmatch(r"(\d*:\d*)?", self.frames):
+            raise InputError(f"`frames` {self.frames}: give FIRST:END, such as 100:200, 100: or :200")
+        first, _, end = self.frames.partition(":")
+        return int(first or 0), int(end) if end else math.inf
+
+
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class PlaybackOptions:
+class PlaybackOptions(_OfFrames):
     """Options of the page that plays a drive."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
@@ -865,18 +890,12 @@ class PlaybackOptions:
         _ = self.limits
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
-        if not 0 < self.max_mb < math.inf:
-            raise InputError(f"`max_mb` {self.max_mb:g}: give a positive number of megabytes")
-
-    @property
-    def limits(self) -> tuple[int, float]:
-        """The first frame, and the one after the last; infinity for all further ones."""
-        return frame_limits(self.frames)
+        _check_positive(self, max_mb=" of megabytes")
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class PlotOptions:
+class PlotOptions(_OfFrames):
     """Options of a figure of a dataset."""
 
     sensor: str = ""
@@ -892,18 +911,12 @@ class PlotOptions:
     def __post_init__(self) -> None:
         """Validate the options."""
         _ = self.limits
-        if self.resolution is not None and not 0 < self.resolution < math.inf:
-            raise InputError(f"`resolution` {self.resolution:g}: give a positive number of metres")
-
-    @property
-    def limits(self) -> tuple[int, float]:
-        """The first frame, and the one after the last; infinity for all further ones."""
-        return frame_limits(self.frames)
+        _check_positive(self, resolution=" of metres")
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
-class FilmOptions:
+class FilmOptions(_OfFrames):
     """Options of a film of a dataset."""
 
     show: Annotated[str, Parameter(converter=_lower)] = "all"
@@ -934,34 +947,15 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name, known in (("show", SHOWN), ("view", FILM_VIEWS), ("color", FILM_COLORS)):
-            if getattr(self, name) not in known:
-                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
+        _check_words(self, show=SHOWN, view=FILM_VIEWS, color=FILM_COLORS)
         _ = self.limits
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
-        if not 0 < self.speed < math.inf:
-            raise InputError(f"`speed` {self.speed:g}: give a positive number")
+        _check_positive(self, speed="")
         if any(side % 2 or not 160 <= side <= 8192 for side in self.size):
             raise InputError(
                 f"`size` {self.size[0]}x{self.size[1]}: give even numbers of pixels from 160 to 8192"
             )
-
-    @property
-    def limits(self) -> tuple[int, float]:
-        """The first frame, and the one after the last; infinity for all further ones."""
-        return frame_limits(self.frames)
-
-
-def frame_limits(text: str) -> tuple[int, float]:
-    """The first frame of ``FIRST:END``, and the one after the last; infinity for all further ones.
-
-    Raises InputError for another text.
-    """
-    if not re.fullmatch(r"(\d*:\d*)?", text):
-        raise InputError(f"`frames` {text}: give FIRST:END, such as 100:200, 100: or :200")
-    first, _, end = text.partition(":")
-    return int(first or 0), int(end) if end else math.inf
 
 
 @Parameter(name="*")
@@ -993,12 +987,7 @@ class EvaluateOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        for name, known in (
-            ("align", ("none", "origin", "se3", "sim3", "yaw-position")),
-            ("associate", ("interpolated", "nearest")),
-        ):
-            if getattr(self, name) not in known:
-                raise InputError(unknown_name(f"`{name}`", getattr(self, name), known=known))
+        _check_words(self, align=ALIGNMENTS, associate=("interpolated", "nearest"))
         if self.max_gap is not None and not 0 <= self.max_gap < math.inf:
             raise InputError(f"`max_gap` {self.max_gap:g}: give seconds, 0 or more")
         for word in self.delta:
@@ -1077,12 +1066,10 @@ class DefendOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
-        if self.fuse not in FUSE:
-            raise InputError(unknown_name("`fuse`", self.fuse, known=FUSE))
+        _check_words(self, fuse=FUSE)
         if self.calibrate and (self.fuse != "harmonic" or self.calibration is not None):
             raise InputError("`calibrate`: leave out `fuse` and `calibration`")
-        if not 0 <= self.seed < 1 << 63:
-            raise InputError(f"`seed` {self.seed}: give a non-negative integer")
+        _check_seed(self.seed)
 
 
 @Parameter(name="*")

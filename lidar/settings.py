@@ -7,11 +7,10 @@ from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 from geoscene.support.registry import unknown_name
-from lidar.dataset.deskew import MOMENTS
 from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
+from lidar.dataset.formats.table import MOMENTS
 from lidar.errors import InputError
-from lidar.grammar import value_text
-from lidar.parameters import describe, parameter_rows, read_values
+from lidar.parameters import describe, parameter_rows, read_values, value_text
 from lidar.sensors.camera import settings as camera_settings
 from lidar.sensors.camera.settings import PLAIN as PLAIN_CAMERA
 from lidar.sensors.camera.settings import CameraSettings
@@ -23,24 +22,6 @@ from lidar.world.settings import PLAIN as PLAIN_WORLD
 from lidar.world.settings import WorldSettings
 
 S = TypeVar("S", ScannerSettings, CameraSettings, WorldSettings)
-
-
-@dataclass(frozen=True, slots=True)
-class SettingDescription:
-    """One setting as `list_settings` describes it.
-
-    name    : field of `ScannerSettings`, `CameraSettings` or `WorldSettings`
-    of      : lidar, camera or world
-    values  : as text, at each of `levels`
-    unit    : empty for counts, shares, factors, words and switches
-    meaning : one line
-    """
-
-    name: str
-    of: str
-    values: tuple[str, ...]
-    unit: str
-    meaning: str
 
 
 def levels() -> tuple[str, ...]:
@@ -85,14 +66,20 @@ def _at(level: str) -> Settings:
     return scanner_settings.LEVELS[level], camera_settings.LEVELS[level], WorldSettings()
 
 
-def list_settings() -> list[SettingDescription]:
-    """All settings, those of scanners first, with their values at each level."""
+def setting_rows() -> list[dict[str, str]]:
+    """Name, group (lidar, camera or world), value at each level as text, unit and meaning of all settings.
+
+    Units are empty for counts, shares, factors, words and switches.
+    """
     at_levels = [_at(level) for level in levels()]
     found = []
     for of, groups in zip(_OF, zip(*at_levels, strict=True), strict=True):
         for row in parameter_rows(type(groups[0])):
-            values = tuple(value_text(getattr(group, row["name"])) for group in groups)
-            found.append(SettingDescription(row["name"], of, values, row.get("unit", ""), describe(row)))
+            values = [value_text(getattr(group, row["name"])) for group in groups]
+            at = dict(zip(levels(), values, strict=True))
+            found.append(
+                {"name": row["name"], "of": of, **at, "unit": row.get("unit", ""), "meaning": describe(row)}
+            )
     return found
 
 

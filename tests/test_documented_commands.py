@@ -35,7 +35,7 @@ from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
 from lidar.tools.tradeoff.bench import coarse
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 APPS = {"geoscene": geoscene.cli.app, "lidar": lidar.cli.app}
 ONLY_PARSED = {
@@ -165,8 +165,8 @@ def folder(inputs, tmp_path, monkeypatch):
         options = options if options.survey else replace(options, duration=0.2, relief=relief)
         return drive(scene, out, options=options, **more)
 
-    def first(recording, jobs, **more):
-        record_all(recording, jobs[:20], **more)
+    def first(plan, jobs, **more):
+        record_all(plan, jobs[:20], **more)
 
     compare = lidar.tools.tradeoff.compare.compare_settings
 

@@ -8,10 +8,10 @@ from geoscene.support.console import main as run
 from lidar.cli.data import apply, convert, denoise, map_, odometry
 from lidar.cli.drives import drive, redteam, sweep, tradeoff
 from lidar.cli.evaluation import detect, evaluate
-from lidar.cli.lists import classes, rigs, selftest, sensors, settings, stages
+from lidar.cli.lists import classes, defences, rigs, selftest, sensors, settings, stages
 from lidar.cli.look import animate, info, plot, view
 from lidar.cli.program import app
-from lidar.cli.security import defences, defend, sign, train, verify
+from lidar.cli.security import defend, sign, train, verify
 from lidar.errors import InputError, LidarError
 
 __all__ = ["app", "main"]

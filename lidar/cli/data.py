@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from geoscene.support.console import Report, note_new_folder, print_json, progress_bar
-from lidar.cli.program import Out, Reporting, print_effects
+from lidar.cli.program import Out, Reporting, print_effects, show
 from lidar.dataset.formats import map_suffixes
 from lidar.options import OUTPUT, ApplyOptions, ConvertOptions, DenoiseOptions, MapOptions, OdometryOptions
 
@@ -153,12 +153,9 @@ def convert(
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         summary = converted(dataset, out, to=options.to, overwrite=report.overwrite, progress=progress)
-    if report.json:
-        print_json({"path": str(out), **summary.counts})
-    else:
-        counts = ", ".join(f"{count:,} {kind}" for kind, count in summary.counts.items())
-        print(f"{out}: {counts}; {summary.hint}")
-    return 0
+    counts = ", ".join(f"{count:,} {kind}" for kind, count in summary.counts.items())
+    document = {"path": str(out), **summary.counts}
+    return show(document, f"{out}: {counts}; {summary.hint}", json=report.json)
 
 
 def apply(
@@ -238,11 +235,7 @@ def denoise(
         note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         found = denoised(dataset, methods, out=out, overwrite=report.overwrite, progress=progress)
-    if report.json:
-        print_json(found.to_json())
-    else:
-        print(found.table().to_text())
-    return 0
+    return show(found.to_json(), found.table().to_text(), json=report.json)
 
 
 def odometry(
@@ -283,11 +276,6 @@ def odometry(
             dataset, out, options=options, overwrite=report.overwrite, progress=progress
         )
     found = summary.to_json()
-    if report.json:
-        print_json({"path": str(out), **found})
-    else:
-        print(
-            f"{out}: {found['poses']} poses by {options.method}, {summary.length_m:.1f} m,"
-            f" in {summary.seconds:.1f} s"
-        )
-    return 0
+    figures = f"{found['poses']} poses by {options.method}, {summary.length_m:.1f} m"
+    text = f"{out}: {figures}, in {summary.seconds:.1f} s"
+    return show({"path": str(out), **found}, text, json=report.json)

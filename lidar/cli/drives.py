@@ -316,7 +316,7 @@ def tradeoff(
     from lidar.simulation.scene_source import open_scene_or_map  # noqa: PLC0415
     from lidar.tools.tradeoff.compare import compare_settings  # noqa: PLC0415
     from lidar.tools.tradeoff.report import document, to_text, write_report  # noqa: PLC0415
-    from lidar.traffic.populate import TrafficOptions  # noqa: PLC0415
+    from lidar.traffic.options import TrafficOptions  # noqa: PLC0415
 
     options = options or DriveOptions()
     options.check_course()

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from geoscene.support.console import Report, command_line, note_new_folder, print_json, progress_bar
-from lidar.cli.program import Out, Reporting
+from geoscene.support.console import Report, command_line, note_new_folder, progress_bar
+from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions
 
@@ -66,21 +66,14 @@ def evaluate(
             with report_folder(out, overwrite=report.overwrite) as folder:
                 found = evaluate_trajectory(estimate, against, options=options, out=folder, progress=progress)
                 write_trajectory_report(found, folder, estimate=estimate)
-    if report.json:
-        print_json(found.errors.to_json())
-        return 0
-    print(method_of(found.errors))
-    for table in trajectory_tables(found.errors):
-        print(f"\n{table.to_text()}")
-    if out is not None:
-        print(f"\n{out}: evaluation.html, figures and tables")
-    return 0
+    parts = [method_of(found.errors), *(table.to_text() for table in trajectory_tables(found.errors))]
+    parts += [] if out is None else [f"{out}: evaluation.html, figures and tables"]
+    return show(found.errors.to_json(), "\n\n".join(parts), json=report.json)
 
 
 def _evaluate_objects(
     estimate: Path, against: Path, *, options: EvaluateOptions, out: Path | None, report: Report
 ) -> int:
-    """Measure detections or tracks."""
     from lidar.tools.evaluation.objects import evaluate_objects  # noqa: PLC0415
     from lidar.tools.evaluation.report import report_folder, write_object_report  # noqa: PLC0415
 
@@ -93,15 +86,9 @@ def _evaluate_objects(
         with report_folder(out, overwrite=report.overwrite) as folder:
             found = evaluate_objects(estimate, against, sensor=options.sensor)
             write_object_report(found, folder)
-    if report.json:
-        print_json(found.to_json())
-        return 0
-    print(f"{found.kind}: {found.frames:,} frames")
-    for table in found.tables():
-        print(f"\n{table.to_text()}")
-    if out is not None:
-        print(f"\n{out}: evaluation.html and tables")
-    return 0
+    parts = [f"{found.kind}: {found.frames:,} frames", *(table.to_text() for table in found.tables())]
+    parts += [] if out is None else [f"{out}: evaluation.html and tables"]
+    return show(found.to_json(), "\n\n".join(parts), json=report.json)
 
 
 def detect(
@@ -149,9 +136,6 @@ def detect(
             overwrite=report.overwrite,
             progress=progress,
         )
-    if report.json:
-        print_json({"path": str(out), **counts})
-        return 0
     words = command_line("lidar", "evaluate", out, "--against", dataset)
-    print(f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames; next: {words}")
-    return 0
+    text = f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames; next: {words}"
+    return show({"path": str(out), **counts}, text, json=report.json)

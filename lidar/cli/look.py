@@ -9,8 +9,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from geoscene.support.console import Report, note_new_folder, print_json, progress_bar, with_flags
-from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app
+from geoscene.support.console import Report, note_new_folder, progress_bar, with_flags
+from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
 from lidar.tools.plots import FIGURES
@@ -53,11 +53,7 @@ def info(
 
     with progress_bar(quiet=quiet) as progress:
         document = describe(dataset, full=full, progress=progress)
-    if json:
-        print_json(document)
-    else:
-        print(info_text(document))
-    return 0
+    return show(document, info_text(document), json=json)
 
 
 def view(
@@ -116,16 +112,11 @@ def view(
         summary = view_drive(
             open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
         )
-    if report.json:
-        print_json({**asdict(summary), "path": str(out)})
-        return 0
     images = f", {summary.images} images" if summary.images else ""
-    print(
-        f"{out}: {summary.frames} frames, {summary.returns:,} returns{images}, {summary.bytes / 1e6:.1f} MB"
-    )
-    for note in summary.notes:
-        print(f"  {with_flags(app, note)}")
-    return 0
+    figures = f"{summary.frames} frames, {summary.returns:,} returns{images}, {summary.bytes / 1e6:.1f} MB"
+    notes = [f"  {with_flags(app, note)}" for note in summary.notes]
+    document = {**asdict(summary), "path": str(out)}
+    return show(document, "\n".join([f"{out}: {figures}", *notes]), json=report.json)
 
 
 def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
@@ -177,11 +168,7 @@ def plot(
             overwrite=report.overwrite,
             progress=progress,
         )
-    if report.json:
-        print_json({"path": str(out), **found.numbers})
-    else:
-        print(f"{out}: {found.note}")
-    return 0
+    return show({"path": str(out), **found.numbers}, f"{out}: {found.note}", json=report.json)
 
 
 def animate(
@@ -217,13 +204,8 @@ def animate(
         made = film(
             open_dataset(dataset), out, options=options, overwrite=report.overwrite, progress=progress
         )
-    if report.json:
-        print_json({**asdict(made), "path": str(out)})
-        return 0
-    print(
-        f"{out}: {made.images} images of {made.size[0]} x {made.size[1]} pixels, {made.seconds:.2f} s,"
-        f" {', '.join(made.shown)}"
-    )
-    for note in made.notes:
-        print(f"  {with_flags(app, note)}")
-    return 0
+    pixels = f"{made.size[0]} x {made.size[1]} pixels"
+    figures = f"{made.images} images of {pixels}, {made.seconds:.2f} s, {', '.join(made.shown)}"
+    notes = [f"  {with_flags(app, note)}" for note in made.notes]
+    document = {**asdict(made), "path": str(out)}
+    return show(document, "\n".join([f"{out}: {figures}", *notes]), json=report.json)

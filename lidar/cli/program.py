@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from geoscene import __version__
-from geoscene.support.console import DEFAULTS, Report
+from geoscene.support.console import DEFAULTS, Report, print_json
 from lidar.options import OUTPUT
 
 if TYPE_CHECKING:
@@ -32,6 +32,15 @@ Out = Annotated[Path, Parameter(name=["--out", "-o"], group=OUTPUT)]
 Reporting = Annotated[Report, Parameter(group=OUTPUT)]
 JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
 QuietFlag = Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)]
+
+
+def show(document: object, text: str, *, json: bool) -> int:
+    """Print a result as JSON or as text; the exit code of success."""
+    if json:
+        print_json(document)
+    else:
+        print(text)
+    return 0
 
 
 def print_effects(effects: Counts) -> None:

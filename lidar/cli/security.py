@@ -13,11 +13,10 @@ from geoscene.support.console import (
     Report,
     command_line,
     note_new_folder,
-    print_json,
     progress_bar,
     whole,
 )
-from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting
+from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, DefendOptions, SignOptions
 
@@ -84,11 +83,7 @@ def defend(
                 seed=options.seed,
                 progress=progress,
             )
-        if report.json:
-            print_json({"path": str(out), "note": made.note})
-        else:
-            print(f"{out}: {made.note}")
-        return 0
+        return show({"path": str(out), "note": made.note}, f"{out}: {made.note}", json=report.json)
     calibration = read_calibration(options.calibration, detector=detector)
     with progress_bar(quiet=report.quiet) as progress:
         found = judged(
@@ -103,11 +98,7 @@ def defend(
             seed=options.seed,
             progress=progress,
         )
-    if report.json:
-        print_json(found.document())
-    else:
-        print(score_table(found).to_text())
-    return 0
+    return show(found.document(), score_table(found).to_text(), json=report.json)
 
 
 def train(
@@ -151,43 +142,9 @@ def train(
         raise InputError(f"{out}: exists already; set `overwrite` to replace it, or give another file")
     with progress_bar(quiet=report.quiet) as progress:
         made = trained(datasets, out, seed=seed, trees=trees, every=every, workers=workers, progress=progress)
-    if report.json:
-        print_json(made.to_json())
-    else:
-        print(align_columns(made.table()))
-        words = command_line("lidar", "defend", datasets[0], "--detector", out)
-        print(f"{out}: {made.frames} frames; next: {words} ...")
-    return 0
-
-
-def defences(*, json: JsonFlag = False) -> int:
-    """List the defences against spoofing, with their parameters.
-
-    Parameters
-    ----------
-    json
-        Print them as JSON.
-    """
-    from geoscene.drawing.report import align_columns  # noqa: PLC0415
-    from lidar.parameters import COLUMNS, parameter_cells  # noqa: PLC0415
-    from lidar.tools.defences.registry import defence_rows  # noqa: PLC0415
-
-    rows = defence_rows()
-    if json:
-        print_json({"defences": rows})
-        return 0
-    cells = []
-    for row in rows:
-        needs = f" Needs: {', '.join(row['needs'])}." if row["needs"] else ""
-        past = f" Earlier frames: {row['history']}." if row["history"] else ""
-        cells.append([row["name"], "", "", "", "", "", f"{row['meaning']}{needs}{past}"])
-        cells += [["", *line] for line in parameter_cells(row["parameters"])]
-    print(align_columns([["name", "parameter", *COLUMNS], *cells]))
-    print(
-        "\nlidar defend DATASET --defence NAME,NAME:KEY=VALUE,KEY=VALUE judges recorded data"
-        "\n(docs/reference/defences.md)."
-    )
-    return 0
+    words = command_line("lidar", "defend", datasets[0], "--detector", out)
+    text = f"{align_columns(made.table())}\n{out}: {made.frames} frames; next: {words} ..."
+    return show(made.to_json(), text, json=report.json)
 
 
 def sign(
@@ -225,14 +182,11 @@ def sign(
         summary = sign_dataset(
             dataset, out, watermark=mark, signer=signer, overwrite=report.overwrite, progress=progress
         )
-    if report.json:
-        print_json({**asdict(summary), "path": str(summary.path)})
-    else:
-        parts = [f"watermark in {summary.marked} clouds, points moved by {summary.rms * 1000:.1f} mm rms"]
-        chained = f"{summary.frames} frames and {summary.files} files in a signed hash chain"
-        parts = (parts if mark else []) + ([chained] if signer else [])
-        print(f"{summary.path}: {'; '.join(parts)}")
-    return 0
+    parts = [f"watermark in {summary.marked} clouds, points moved by {summary.rms * 1000:.1f} mm rms"]
+    chained = f"{summary.frames} frames and {summary.files} files in a signed hash chain"
+    parts = (parts if mark else []) + ([chained] if signer else [])
+    document = {**asdict(summary), "path": str(summary.path)}
+    return show(document, f"{summary.path}: {'; '.join(parts)}", json=report.json)
 
 
 def verify(
@@ -285,8 +239,5 @@ def verify(
             false_alarms=false_alarms,
             progress=progress,
         )
-    if json:
-        print_json(found.to_json())
-    else:
-        print("\n".join(found.to_text(str(dataset))))
+    show(found.to_json(), "\n".join(found.to_text(str(dataset))), json=json)
     return 0 if found.intact else FAILURE

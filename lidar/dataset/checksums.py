@@ -154,7 +154,6 @@ def _digests(
 
 
 def _to_bytes(sha256: Mapping[str, bytes]) -> bytes:
-    """The file of checksums."""
     lines = b"".join(_line(os.fsencode(name), sha256[name]) for name in sorted(sha256))
     return lines + _END + hashlib.sha256(lines).hexdigest().encode() + b"\n"
 

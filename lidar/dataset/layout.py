@@ -43,8 +43,8 @@ from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
-from lidar.sensors.rig.specs import names_folder
+from lidar.geometry.trajectory_files import MANIFEST, read_trajectory
+from lidar.sensors.rig.specs import Rig, names_folder, rig_of
 
 log = logging.getLogger(__name__)
 
@@ -181,6 +181,10 @@ class Dataset(Previewed):
         """UTC time of the drive's start."""
         return datetime.fromisoformat(self.manifest["start_time"])
 
+    def microseconds(self, time_ns: int) -> int:
+        """Microseconds since 1970 of a time since the drive's start."""
+        return round(self.start.timestamp() * 1e6) + time_ns // 1000
+
     @property
     def crs(self) -> CRS:
         """The CRS of LAZ files."""
@@ -214,6 +218,11 @@ class Dataset(Previewed):
             if not len(times) and self.manifest.get("sensor_frames", {}).get(name):
                 raise DatasetError(f"{path}: damaged (no times of its frames); drive again with `overwrite`")
         return times
+
+    def rig(self) -> Rig:
+        """The rig, with sensors and mounts; raises InputError if its files are not as they were."""
+        with reading_file(self.paths.manifest):
+            return rig_of(str(self.manifest["recipe"]["rig"]))
 
     def trajectory(self) -> Trajectory:
         """The ego vehicle's poses."""

@@ -55,7 +55,6 @@ def html(dataset: Dataset) -> str:
 
 
 def _figures(dataset: Dataset) -> Iterator[tuple[str, str]]:
-    """Names and values."""
     manifest = dataset.manifest
     yield "scene", manifest["scene"]["name"] or Path(manifest["scene"]["path"]).name
     yield "start", f"{dataset.start:%Y-%m-%d %H:%M:%S} UTC"

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Ints
-from lidar.dataset.deskew import deskew
 from lidar.dataset.formats import FORMATS, Format, format_of, read_table
-from lidar.dataset.formats.table import PointLabels, Table, placed_returns
+from lidar.dataset.formats.table import PointLabels, Table, deskew, placed_returns
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
 from lidar.errors import DatasetError, InputError
-from lidar.geometry.attitude import quat_from_matrix
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount, quat_from_matrix
 from lidar.geometry.poses import Trajectory
 
 _FAR = 1e6
@@ -165,9 +163,14 @@ def color_images(dataset: Dataset, name: str) -> Stream | None:
         if not np.isfinite(np.array(camera["K"], float).reshape(3, 3)).all():
             raise ValueError("intrinsics are not finite")
         _ = int(camera["width"]), int(camera["height"]), str(camera["model"]), list(camera["distortion"])
-    first = dataset.frame_file(dataset.paths.image(name, 0, kind="rgb"))
+    return _images(dataset, name, kind="rgb")
+
+
+def _images(dataset: Dataset, name: str, *, kind: str) -> Stream | None:
+    """A camera's images of a kind; None if there are none."""
+    first = dataset.frame_file(dataset.paths.image(name, 0, kind=kind))
     numbers = frame_numbers(first.parent, ".png").tolist()
-    found = [(frame, dataset.paths.image(name, frame, kind="rgb")) for frame in numbers]
+    found = [(frame, dataset.paths.image(name, frame, kind=kind)) for frame in numbers]
     return _stream(dataset, name, found=found) if found else None
 
 
@@ -185,10 +188,8 @@ def images_of(dataset: Dataset, name: str) -> Images | None:
     Raises DatasetError for frames without a time.
     """
     for kind in ("rgb", "depth"):
-        first = dataset.frame_file(dataset.paths.image(name, 0, kind=kind))
-        numbers = frame_numbers(first.parent, ".png").tolist()
-        if found := [(frame, dataset.paths.image(name, frame, kind=kind)) for frame in numbers]:
-            return Images(_stream(dataset, name, found=found), kind)
+        if (stream := _images(dataset, name, kind=kind)) is not None:
+            return Images(stream, kind)
     return None
 
 

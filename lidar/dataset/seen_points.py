@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
-from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats.table import Table, placed_returns
+from lidar.dataset.ground_truth import COLUMNS, read_boxes
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.png import counts_to_depth, read_png
 from lidar.dataset.recorded import Stream, color_images
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.camera_model import exposure_times, project
-from lidar.sensors.rig.specs import CameraSpec, rig_of
+from lidar.sensors.rig.specs import CameraSpec
 
 _ROLLS = 5
 """Iterations for the row in which a rolling shutter sees a point."""
@@ -184,10 +184,8 @@ def _nearest_of_all(pixel: Float, depth: Float, *, size: tuple[int, int]) -> Boo
 
 def views_of(dataset: Dataset) -> list[ImageView]:
     """The cameras of a dataset that have colour images."""
-    with reading_file(dataset.paths.manifest):
-        rig = rig_of(dataset.manifest["recipe"]["rig"])
-    streams = {spec.name: color_images(dataset, spec.name) for spec in rig.cameras}
-    return [ImageView(dataset, spec, s) for spec in rig.cameras if (s := streams[spec.name]) is not None]
+    streams = ((spec, color_images(dataset, spec.name)) for spec in dataset.rig().cameras)
+    return [ImageView(dataset, spec, stream) for spec, stream in streams if stream is not None]
 
 
 def returns_of(

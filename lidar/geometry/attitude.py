@@ -1,4 +1,4 @@
-"""Attitudes: quaternions (x, y, z, w), Euler angles in two conventions, and axes.
+"""Attitudes: quaternions (x, y, z, w), Euler angles in two conventions, axes, and extrinsics of sensors.
 
 The angles of `poses.csv` are alpha about X (roll), beta about Y (pitch), gamma about Z (yaw), radians, with
 
@@ -12,6 +12,8 @@ functions end in ``_intrinsic``.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -119,3 +121,33 @@ def body_rates(time_s: ArrayLike, quat_xyzw: ArrayLike) -> Float:
     t, attitude = np.asarray(time_s, float), Rotation.from_quat(np.asarray(quat_xyzw, float))
     between = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(t)[:, None]
     return np.concatenate([between[:1], between]) * 0.5 + np.concatenate([between, between[-1:]]) * 0.5
+
+
+OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rotation from optical axes (x right, y down, z forward) to body axes (x forward, y left, z up)."""
+OPTICAL_QUAT = (-0.5, 0.5, -0.5, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Mount:
+    """Extrinsics of a sensor: its point s lies at translation + rotation @ s in the vehicle frame.
+
+    translation : metres in the vehicle frame (origin: the rear axle's centre on the ground)
+    quat_xyzw   : rotation from sensor axes to vehicle axes
+    """
+
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def rotation(self) -> Float:
+        """Rotation (3, 3) from sensor axes to vehicle axes."""
+        return matrix_from_quat(self.quat_xyzw)
+
+    @property
+    def matrix(self) -> Float:
+        """Homogeneous transform (4, 4) from the sensor frame to the vehicle frame."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix

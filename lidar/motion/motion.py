@@ -17,6 +17,8 @@ from lidar.geometry.poses import Trajectory
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
 
+RATE_HZ = 100.0
+"""Poses of a trajectory per second."""
 DWELL_S = 1.0
 """Seconds at rest at every stop between legs, for steering and gear changes, and at the end of a route."""
 _AT_REST = 0.01  # m/s, below which a vehicle has come to rest
@@ -48,53 +50,46 @@ def drive_path(
     path: Path,
     vehicle: Vehicle,
     *,
-    rate_hz: float = 100.0,
     duration: float | None = None,
     at_speed: bool = False,
 ) -> Trajectory:
-    """The trajectory of a vehicle along a path, from rest to rest, in the scene frame.
+    """The trajectory of a vehicle along a path, from rest to rest, in the scene frame; 100 poses per second.
 
-    rate_hz   : poses per second
-    duration  : maximum seconds; on a longer path the vehicle stops in time
+    duration : maximum seconds; on a longer path the vehicle stops in time
     at_speed : the vehicle is at speed at the start, and after ``duration``; it still stops at the path's end
 
     The speed stays within speed limits and the vehicle's lateral acceleration, acceleration, deceleration and
     jerk. The body's x axis is along the path at the rear axle, apart from roll and pitch under acceleration.
-    Raises InputError for a duration or rate that is not positive.
+    Raises InputError for a duration that is not positive.
     """
-    motion = motion_along(path, vehicle, rate_hz=rate_hz, duration=duration, at_speed=at_speed)
+    motion = motion_along(path, vehicle, duration=duration, at_speed=at_speed)
     return poses_along(path, vehicle, motion=motion)
 
 
 def motion_along(
-    path: Path,
-    vehicle: Vehicle,
-    *,
-    rate_hz: float = 100.0,
-    duration: float | None = None,
-    at_speed: bool = False,
+    path: Path, vehicle: Vehicle, *, duration: float | None = None, at_speed: bool = False
 ) -> Motion:
     """The fastest speed profile along a path within all limits; arguments as for `drive_path`."""
-    if not (rate_hz > 0 and (duration is None or duration > 0)):
-        raise InputError("rate and duration of a drive must be positive")
-    limit = speed_limits(path, vehicle)
-    fine = math.ceil(100.0 / rate_hz)
-    dt = 1.0 / (rate_hz * fine)
+    if duration is not None and not duration > 0:
+        raise InputError("the duration of a drive must be positive")
+    limit, dt = speed_limits(path, vehicle), 1.0 / RATE_HZ
     s, v, leg = _all_legs(path, limit, vehicle=vehicle, dt=dt, at_speed=at_speed)
     if duration is not None and len(s) * dt > duration:
         if at_speed:
-            count = max(round(duration / dt), fine) + 1
+            count = max(round(duration / dt), 1) + 1
             s, v, leg = s[:count], v[:count], leg[:count]
         else:
             s, v, leg = _within(path, limit, vehicle=vehicle, dt=dt, duration=duration)
-    s, v, leg = s[::fine], v[::fine], leg[::fine]
-    n = len(s)
-    time_ns = np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
-    acceleration = np.gradient(v, 1.0 / rate_hz) if n > 1 else np.zeros(n)
+    acceleration = np.gradient(v, dt) if len(s) > 1 else np.zeros(len(s))
     first = np.searchsorted(path.leg, leg, side="left")
     last = np.searchsorted(path.leg, leg, side="right") - 1
     row = np.clip(np.searchsorted(path.s, s, side="right") - 1, first, last)
-    return Motion(time_ns, s, v, acceleration, row)
+    return Motion(even_times(len(s)), s, v, acceleration, row)
+
+
+def even_times(count: int) -> NDArray[np.int64]:
+    """Times (count,) in nanoseconds, `RATE_HZ` of them per second."""
+    return np.round(np.arange(count) * (1e9 / RATE_HZ)).astype(np.int64)
 
 
 def ended_at_rest(motion: Motion) -> Motion:

@@ -24,9 +24,19 @@ from geoscene.geometry.frames import Frame
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 from lidar.errors import BlockedError, RouteError
-from lidar.motion.clearance import ASIDE, PathParameters, RouteLine, pushes, turning_manoeuvre, turns_at
 from lidar.motion.route import Route
-from lidar.motion.steering import Pose, SteeredTrack, follow, relax
+from lidar.motion.steering import (
+    ASIDE,
+    PathParameters,
+    Pose,
+    RouteLine,
+    SteeredTrack,
+    follow,
+    pushes,
+    relax,
+    turning_manoeuvre,
+    turns_at,
+)
 from lidar.motion.vehicle import Vehicle
 
 Ground = Callable[[Float, Float], Float]
@@ -97,14 +107,12 @@ def plan_path(
     frame: Frame,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
     ground: Surface | None = None,
-    margin: float = MARGIN,
 ) -> Path:
     """The path of a vehicle along a route.
 
     obstacles : polygons in scene metres that the body must not touch (footprints of buildings that stand on
-                the ground); they do not hold on bridges and in tunnels
+                the ground), but come near to `MARGIN`; they do not hold on bridges and in tunnels
     ground    : the surface near the heights of the route's line; without it, those heights are the ground
-    margin    : metres that the body keeps from obstacles
 
     Raises BlockedError where the vehicle cannot follow the route, or cannot without touching an obstacle: its
     ``turns`` are those that rerouting must avoid. Raises RouteError for a route too short to drive.
@@ -113,7 +121,7 @@ def plan_path(
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
     # aircraft have no lane, and larger turning radii
     step = vehicle.turning_radius / 17 if vehicle.kind == "air" else min(0.25, vehicle.turning_radius / 8)
-    setting = PathParameters(vehicle, frame, obstacles, margin, step, route.side)
+    setting = PathParameters(vehicle, frame, obstacles, MARGIN, step, route.side)
     line = _resample(route, 2 * step if vehicle.kind == "air" else min(0.5, 2 * step))
     cuts = [0, *(np.flatnonzero(line.turn) + 1).tolist(), len(line.edge)]
     legs: list[SteeredTrack] = []

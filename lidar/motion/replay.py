@@ -16,7 +16,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import DatasetError, FormatError, RouteError
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import MANIFEST, read_trajectory
+from lidar.geometry.trajectory_files import MANIFEST, read_trajectory
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

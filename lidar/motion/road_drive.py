@@ -1,23 +1,30 @@
-"""Plans of drives on roads: from a scene and the description of a route to a path."""
+"""Plans of drives on roads: from a scene and the description of a route to a path.
+
+Route and path are planned together: streets and turns that the vehicle cannot pass are avoided.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.geometry.frames import Frame
 from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.errors import RouteError
-from lidar.motion.path import Path, Surface
-from lidar.motion.rerouting import plan_route_and_path
-from lidar.motion.route import Route, RouteOptions, Side, Spec
-from lidar.motion.vehicle import load_vehicle
+from lidar.errors import BlockedError, RouteError
+from lidar.geometry.time_scales import check_duration
+from lidar.motion.path import Path, Surface, plan_path
+from lidar.motion.route import Route, RouteOptions, Side, Spec, plan_route
+from lidar.motion.vehicle import Vehicle, load_vehicle
 from lidar.world.world import World
 
 _RANDOM_SECONDS = 60.0
@@ -73,7 +80,6 @@ class RoadPlan:
     """
 
     graph: RoadGraph
-    route: Route
     path: Path
     duration: float | None
     at_speed: bool = False
@@ -110,26 +116,25 @@ def _name(scene: Scene | RoadMap) -> str:
     return str(scene.path) if isinstance(scene, Scene) else scene.name
 
 
-def ground_footprints(scene: Scene) -> NDArray[np.object_]:
-    """Footprints (k,) in scene metres of buildings without a passage below."""
+def _buildings(scene: Scene) -> tuple[NDArray[np.object_], Float]:
+    """Footprints (k,) in scene metres of buildings, and metres (k,) from the ground to their lower ends."""
     if not scene.table_length("buildings"):
-        return np.empty(0, object)
+        return np.empty(0, object), np.empty(0)
     layer = scene.features("buildings")
-    return _obstacles(layer.geometry, np.asarray(layer.columns["min_height"], float))
+    return layer.geometry, np.asarray(layer.columns["min_height"], float)
 
 
 def _obstacles(footprints: NDArray[np.object_], min_height: Float) -> NDArray[np.object_]:
+    """Footprints of buildings without a passage below."""
     return footprints[min_height < _HEADROOM]
 
 
 def road_map(scene: Scene) -> RoadMap:
     """The roads and buildings of a scene."""
-    xy, height = np.empty(0, object), np.empty(0)
-    if scene.table_length("buildings"):
-        layer = scene.features("buildings")
-        xy, height = layer.geometry, np.asarray(layer.columns["min_height"], float)
     graph = scene.road_graph() if scene.files.road_graph.exists() else None
-    return RoadMap(str(scene.path), scene.frame, scene.bounds, graph, xy, height, scene.left_hand)
+    return RoadMap(
+        str(scene.path), scene.frame, scene.bounds, graph, *_buildings(scene), left_hand=scene.left_hand
+    )
 
 
 def road_surface(scene: Scene) -> Surface:
@@ -161,10 +166,10 @@ def plan_road_drive(
     whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
-    obstacles = ground_footprints(scene)
+    obstacles = _obstacles(*_buildings(scene))
     progress("planning", 0, total=0)
     try:
-        route, path = plan_route_and_path(
+        _, path = plan_route_and_path(
             graph,
             scene.frame,
             spec=spec,
@@ -179,7 +184,7 @@ def plan_road_drive(
         raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
     number = np.append(np.flatnonzero(kept), -1).astype(np.int32)
     path = replace(path, edge=number[path.edge])
-    return RoadPlan(whole, route, path, *options.record(spec))
+    return RoadPlan(whole, path, *options.record(spec))
 
 
 def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tuple[Float, list[Float]]:
@@ -198,3 +203,52 @@ def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tup
         tried=lambda route: tried.append(route.line[:, :2]),
     )
     return path.position[:, :2], tried
+
+
+_ATTEMPTS = 40
+"""Maximum number of plans."""
+
+
+def plan_route_and_path(
+    graph: RoadGraph,
+    frame: Frame,
+    *,
+    spec: Spec,
+    vehicle: Vehicle,
+    options: RouteOptions | None = None,
+    obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
+    ground: Surface | None = None,
+    tried: Callable[[Route], None] = lambda _: None,
+) -> tuple[Route, Path]:
+    """A route and a path along it on which the vehicle touches no obstacle.
+
+    Parameters are those of `plan_route` and `lidar.motion.path.plan_path`; ``body_width`` is the vehicle's.
+    Where the body does not pass, the route is planned again without that street or turn; ``tried`` is called
+    with each route.
+
+    Raises RouteError as `plan_route` does and for a given route that takes longer than a drive lasts, and
+    BlockedError if every route is blocked.
+    """
+    options = replace(options or RouteOptions(), body_width=vehicle.width)
+    if not isinstance(obstacles, shapely.STRtree):
+        obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
+    avoid: set[tuple[int, int]] = set()
+    blocked: BlockedError
+    for _ in range(_ATTEMPTS):
+        try:
+            route = plan_route(graph, frame, spec=spec, options=options, avoid=avoid)
+        except RouteError:
+            if avoid:
+                break
+            raise
+        if spec != "random" and options.duration is None:
+            check_duration(route.least_seconds(vehicle.max_speed), what="the route")
+        tried(route)
+        try:
+            return route, plan_path(route, vehicle, frame=frame, obstacles=obstacles, ground=ground)
+        except BlockedError as error:
+            blocked = error
+            fresh = set(error.turns) - avoid
+            # a turn that is avoided already and still blocked means that its street is blocked
+            avoid |= fresh or {(b, b) for _, b in error.turns}
+    raise blocked

@@ -17,7 +17,7 @@ import numpy as np
 
 from geoscene.typing import Float, Ints
 from lidar.errors import InputError
-from lidar.motion.motion import DWELL_S, Motion, legs_of, speed_limits
+from lidar.motion.motion import DWELL_S, RATE_HZ, Motion, even_times, legs_of, speed_limits
 from lidar.motion.path import Path
 from lidar.motion.vehicle import Vehicle
 
@@ -54,7 +54,6 @@ def motion_within(
     *,
     time_s: Float,
     max_distance: Float,
-    rate_hz: float = 100.0,
     at_speed: bool = False,
 ) -> Motion:
     """The speed profile along a path, from rest to rest, that never exceeds given distances.
@@ -69,7 +68,7 @@ def motion_within(
         raise InputError("the maximum distances of a speed profile must not decrease")
     limit = speed_limits(path, vehicle)
     parts: list[tuple[Float, Float, Ints]] = []
-    begin, dt, total = 0.0, 1.0 / rate_hz, float(time_s[-1])
+    begin, dt, total = 0.0, 1.0 / RATE_HZ, float(time_s[-1])
     for first, last in legs_of(path):
         if parts and total - begin < 2 * STEP_S:
             break
@@ -98,8 +97,7 @@ def motion_within(
         if not driven:
             break
     s, v, row = (np.concatenate(column) for column in zip(*parts, strict=True))
-    time_ns = np.round(np.arange(len(s)) * (1e9 / rate_hz)).astype(np.int64)
-    return Motion(time_ns, s, v, np.gradient(v, 1.0 / rate_hz), row)
+    return Motion(even_times(len(s)), s, v, np.gradient(v, dt), row)
 
 
 def desired_speed(path: Path, vehicle: Vehicle) -> Float:

@@ -25,6 +25,9 @@ Place = tuple[int, float]
 _NAMED = 3
 """Maximum number of waypoints that an error names."""
 
+TOLERANCE = 50.0
+"""Metres from a drivable street to a waypoint or a point of a track, at most."""
+
 DENSE_M = 60.0
 """Median metres between a file's points up to which they are a track; farther apart, they are waypoints."""
 SIGMA_M = 6.0
@@ -78,14 +81,13 @@ def route_through(
     frame: Frame,
     *,
     points: Sequence[tuple[float, float]],
-    tolerance: float,
     avoid: Collection[tuple[int, int]] = (),
 ) -> tuple[NDArray[np.int32], tuple[float, float]]:
     """Edges of the fastest route through waypoints (latitude, longitude), and metres of its start and end.
 
     One-way streets and turn restrictions hold; the vehicle passes waypoints without turning round.
 
-    Raises RouteError naming waypoints that are farther than ``tolerance`` metres from a street, or the first
+    Raises RouteError naming waypoints that are farther than `TOLERANCE` metres from a street, or the first
     that cannot be reached.
     """
     if len(points) < 2:
@@ -97,11 +99,11 @@ def route_through(
     xy = np.column_stack([x, y])
     edge, offset, distance = nearest_edge(graph, xy)
     scale = frame.scale(lon, lat)
-    far = np.flatnonzero(~(distance <= tolerance * scale))
+    far = np.flatnonzero(~(distance <= TOLERANCE * scale))
     if len(far):
         named = [
             f"waypoint {k + 1} ({lat[k]:.6f}, {lon[k]:.6f}) is {distance[k]:.0f} m from the nearest"
-            f" drivable street, more than {tolerance:.0f} m"
+            f" drivable street, more than {TOLERANCE:.0f} m"
             for k in far[:_NAMED]
         ]
         rest = [f"and so are {len(far) - _NAMED} more"] if len(far) > _NAMED else []
@@ -131,14 +133,13 @@ def match_track(
     track: RecordedTrack,
     *,
     frame: Frame,
-    tolerance: float,
     avoid: Collection[tuple[int, int]] = (),
 ) -> tuple[NDArray[np.int32], tuple[float, float]]:
     """Edges that a recorded track most likely followed, and metres of its start and end.
 
     The hidden Markov model of Newson and Krumm (2009): a point lies about `SIGMA_M` off its street, and the
     way driven between two points is about as long as the straight line. Raises RouteError naming the points
-    that have no street within ``tolerance``, or where the streets do not connect.
+    that have no street within `TOLERANCE`, or where the streets do not connect.
     """
     xy = _thin(track.xyz[:, :2], 2.5 * SIGMA_M)
     tree = shapely.STRtree(edge_lines(graph))
@@ -146,7 +147,7 @@ def match_track(
     costs: list[Float] = []
     lost: list[int] = []
     points = shapely.points(xy)
-    which, near = tree.query(points, predicate="dwithin", distance=tolerance)
+    which, near = tree.query(points, predicate="dwithin", distance=TOLERANCE)
     distance = shapely.distance(points[which], tree.geometries[near])
     share = shapely.line_locate_point(tree.geometries[near], points[which], normalized=True)
     for k in range(len(xy)):
@@ -160,7 +161,7 @@ def match_track(
     if lost:
         lon, lat = frame.to_geographic(*xy[lost[0]])
         raise RouteError(
-            f"{len(lost)} of {len(xy)} points of the track have no drivable street within {tolerance:.0f} m,"
+            f"{len(lost)} of {len(xy)} points of the track have no drivable street within {TOLERANCE:.0f} m,"
             f" the first at {float(lat):.6f}, {float(lon):.6f}; cut the track to the scene's streets, or"
             " build a scene that holds it"
         )

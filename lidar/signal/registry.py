@@ -12,8 +12,7 @@ import numpy as np
 from geoscene.support.registry import Registry
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
-from lidar.grammar import Item, item_of, read_items
-from lidar.parameters import build, parameter_rows
+from lidar.parameters import Item, build, item_of, parameter_rows, read_items
 from lidar.signal.situation import Counts
 from lidar.signal.stage import Stage
 

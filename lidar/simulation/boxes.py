@@ -6,7 +6,6 @@ import heapq
 import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -17,15 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.classes import Class
 from geoscene.support.files import atomic_path
-from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS
+from geoscene.typing import Ints
+from lidar.dataset.ground_truth import COLUMNS
 from lidar.dataset.layout import Paths, frame_numbers, read_sensors, reading_file
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.sensors.camera.outline import outline
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.world.actors import Actors, States, existing_actors, poses_of, rotations, states
+from lidar.world.actors import Actors, existing_actors, poses_of, rotations, states
 
 
 def box_rows(
@@ -62,23 +61,17 @@ def box_rows(
     rows = rows[(np.hypot(*away[:, :2].T) <= radius * actors.scale) | seen]
     at = states(actors, rows, time_ns=time_ns)
     turn = rotations(at.angles)
-    centre = _centres(actors, rows, at=at)
+    up = turn[:, :, 2] * [actors.scale, actors.scale, 1.0]
+    centre = at.position + up * actors.size[rows, 2:] / 2
     quat = quat_from_matrix(turn)
     velocity = at.velocity / [actors.scale, actors.scale, 1.0]
     body = pose.rotation[0].T
     local = ((centre - pose.position) / pose.scale) @ body.T
     forward = turn[:, :, 0] @ body.T
     moved = velocity @ body.T
-    n = len(rows)
-    names = np.array([Class(int(k)).name.lower() for k in actors.klass[rows]], np.str_)
     triples = {"": centre, "v": velocity, "ego_": local, "ego_v": moved}
     out: dict[str, NDArray[Any]] = {
-        "frame": np.full(n, frame),
-        "time_ns": np.full(n, time_ns),
-        "id": rows,
-        "instance": actors.feature[rows],
-        "class": names,
-        "kind": actors.kind[rows],
+        **_names(actors, rows, frame=frame, time_ns=time_ns),
         **dict(zip(("length", "width", "height"), actors.size[rows].T, strict=True)),
         "yaw": np.arctan2(turn[:, 1, 0], turn[:, 0, 0]),
         "ego_yaw": np.arctan2(forward[:, 1], forward[:, 0]),
@@ -90,10 +83,16 @@ def box_rows(
     return {name: out[name] for name in COLUMNS}
 
 
-def _centres(actors: Actors, rows: Ints, *, at: States) -> Float:
-    """Centres (k, 3) of boxes: half the height above the position, along the body's z axis."""
-    up = rotations(at.angles)[:, :, 2] * [actors.scale, actors.scale, 1.0]
-    return at.position + up * actors.size[rows, 2:] / 2
+def _names(actors: Actors, rows: Ints, *, frame: int, time_ns: int) -> dict[str, NDArray[Any]]:
+    """The columns of boxes that say when they are, and of which road users."""
+    return {
+        "frame": np.full(len(rows), frame),
+        "time_ns": np.full(len(rows), time_ns),
+        "id": rows,
+        "instance": actors.feature[rows],
+        "class": np.array([Class(int(k)).name.lower() for k in actors.klass[rows]], np.str_),
+        "kind": actors.kind[rows],
+    }
 
 
 def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer]) -> Ints:
@@ -103,38 +102,27 @@ def count_points(actors: Actors, rows: ArrayLike, *, feature: NDArray[np.integer
     return np.bincount(mine, minlength=len(actors))[np.asarray(rows, np.int64)]
 
 
-@dataclass(frozen=True, slots=True)
-class ImageBoxes:
-    """2D boxes of actors in an image.
-
-    row        : (k,) int64, index of the actor
-    box        : (k, 4) float64 pixels: left, top, right and bottom within the image, occluded or not
-    seen       : (k, 4) float64 pixels, of the visible pixels; NaN if there are none
-    pixels     : (k,) int64, number of visible pixels
-    visibility : (k,) 0 to 1, visible pixels over the pixels without occlusion
-    """
-
-    row: Ints
-    box: Float
-    seen: Float
-    pixels: Ints
-    visibility: Float
-
-
 def image_boxes(
     actors: Actors,
     camera: CameraSpec,
     *,
     pose: Poses,
+    frame: int,
     time_ns: int,
     instance: NDArray[np.integer],
     span_ns: tuple[int, int] | None = None,
-) -> ImageBoxes:
-    """2D boxes of the actors in an image.
+) -> dict[str, NDArray[Any]]:
+    """Columns of the 2D boxes of the actors in an image, one row each.
 
     pose     : the camera's one pose at the time of the image
     instance : (h, w) feature numbers of the image
     span_ns  : first and last time of the exposure
+
+    left, top, right, bottom : pixels, within the image, occluded or not
+    seen_left, ...  : pixels, of the visible pixels; NaN if there are none
+    pixels          : number of visible pixels
+    visibility      : 0 to 1, visible pixels over the pixels without occlusion
+    frame, ... kind : as of `box_rows`
 
     The pixels without occlusion are those that the actor's projected triangles cover, except triangles that
     extend behind the camera. An actor without such triangles in the image, but with pixels, has their box
@@ -149,7 +137,7 @@ def image_boxes(
         (away[:, 2] > -size) | np.full(len(rows), camera.model == "fisheye")
     )
     ahead |= count_points(actors, rows, feature=instance) > 0
-    found: list[tuple[int, tuple[float, ...], tuple[float, ...], int, float]] = []
+    found: list[tuple[float, ...]] = []
     body = poses_of(actors, rows, at=at)
     pixels_of = _pixels_of(actors, instance)
     for k in np.flatnonzero(ahead).tolist():
@@ -167,14 +155,17 @@ def image_boxes(
             v, u = v[near], u[near]
         seen = (u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5) if len(u) else (np.nan,) * 4
         if inside or len(u):
-            found.append((row, box if inside else seen, seen, len(u), min(len(u) / max(whole, 1), 1.0)))
-    return ImageBoxes(
-        np.array([f[0] for f in found], np.int64),
-        np.array([f[1] for f in found], float).reshape(-1, 4),
-        np.array([f[2] for f in found], float).reshape(-1, 4),
-        np.array([f[3] for f in found], np.int64),
-        np.array([f[4] for f in found], float),
-    )
+            visible = min(len(u) / max(whole, 1), 1.0)
+            found.append((row, *(box if inside else seen), *seen, len(u), visible))
+    table = np.array(found, float).reshape(-1, 11)
+    sides = ("left", "top", "right", "bottom")
+    return {
+        **_names(actors, table[:, 0].astype(np.int64), frame=frame, time_ns=time_ns),
+        **dict(zip(sides, np.round(table[:, 1:5], 2).T, strict=True)),
+        **{f"seen_{side}": column for side, column in zip(sides, table[:, 5:9].T, strict=True)},
+        "pixels": table[:, 9].astype(np.int64),
+        "visibility": np.round(table[:, 10], 4),
+    }
 
 
 def _pixels_of(actors: Actors, instance: NDArray[np.integer]) -> dict[int, Ints]:

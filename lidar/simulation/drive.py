@@ -25,17 +25,21 @@ from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
 from lidar.errors import InputError, LidarError
-from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.geometry.trajectory_files import write_trajectory
 from lidar.options import DriveOptions
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.situation import Counts
 from lidar.simulation.boxes import merge_box_files, merge_signal_files
-from lidar.simulation.frame_loop import check_attackers, recording_chunks, run_jobs
-from lidar.simulation.measured import MeasuredCloud, MeasuredImages
+from lidar.simulation.frame_loop import (
+    check_attackers,
+    record_frame,
+    record_on_cluster,
+    recording_chunks,
+    run_jobs,
+)
 from lidar.simulation.metadata import write_metadata
 from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
-from lidar.simulation.record import record_frame
-from lidar.simulation.recording import Recording
+from lidar.simulation.recording import MeasuredCloud, MeasuredImages, Recording
 from lidar.world.world import Worlds
 
 Show = Callable[[MeasuredCloud | MeasuredImages], None]
@@ -101,24 +105,62 @@ def drive(
     """
     if live is not None and options.scheduler:
         raise InputError("`live` shows frames that this machine records; leave out `scheduler`")
-    began = time.perf_counter()
+    began, out = time.perf_counter(), Path(out)
     with (
         install_listener("numba:compile", _CompilationProgress(progress)),
         connect(options.scheduler) if options.scheduler else nullcontext() as cluster,
     ):
-        return _driven(
-            scene,
-            Path(out),
-            options=options,
-            overwrite=overwrite,
-            cluster=cluster,
-            progress=progress,
-            notes=notes or {},
-            check=check,
-            plan=plan,
-            live=live,
-            began=began,
-        )
+        planning_from = time.perf_counter()
+        plan = plan or plan_drive(scene, options, progress=progress)
+        planning_s = time.perf_counter() - planning_from
+        manifest = plan.manifest() | dict(notes or {})
+        recording = plan.recording(out)
+        check_attackers(plan, recording)
+        with exclusive(out), _begun(out, manifest, overwrite=overwrite):
+            journal = _verify(recording, plan.jobs, progress=progress)
+            _write_plan(plan, recording)
+            pending = _pending(plan, journal)
+            resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
+            trim_memory()
+            recording_from = time.perf_counter()
+            record_all(
+                plan,
+                pending,
+                recording=recording,
+                cluster=cluster,
+                journal=journal,
+                progress=progress,
+                live=live,
+            )
+            recording_s = time.perf_counter() - recording_from
+            points = _points(plan, journal)
+            journal.close()
+            if plan.actors is not None:
+                merge_box_files(out)
+            if plan.signals is not None:
+                merge_signal_files(out)
+            manifest |= {"points": points, "frames_done": manifest["frames"]}
+            checking_from = time.perf_counter()
+            if check is not None:
+                write_json(Paths(out).manifest, manifest)
+                manifest |= check(plan)
+            began += time.perf_counter() - checking_from  # what a drive takes is without measuring its errors
+            _finish(recording, plan.jobs, manifest=manifest, journal=journal)
+            wall = time.perf_counter() - began
+    return DriveSummary(
+        out,
+        int(manifest["frames"]),
+        resumed,
+        points,
+        written=sum(points.values()) - sum(before.values()),
+        duration=plan.trajectory.duration_ns / 1e9,
+        length=plan.length,
+        wall=wall,
+        planning=planning_s,
+        recording=recording_s,
+        stages=recording.watch.seconds,
+        effects=recording.settings.stages.effects(recording.effects.counts),
+    )
 
 
 class _CompilationProgress(Listener):
@@ -134,86 +176,6 @@ class _CompilationProgress(Listener):
     def on_end(self, event: Event) -> None:  # noqa: ARG002
         """Count a compiled function."""
         self._compiled += 1
-
-
-def _driven(
-    scene: Scene,
-    out: Path,
-    *,
-    options: DriveOptions,
-    overwrite: bool,
-    cluster: DaskCluster | None,
-    progress: Progress,
-    notes: Mapping[str, Any],
-    check: Callable[[DrivePlan], Mapping[str, Any]] | None,
-    plan: DrivePlan | None,
-    live: Live | None,
-    began: float,
-) -> DriveSummary:
-    """Plan and record; ``began`` is the time of the start, seconds."""
-    planning_from = time.perf_counter()
-    plan = plan or plan_drive(scene, options, progress=progress)
-    planning_s = time.perf_counter() - planning_from
-    manifest = plan.manifest() | dict(notes)
-    recording = plan.recording(out)
-    check_attackers(plan, recording)
-    with exclusive(out), _begun(out, manifest, overwrite=overwrite):
-        journal = _verify(recording, plan.jobs, progress=progress)
-        _write_plan(plan, recording)
-        pending = _pending(plan, journal)
-        resumed, before = len(plan.jobs) - len(pending), _points(plan, journal)
-        trim_memory()
-        recording_from = time.perf_counter()
-        if cluster is None:
-            record_all(
-                recording,
-                pending,
-                scene=scene,
-                journal=journal,
-                workers=options.workers,
-                progress=progress,
-                shown=None if live is None else live(plan),
-            )
-        else:
-            from lidar.simulation.cluster import record_on_cluster  # noqa: PLC0415
-
-            record_on_cluster(
-                plan,
-                recording=recording,
-                chunks=recording_chunks(pending, recording),
-                cluster=cluster,
-                journal=journal,
-                progress=progress,
-            )
-        recording_s = time.perf_counter() - recording_from
-        points = _points(plan, journal)
-        journal.close()
-        if plan.actors is not None:
-            merge_box_files(out)
-        if plan.signals is not None:
-            merge_signal_files(out)
-        manifest |= {"points": points, "frames_done": manifest["frames"]}
-        checking_from = time.perf_counter()
-        if check is not None:
-            write_json(Paths(out).manifest, manifest)
-            manifest |= check(plan)
-        began += time.perf_counter() - checking_from  # what a drive takes is without measuring its errors
-        _finish(recording, plan.jobs, manifest=manifest, journal=journal)
-        wall = time.perf_counter() - began
-    return DriveSummary(
-        out,
-        int(manifest["frames"]),
-        resumed,
-        points,
-        written=sum(points.values()) - sum(before.values()),
-        duration=plan.trajectory.duration_ns / 1e9,
-        length=plan.length,
-        wall=wall,
-        planning=planning_s,
-        recording=recording_s,
-        stages=recording.watch.seconds,
-        effects=recording.settings.stages.effects(recording.effects.counts),
-    )
 
 
 def _finish(
@@ -277,7 +239,6 @@ def _verify(recording: Recording, jobs: Sequence[SensorFrame], *, progress: Prog
 
 
 def _pending(plan: DrivePlan, journal: Journal) -> list[SensorFrame]:
-    """The frames that are not finished."""
     finished = {name: np.zeros(count, bool) for name, count in plan.frames.items()}
     for name, done in finished.items():
         done[journal.entries.of(name).frame] = True
@@ -311,19 +272,26 @@ def _begun(out: Path, manifest: Mapping[str, Any], *, overwrite: bool) -> Iterat
 
 
 def record_all(
-    recording: Recording,
+    plan: DrivePlan,
     jobs: Sequence[SensorFrame],
     *,
-    scene: Scene,
+    recording: Recording,
+    cluster: DaskCluster | None,
     journal: Journal,
-    workers: int = 1,
-    progress: Progress = silent,
-    shown: Show | None = None,
+    progress: Progress,
+    live: Live | None,
 ) -> None:
-    """Record frames and add them to the journal; ``shown`` is called with each of them."""
+    """Record frames by threads or on a cluster, and add them to the journal."""
+    if cluster is not None:
+        chunks = recording_chunks(jobs, recording)
+        record_on_cluster(
+            plan, recording=recording, chunks=chunks, cluster=cluster, journal=journal, progress=progress
+        )
+        return
     progress("driving", 0, total=len(jobs))
+    shown = None if live is None else live(plan)
     task = partial(_record, recording=recording, journal=journal, keep=shown is not None)
-    recorded = run_jobs(task, jobs, recording=recording, scene=scene, workers=workers)
+    recorded = run_jobs(task, jobs, recording=recording, scene=plan.scene, workers=plan.options.workers)
     for done, measured in enumerate(recorded, 1):
         if shown is not None and measured is not None:
             shown(measured)

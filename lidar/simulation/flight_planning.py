@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +16,7 @@ from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
 from geoscene.typing import Float, Ints
-from lidar.errors import InputError, RouteError
+from lidar.errors import RouteError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import LONGEST_S, check_duration
 from lidar.motion.flight import (
@@ -30,9 +29,10 @@ from lidar.motion.flight import (
 from lidar.motion.motion import drive_path
 from lidar.motion.path import plan_path
 from lidar.motion.road_drive import ROUTE_MARGIN_S, graph_on_tiles
-from lidar.motion.route import Route, RouteOptions, Spec, plan_route
+from lidar.motion.route import Route, RouteOptions, plan_route
 from lidar.motion.vehicle import Vehicle
 from lidar.motion.waypoints import read_track
+from lidar.options import DriveOptions
 from lidar.sensors.rig.camera_model import unproject
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
@@ -41,6 +41,7 @@ from lidar.world.world import World
 ALTITUDES = {"slow": 60.0, "fast": 600.0}
 """Default metres above the ground of aircraft slower and faster than 30 m/s."""
 
+_RANDOM_SECONDS = 60.0  # of a random flight
 _STREET_RADIUS = 20.0  # metres, largest turning radius that can follow streets
 _HIGH = 1e4
 _LAYERS = 16  # surfaces above the ground that a vertical ray passes at most
@@ -51,59 +52,27 @@ _FURTHEST = 20_000.0  # metres from the scene to a waypoint; sensors do not rang
 _GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
 
 
-@dataclass(frozen=True, slots=True)
-class FlightOptions:
-    """Parameters of flight planning.
-
-    survey    : ``all``, W,S,E,N in degrees, or a GeoJSON file with a polygon: the area to fly over in
-                parallel strips, instead of a route
-    altitude  : metres above the ground below each point; surveys of craft that cannot hover (`cruise`) are
-                level, above the highest ground below them. By default the heights of the route's file, or
-                `ALTITUDES`
-    overlap   : share of a strip that the next one covers too
-    turns     : scan in the turns between strips too
-    seed      : of a random route
-    duration  : seconds; a whole survey or given route by default
-    from_rest : start a random flight at rest
-    """
-
-    survey: str = ""
-    altitude: float | None = None
-    overlap: float = 0.3
-    turns: bool = False
-    seed: int = 0
-    duration: float | None = None
-    from_rest: bool = False
-
-
 def plan_flight(
-    scene: Scene,
-    spec: Spec,
-    *,
-    vehicle: Vehicle,
-    sensors: Sequence[Scanner | Camera],
-    options: FlightOptions,
+    scene: Scene, *, vehicle: Vehicle, sensors: Sequence[Scanner | Camera], options: DriveOptions
 ) -> tuple[Trajectory, Ints | None]:
     """The flight of an aircraft over a scene, and the times at which its scanners work.
 
-    These are (k, 2) int64 nanoseconds from and to which they work; None for always.
-
-    spec : ``random`` (over streets), a file of waypoints, or waypoints (latitude, longitude); not used for a
-           survey
+    These are (k, 2) int64 nanoseconds from and to which they work; None for always. A random route is over
+    streets. Surveys of craft that cannot hover (`cruise`) are level, above the highest ground below them.
 
     Raises RouteError for a flight that the aircraft cannot fly or that would collide with the scene.
     """
-    survey, above, duration = options.survey, _above(vehicle, options), options.duration
+    survey, above, duration = options.survey, _above(vehicle, options), _seconds(options)
     below = _SceneBelow(scene)
     if survey:
         route, lines, spacing = _strips(
             scene, vehicle, sensors=sensors, options=options, height=above, below=below
         )
     else:
-        route = _along(scene, spec, vehicle=vehicle, options=options, above=above, below=below)
+        route = _along(scene, vehicle=vehicle, options=options, above=above, below=below)
         if duration is None:
             check_duration(route.least_seconds(vehicle.max_speed), what="the route")
-    at_speed = spec == "random" and not survey and not options.from_rest
+    at_speed = _is_random(options) and not options.from_rest
     trajectory = drive_path(plan_path(route, vehicle, frame=scene.frame), vehicle, at_speed=at_speed)
     if duration is not None:
         trajectory = trajectory.until(round(duration * 1e9))
@@ -120,12 +89,7 @@ def plan_flight(
 
 
 def flight_course(
-    roads: RoadMap,
-    spec: Spec,
-    *,
-    vehicle: Vehicle,
-    sensors: Sequence[Scanner | Camera],
-    options: FlightOptions,
+    roads: RoadMap, *, vehicle: Vehicle, sensors: Sequence[Scanner | Camera], options: DriveOptions
 ) -> Float:
     """Scene metres (n, 2) of the course that `plan_flight` will plan over the scene of a map.
 
@@ -135,11 +99,20 @@ def flight_course(
     if options.survey:
         route, _, _ = _strips(roads, vehicle, sensors=sensors, options=options, height=above, below=_LEVEL)
     else:
-        route = _along(roads, spec, vehicle=vehicle, options=options, above=above, below=_LEVEL)
+        route = _along(roads, vehicle=vehicle, options=options, above=above, below=_LEVEL)
     return plan_path(route, vehicle, frame=roads.frame).position[:, :2]
 
 
-def _above(vehicle: Vehicle, options: FlightOptions) -> float:
+def _is_random(options: DriveOptions) -> bool:
+    return options.route in ("", "random") and not options.survey
+
+
+def _seconds(options: DriveOptions) -> float | None:
+    """Seconds of a flight; None for a whole survey or given route."""
+    return _RANDOM_SECONDS if options.duration is None and _is_random(options) else options.duration
+
+
+def _above(vehicle: Vehicle, options: DriveOptions) -> float:
     """Metres of a flight above the ground."""
     if options.altitude is not None:
         return options.altitude
@@ -212,23 +185,17 @@ class _SceneBelow:
 
 
 def _along(
-    scene: Scene | RoadMap,
-    spec: Spec,
-    *,
-    vehicle: Vehicle,
-    options: FlightOptions,
-    above: float,
-    below: _Ground,
+    scene: Scene | RoadMap, *, vehicle: Vehicle, options: DriveOptions, above: float, below: _Ground
 ) -> Route:
     """The route along waypoints or streets, ``above`` metres over the ground."""
-    if isinstance(spec, str) and spec == "random":
+    spec, seconds = options.route, _seconds(options)
+    if _is_random(options):
         if vehicle.turning_radius > _STREET_RADIUS:
             raise RouteError(
                 f"a craft that turns within {vehicle.turning_radius:.0f} m cannot follow streets; give"
                 " `survey` all, `survey` FILE or waypoints"
             )
-        seconds = 60.0 if options.duration is None else options.duration
-        length = vehicle.max_speed * (seconds + ROUTE_MARGIN_S)
+        length = vehicle.max_speed * ((seconds or _RANDOM_SECONDS) + ROUTE_MARGIN_S)
         graph = graph_on_tiles(scene.graph if isinstance(scene, RoadMap) else scene.road_graph(), scene)
         line = plan_route(
             graph, scene.frame, spec="random", options=RouteOptions(seed=options.seed, length=length)
@@ -260,16 +227,14 @@ def _strips(
     vehicle: Vehicle,
     *,
     sensors: Sequence[Scanner | Camera],
-    options: FlightOptions,
+    options: DriveOptions,
     height: float,
     below: _Ground,
 ) -> tuple[Route, Float, float]:
     """The route in strips along an area's longer side, the strips (k, 2, 2), and their spacing."""
-    area, overlap = survey_area(scene, options.survey), options.overlap
-    if not 0.0 <= overlap < 1.0:
-        raise InputError(f"`overlap` {overlap:g}: a share from 0 to less than 1")
+    area = survey_area(scene, options.survey)
     scale = float(np.asarray(scene.frame.scale_at(area.centroid.x, area.centroid.y)))
-    spacing = swath(sensors, height) * (1.0 - overlap) * scale
+    spacing = swath(sensors, height) * (1.0 - options.overlap) * scale
     corner = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
     sides = np.diff(corner[:3], axis=0)
     dx, dy = sides[int(np.argmax(np.hypot(*sides.T)))]

@@ -1,25 +1,40 @@
-"""The loop over the frames of a drive: threads take them in order of time, near one another at a time."""
+"""The loop over the frames of a drive, which are measured in the simulated world and written as files.
+
+Threads take them in order of time, near one another at a time, or workers of a Dask cluster some at a time.
+"""
 
 from __future__ import annotations
 
 import os
+import pickle
+import secrets
+import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
 from geoscene.scene import Scene
+from geoscene.support.cluster import DaskCluster
+from geoscene.support.csv_tables import write_columns
+from geoscene.support.files import write_atomically
+from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
+from lidar.dataset.journal import Journal
 from lidar.geometry.poses import Trajectory
-from lidar.sensors.rig.devices import Scanner
+from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.signal.attacks.attacker import Seen, check_sight, sent_only
-from lidar.signal.situation import Situation
+from lidar.signal.situation import Counts, Situation
+from lidar.signal.truth import write_truth
 from lidar.simulation.plan import DrivePlan, SensorFrame
-from lidar.simulation.recording import Recording
+from lidar.simulation.record_clouds import measure_cloud, write_labelled_clouds
+from lidar.simulation.recording import MeasuredCloud, MeasuredImages, Recording
 from lidar.simulation.situations import situation_of
 from lidar.world.world import Region, Worlds
 
@@ -146,3 +161,145 @@ def chunks(
 
 def _box(low: Float, high: Float) -> Region:
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def record_frame(
+    recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds
+) -> MeasuredCloud | MeasuredImages:
+    """Simulate one frame and write its files. Several threads may do so at once."""
+    measured = measure_frame(recording, sensor, frame=frame, worlds=worlds)
+    paths = recording.paths(sensor, frame)
+    if "truth" in paths:
+        write_truth(paths["truth"], measured.truth)
+    if "boxes" in paths:
+        with recording.watch.stage("boxes"):
+            write_columns(paths["boxes"], measured.boxes)
+    if isinstance(sensor, Scanner):
+        assert isinstance(measured, MeasuredCloud)  # noqa: S101
+        write_labelled_clouds(recording, sensor, measured=measured, paths=paths)
+        return measured
+    from lidar.simulation.record_images import write_images  # noqa: PLC0415  (0.1 s)
+
+    assert isinstance(measured, MeasuredImages)  # noqa: S101
+    write_images(recording, measured, paths=paths)
+    return measured
+
+
+def measure_frame(
+    recording: Recording, sensor: Scanner | Camera, *, frame: int, worlds: Worlds
+) -> MeasuredCloud | MeasuredImages:
+    """Simulate one frame as `record_frame` does, without files. Several threads may do so at once."""
+    if isinstance(sensor, Camera):
+        from lidar.simulation.record_images import measure_images  # noqa: PLC0415  (0.1 s)
+
+        return measure_images(recording, sensor, frame=frame, worlds=worlds)
+    return measure_cloud(recording, sensor, frame=frame, worlds=worlds)
+
+
+_FRAMES = 8
+"""Frames of a task: few, so that the tasks of a lost worker are soon repeated."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Frames to record.
+
+    plan   : file with the plan of the drive
+    out    : dataset
+    region : that the vehicle stays in
+    frames : rows of the plan's sensors, and frame numbers
+    """
+
+    plan: Path
+    out: Path
+    region: Region
+    frames: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """Result of a task: recorded frames.
+
+    frames  : sensor, frame, points, SHA-256 of the files
+    seconds : by stage
+    effects : what stages of signals did
+    """
+
+    frames: tuple[tuple[str, int, int, bytes], ...]
+    seconds: dict[str, float]
+    effects: Counts
+
+
+def record_on_cluster(
+    plan: DrivePlan,
+    *,
+    recording: Recording,
+    chunks: Iterable[tuple[Sequence[SensorFrame], Region]],
+    cluster: DaskCluster,
+    journal: Journal,
+    progress: Progress = silent,
+) -> None:
+    """Record frames and add them to the journal.
+
+    chunks : frames during which the vehicle stays in a region, and the region
+    """
+    out, scene = recording.out.resolve(), replace(plan.scene, path=plan.scene.path.resolve())
+    cluster.check(out, inputs=[] if scene.stored else [scene.files.manifest])  # workers fetch stored ones
+    file = out / f"plan-{secrets.token_hex(8)}.part"
+    tasks = [
+        _Task(file, out, region, tuple((job.order, job.frame) for job in jobs[k : k + _FRAMES]))
+        for jobs, region in chunks
+        for k in range(0, len(jobs), _FRAMES)
+    ]
+    done, total = 0, sum(len(task.frames) for task in tasks)
+    progress("driving", done, total=total)
+    write_atomically(file, pickle.dumps(replace(plan, scene=scene, jobs=())))
+    try:
+        for result in cluster.run_tasks(_record_task, tasks):
+            for sensor, frame, points, digests in result.frames:
+                journal.add(sensor, frame, points=points, digests=digests)
+            recording.watch.add(result.seconds)
+            for stage, counts in result.effects.items():
+                recording.effects.add(stage, counts)
+            done += len(result.frames)
+            progress("driving", done, total=total)
+    finally:
+        file.unlink(missing_ok=True)
+    for left in out.rglob("*.part"):  # of workers that were lost while writing
+        left.unlink()
+
+
+class _Station(threading.local):
+    """State that a worker's thread keeps between frames of a drive."""
+
+    plan = Path()
+    recording: Recording
+    sensors: tuple[Scanner | Camera, ...]
+    worlds: Worlds
+
+
+_station = _Station()
+
+
+def _record_task(task: _Task) -> _Done:
+    """Record the frames of a task; run by workers."""
+    if _station.plan != task.plan:
+        plan: DrivePlan = pickle.loads(task.plan.read_bytes())  # noqa: S301 - of the program that gave the task
+        _station.recording = plan.recording(task.out)
+        _station.sensors = plan.sensors
+        _station.worlds = Worlds(
+            plan.scene, plan.max_range, actors=plan.actors, settings=_station.recording.settings.world
+        )
+        _station.plan = task.plan
+    recording, worlds = _station.recording, _station.worlds
+    recording.watch.seconds.clear()
+    recording.effects.counts.clear()
+    with recording.watch.stage("load"):
+        worlds.follow(task.region)
+    frames = []
+    for row, frame in task.frames:
+        sensor = _station.sensors[row]
+        points = record_frame(recording, sensor, frame=frame, worlds=worlds).points
+        with recording.watch.stage("digest"):
+            frames.append((sensor.name, frame, points, recording.digests(sensor, frame)))
+    return _Done(tuple(frames), dict(recording.watch.seconds), dict(recording.effects.counts))

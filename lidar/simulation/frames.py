@@ -26,12 +26,10 @@ from lidar.sensors.rig.specs import GnssSpec, ImuSpec
 from lidar.signal.registry import Stages
 from lidar.signal.run import altered_fixes, altered_samples
 from lidar.signal.situation import Situation
-from lidar.simulation.frame_loop import check_attackers, run_jobs
-from lidar.simulation.measured import Columns, MeasuredCloud, MeasuredImages
-from lidar.simulation.navigation_files import observed_fixes
+from lidar.simulation.frame_loop import check_attackers, measure_frame, run_jobs
+from lidar.simulation.metadata import observed_fixes
 from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
-from lidar.simulation.record import measure_frame
-from lidar.simulation.recording import Recording
+from lidar.simulation.recording import Columns, MeasuredCloud, MeasuredImages, Recording
 from lidar.simulation.situations import situation_of_unit
 from lidar.world.world import Worlds
 
@@ -100,7 +98,7 @@ class DriveFrame:
         """Columns of the bounding boxes that go with `clouds` and `images`, by sensor; none without traffic.
 
         Of a scanner they are 3D boxes in the scene and from the ego vehicle, see
-        `lidar.dataset.boxes.box_rows`; of a camera 2D boxes in pixels.
+        `lidar.dataset.ground_truth.box_rows`; of a camera 2D boxes in pixels.
         """
         return {name: one.boxes for name, one in self.sensors.items() if one.boxes}
 
@@ -189,7 +187,6 @@ def _steps(
 
 
 def _within(readings: Readings, span_ns: tuple[int, int]) -> Readings:
-    """The readings from a time on and before another."""
     first, last = np.searchsorted(readings.time_ns, span_ns)
     taken: Readings = readings.take(slice(int(first), int(last)))
     return taken

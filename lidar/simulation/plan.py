@@ -19,14 +19,13 @@ from geoscene.pipeline.reach import OFFSET, RoadMap
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float, Ints
-from lidar.dataset.provenance import scene_provenance, versions
+from lidar.dataset.derived import scene_provenance, versions
 from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import check_duration, check_start
-from lidar.motion.road_conditions import vehicle_on
 from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
-from lidar.motion.vehicle import Vehicle, load_vehicle
+from lidar.motion.vehicle import Vehicle, load_vehicle, vehicle_on
 from lidar.options import DriveOptions
 from lidar.raycast.device import check_device
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
@@ -35,14 +34,12 @@ from lidar.signal.attacks.placed_object import with_objects
 from lidar.signal.stage import LABELS, POSES, ROAD_USERS
 from lidar.simulation.recording import Recording
 from lidar.traffic.ego_drive import drive_in_traffic, drive_with_signals
+from lidar.traffic.options import TrafficFile
 from lidar.world.actors import Actors
 from lidar.world.settings import check_relief, origin_limit
 
 if TYPE_CHECKING:
-    from lidar.simulation.flight_planning import FlightOptions
     from lidar.traffic.signal_heads import SignalStates
-
-_RANDOM_SECONDS = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -325,9 +322,7 @@ def plan_motion(
     from lidar.simulation.flight_planning import plan_flight  # noqa: PLC0415
 
     progress("planning", 0, total=0)
-    trajectory, scanning_ns = plan_flight(
-        scene, route, vehicle=vehicle, sensors=sensors, options=flight_options(options)
-    )
+    trajectory, scanning_ns = plan_flight(scene, vehicle=vehicle, sensors=sensors, options=options)
     return PlannedMotion(trajectory, scanning_ns=scanning_ns)
 
 
@@ -338,24 +333,6 @@ def road_drive_options(options: DriveOptions, scene: Scene | RoadMap) -> RoadDri
         seed=options.seed,
         duration=options.duration,
         side=options.side_in(scene),
-        from_rest=options.from_rest,
-    )
-
-
-def flight_options(options: DriveOptions) -> FlightOptions:
-    """Parameters of flight planning from the options of a drive."""
-    from lidar.simulation.flight_planning import FlightOptions  # noqa: PLC0415
-
-    seconds = options.duration
-    if seconds is None and options.route in ("", "random") and not options.survey:
-        seconds = _RANDOM_SECONDS
-    return FlightOptions(
-        survey=options.survey,
-        altitude=options.altitude,
-        overlap=options.overlap,
-        turns=options.turns,
-        seed=options.seed,
-        duration=seconds,
         from_rest=options.from_rest,
     )
 
@@ -375,8 +352,7 @@ def _signals(
     traffic = options.traffic
     if not any(isinstance(sensor, Camera) and "rgb" in sensor.spec.images for sensor in sensors):
         return None
-    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (not for drives without cameras)
-    from lidar.traffic.signal_heads import signal_states  # noqa: PLC0415
+    from lidar.traffic.signal_heads import signal_states  # noqa: PLC0415  (not without cameras)
 
     if isinstance(traffic, TrafficFile):
         return None
@@ -403,8 +379,7 @@ def _with_traffic(
     trajectory = motion.trajectory
     if options.traffic is None:
         return trajectory, None
-    from lidar.traffic.fcd import TrafficFile  # noqa: PLC0415  (0.1 s)
-    from lidar.traffic.fcd_replay import replay  # noqa: PLC0415
+    from lidar.traffic.fcd_replay import replay  # noqa: PLC0415  (0.1 s)
     from lidar.traffic.populate import populate  # noqa: PLC0415
 
     progress("traffic", 0, total=0)

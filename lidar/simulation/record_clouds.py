@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.csv_tables import write_columns
 from geoscene.typing import Float
-from lidar.dataset.deskew import MOMENTS, deskew
-from lidar.dataset.formats.table import FrameInfo, PointLabels, Table, cloud_table
+from lidar.dataset.formats.table import MOMENTS, FrameInfo, PointLabels, Table, cloud_table, deskew
 from lidar.errors import LidarError
 from lidar.geometry.random_streams import generator
 from lidar.geometry.time_scales import gps_seconds
@@ -21,33 +19,27 @@ from lidar.sensors.laser.scan import Sweep, cast, find_pulse, measure
 from lidar.sensors.rig.devices import Scanner
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.signal.run import altered_sweep
-from lidar.signal.truth import Altered, cloud_truth, trace_unaltered, write_truth
+from lidar.signal.truth import Altered, cloud_truth, trace_unaltered
 from lidar.simulation.boxes import box_rows, count_points
-from lidar.simulation.measured import MeasuredCloud, firing_times, placed_cloud
-from lidar.simulation.recording import Recording
+from lidar.simulation.recording import MeasuredCloud, Recording, firing_times, placed_cloud
 from lidar.simulation.situations import situation_of
 from lidar.world.actors import Actors
 from lidar.world.world import World, Worlds
 
 
-def record_cloud(recording: Recording, scanner: Scanner, *, frame: int, worlds: Worlds) -> MeasuredCloud:
-    """Scan one frame and write its clouds, labels and boxes."""
-    paths = recording.paths(scanner, frame)
-    measured = measure_cloud(recording, scanner, frame=frame, worlds=worlds)
+def write_labelled_clouds(
+    recording: Recording, scanner: Scanner, *, measured: MeasuredCloud, paths: dict[str, Path]
+) -> None:
+    """Write the cloud of a frame in every format, and its labels."""
     cloud = measured.cloud
-    if "truth" in paths:
-        write_truth(paths["truth"], measured.truth)
-    write_clouds(recording, scanner, frame=frame, cloud=cloud, paths=paths, velocity=measured.velocity)
+    write_clouds(
+        recording, scanner, frame=measured.frame, cloud=cloud, paths=paths, velocity=measured.velocity
+    )
     for form in recording.settings.label_formats:
         form.write(paths[f"labels {form.name}"], _point_labels(cloud, recording.actors))
-    if "boxes" in paths:
-        with recording.watch.stage("boxes"):
-            write_columns(paths["boxes"], measured.boxes)
-    return measured
 
 
 def _point_labels(cloud: Cloud, actors: Actors | None) -> PointLabels:
-    """The labels of a cloud's points."""
     road_user, moving = np.zeros(len(cloud), np.int64), np.zeros(len(cloud), bool)
     if actors is not None and len(actors):
         row = cloud.feature.astype(np.int64) - int(actors.feature[0])

@@ -19,31 +19,21 @@ from lidar.sensors.camera.render import optical_flow, render
 from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera
 from lidar.signal.run import altered_image
-from lidar.signal.truth import image_truth, write_truth
-from lidar.simulation.boxes import ImageBoxes, image_boxes
-from lidar.simulation.measured import MeasuredImages
-from lidar.simulation.recording import Recording
-from lidar.simulation.signals import lamps_at, signal_columns
+from lidar.signal.truth import image_truth
+from lidar.simulation.boxes import image_boxes
+from lidar.simulation.recording import MeasuredImages, Recording
 from lidar.simulation.situations import situation_of, sun_during
-from lidar.world.actors import Actors
+from lidar.traffic.signal_heads import STATES, SignalStates
 from lidar.world.world import World, Worlds
 
 
-def record_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
-    """Render one frame and write its images and boxes."""
-    paths, watch = recording.paths(camera, frame), recording.watch
-    measured = measure_images(recording, camera, frame=frame, worlds=worlds)
-    if "boxes" in paths:
-        with watch.stage("boxes"):
-            write_columns(paths["boxes"], measured.boxes)
+def write_images(recording: Recording, measured: MeasuredImages, *, paths: dict[str, Path]) -> None:
+    """Write the images of a frame as PNG, and the signal heads in them."""
     if "signals" in paths:
         write_columns(paths["signals"], measured.signals)
-    if "truth" in paths:
-        write_truth(paths["truth"], measured.truth)
-    for kind in camera.spec.images:
-        with watch.stage(f"write {kind}"):
+    for kind in measured.camera.images:
+        with recording.watch.stage(f"write {kind}"):
             _write_image(paths[kind], measured, kind=kind)
-    return measured
 
 
 def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: Worlds) -> MeasuredImages:
@@ -66,15 +56,15 @@ def measure_images(recording: Recording, camera: Camera, *, frame: int, worlds: 
         signals = signal_columns(shown, image, pose=pose, frame=frame, time_ns=middle)
     if recording.actors is not None:
         with recording.watch.stage("boxes"):
-            found = image_boxes(
+            boxes = image_boxes(
                 recording.actors,
                 camera.spec,
                 pose=pose,
+                frame=frame,
                 time_ns=middle,
                 instance=image.feature,
                 span_ns=(start, int(times[-1])),
             )
-            boxes = _box_columns(recording.actors, found, frame=frame, time_ns=middle)
     if recording.has_stages(camera):
         original = image
         at = situation_of(recording, camera, frame=frame, world=world)
@@ -138,23 +128,6 @@ def _write_image(path: Path, measured: MeasuredImages, *, kind: str) -> None:
         write_png(path, feature_to_image(image.feature))
 
 
-def _box_columns(actors: Actors, found: ImageBoxes, *, frame: int, time_ns: int) -> dict[str, Any]:
-    """Columns of the 2D boxes of an image."""
-    sides = ("left", "top", "right", "bottom")
-    return {
-        "frame": np.full(len(found.row), frame),
-        "time_ns": np.full(len(found.row), time_ns),
-        "id": found.row,
-        "instance": actors.feature[found.row],
-        "class": np.array([Class(int(k)).name.lower() for k in actors.klass[found.row]], np.str_),
-        "kind": actors.kind[found.row],
-        **{side: np.round(found.box[:, k], 2) for k, side in enumerate(sides)},
-        **{f"seen_{side}": found.seen[:, k] for k, side in enumerate(sides)},
-        "pixels": found.pixels,
-        "visibility": np.round(found.visibility, 4),
-    }
-
-
 def _poses(recording: Recording, camera: Camera, *, times: NDArray[np.int64]) -> Poses:
     """Poses of a camera at times (k,)."""
     mount = camera.spec.mount
@@ -174,3 +147,50 @@ def _flow(
     shares = [(t - start) / (end - start) for t in (times, later)]
     here, there = (_poses(recording, camera, times=t) for t in (times, later))
     return optical_flow(camera.spec, here, later=there, world=world, times=shares[0], later_times=shares[1])
+
+
+_LAMPS_Z = 2.9  # metres of the middle of the lamps above the foot of the post
+
+
+def lamps_at(signals: SignalStates, time_ns: int) -> Lamps:
+    """The lamps that are lit at a time, nanoseconds since the drive's start."""
+    return Lamps(signals.heads.feature, signals.at(time_ns * 1e-9))
+
+
+def signal_columns(
+    signals: SignalStates, image: Image, *, pose: Poses, frame: int, time_ns: int
+) -> dict[str, NDArray[Any]]:
+    """Columns of ``signals.csv``: the signal heads (k,) in an image.
+
+    image   : as it was rendered, before stages
+    pose    : of the camera, one
+    time_ns : at which the heads show their states, nanoseconds since the drive's start
+    """
+    heads = signals.heads
+    v, u = np.nonzero(image.klass == Class.TRAFFIC_LIGHT)
+    seen = image.feature[v, u]
+    known = np.isin(seen, heads.feature)
+    v, u, seen = v[known], u[known], seen[known]
+    feature, which, pixels = np.unique(seen, return_inverse=True, return_counts=True)
+    row = np.searchsorted(heads.feature, feature)
+    k = len(feature)
+    low, high = np.full((k, 2), np.inf), np.full((k, 2), -np.inf)
+    for side, at in enumerate((u, v)):
+        np.minimum.at(low[:, side], which, at - 0.5)
+        np.maximum.at(high[:, side], which, at + 0.5)
+    toward = pose.position - heads.place[row] - [0.0, 0.0, _LAMPS_Z]
+    front = np.column_stack([np.cos(heads.heading[row]), np.sin(heads.heading[row]), np.zeros(k)])
+    cosine = np.einsum("ij,ij->i", toward, front) / np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
+    return {
+        "frame": np.full(k, frame),
+        "time_ns": np.full(k, time_ns),
+        "instance": feature,
+        "state": np.array(STATES, np.str_)[signals.at(time_ns * 1e-9)[row]],
+        "angle_deg": np.round(np.degrees(np.arccos(np.clip(cosine, -1, 1))), 1),
+        "junction": heads.zone[row],
+        "left": low[:, 0],
+        "top": low[:, 1],
+        "right": high[:, 0],
+        "bottom": high[:, 1],
+        "pixels": pixels,
+    }

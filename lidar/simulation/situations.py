@@ -14,7 +14,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene, open_scene
 from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.sensors.camera.light import Light, sun_direction
 from lidar.sensors.laser.cloud import Cloud

@@ -16,7 +16,13 @@ from geoscene.classes import Class
 from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.checksums import write_checksums
-from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.derived import (
+    check_target,
+    complete_folder,
+    copy_dataset,
+    derived_from,
+    write_folder_provenance,
+)
 from lidar.dataset.foreign import (
     KITTI,
     foreign_clouds,
@@ -27,11 +33,10 @@ from lidar.dataset.foreign import (
 )
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import cloud_table
+from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png, write_png
-from lidar.dataset.provenance import derived_from, write_folder_provenance
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.options import ApplyOptions, with_stage_settings
 from lidar.sensors.camera.render import CameraImage as Image
@@ -46,7 +51,7 @@ from lidar.signal.situation import Counts, Effects, Situation
 from lidar.signal.stage import LABELS, POSES
 from lidar.signal.truth import Past, image_past, image_truth, truth_since, write_truth
 from lidar.simulation.boxes import merge_box_files
-from lidar.simulation.navigation_files import record_fixes, record_samples
+from lidar.simulation.metadata import record_fixes, record_samples
 from lidar.simulation.record_clouds import sent_pulses
 from lidar.simulation.recording import Recording
 from lidar.simulation.situations import RecordedSurroundings, situation_of, situation_of_unit, surroundings_of

@@ -17,12 +17,11 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import unknown_name
 from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
-from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset, derived_from
 from lidar.dataset.formats import ALL, FORMATS, Format
 from lidar.dataset.formats.table import Table, table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.layouts import EXPORTERS, ExportSummary
-from lidar.dataset.provenance import derived_from
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.time_scales import drive_ns

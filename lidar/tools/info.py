@@ -19,14 +19,13 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
+from lidar.dataset.derived import read_folder_provenance
 from lidar.dataset.foreign import foreign_clouds, read_foreign_stages
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Dataset, Paths, open_dataset, opened_rows, reading_file
-from lidar.dataset.provenance import read_folder_provenance
 from lidar.errors import DatasetError
-from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
-from lidar.geometry.mounts import OPTICAL
+from lidar.geometry.attitude import OPTICAL, euler_from_quat, quat_from_matrix
 from lidar.signal.registry import ATTACKS
 
 _TABLE_BYTES = 2**24

@@ -15,9 +15,9 @@ from lidar.dataset.foreign import foreign_truth
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.kitti import read_labels
 from lidar.dataset.formats.table import PointLabels, table_cloud
+from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, Paths, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.options import with_stage_settings

@@ -12,11 +12,10 @@ from geoscene.support.files import delete_leftovers, exclusive, write_atomically
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, write_checksums
-from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.derived import check_target, complete_folder, copy_dataset, derived_from
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import table_cloud
 from lidar.dataset.layout import Dataset, Paths, open_dataset
-from lidar.dataset.provenance import derived_from
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.laser.cloud import Cloud

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table
+from lidar.dataset.ground_truth import read_boxes
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.png import read_png
 from lidar.dataset.recorded import Stream, cloud_points, color_images, instance_clouds, nearest, still_points
 from lidar.errors import DatasetError, InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 
 Sample = dict[str, Any]

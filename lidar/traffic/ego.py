@@ -15,9 +15,8 @@ from geoscene.roadgraph.routing import edge_lines
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
 from lidar.motion.path import Path
-from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.speed_profile import desired_speed
-from lidar.motion.vehicle import Vehicle
+from lidar.motion.vehicle import DRY, RoadConditions, Vehicle
 from lidar.traffic.junctions import JunctionPlan, signal_group, zone_at
 from lidar.traffic.lanes import STEP, ActorPath
 from lidar.traffic.simulation_kernel import MOTION, STEP_S, EgoMotion, records
@@ -96,7 +95,7 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     s = path.s + 1e-9 * np.arange(len(path))
     scale = float(path.scale.mean())
     heading = np.interp(at, s, path.heading)
-    ahead = scale * (vehicle.length / 2 - vehicle.rear_overhang)
+    ahead = scale * vehicle.middle
     axle = np.column_stack([np.interp(at, s, column) for column in path.position.T])
     xy = axle[:, :2] + ahead * np.column_stack([np.cos(heading), np.sin(heading)])
     row = np.searchsorted(s, at, side="right").clip(1, len(s)) - 1
@@ -117,14 +116,14 @@ def ego_trip(path: Path, vehicle: Vehicle, *, at_speed: bool = False, road: Road
     return EgoTrip(course, driver, vehicle.length + _ROOM[0], vehicle.width + _ROOM[1], xy, heading)
 
 
-def ego_motion(ego: Trajectory, box: tuple[float, float, float], *, graph: RoadGraph) -> EgoBox:
-    """The ego's motion and the area that others keep free of; ``box`` as in `simulate_trips`."""
-    length, width, ahead = box
+def ego_motion(ego: Trajectory, vehicle: Vehicle, *, graph: RoadGraph) -> EgoBox:
+    """The ego's motion and the area that others keep free of."""
+    length, width = vehicle.length, vehicle.width
     steps = int(ego.duration_ns * 1e-9 / STEP_S) + 2
     time = np.round(np.arange(steps) * STEP_S * 1e9).astype(np.int64)
     poses = ego.at(time)
     forward = poses.rotation[:, :, 0]
-    middle = poses.position + poses.scale * forward * ahead
+    middle = poses.position + poses.scale * forward * vehicle.middle
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     speed = np.interp(time, ego.time_ns, np.hypot(*ego.velocity[:, :2].T))
     motion = records(MOTION, x=middle[:, 0], y=middle[:, 1], heading=heading, speed=speed)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from geoscene.roadgraph.graph import RoadGraph
@@ -12,20 +10,17 @@ from geoscene.typing import Float
 from lidar.geometry.poses import Trajectory
 from lidar.motion.motion import ended_at_rest, motion_along, poses_along
 from lidar.motion.path import Path
-from lidar.motion.road_conditions import DRY, RoadConditions
 from lidar.motion.road_drive import RoadPlan
 from lidar.motion.speed_profile import motion_within
-from lidar.motion.vehicle import Vehicle
+from lidar.motion.vehicle import DRY, RoadConditions, Vehicle
 from lidar.traffic.ego import ego_trip
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import lanes_of
+from lidar.traffic.options import TrafficOptions
 from lidar.traffic.simulation import has_traffic_control, simulate_ego
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.trips import Trip
 from lidar.world.actors import Actors
-
-if TYPE_CHECKING:
-    from lidar.traffic.populate import TrafficOptions
 
 _ROUNDS = 3  # maximum number of simulations of the ego vehicle
 _SAME = 25.0  # metres between two trajectories from which the surroundings are the same

@@ -13,14 +13,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Literal, cast
+from typing import IO, TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
 from lidar.errors import FormatError
-from lidar.parameters import check_parameters, parameter
 
 if TYPE_CHECKING:
     from pyproj import Transformer
@@ -58,39 +57,6 @@ _WORDS = (
 """Words in the names of types, first match first, and their classes; "" for those left out."""
 _OTHER = {"private": "passenger", "evehicle": "passenger", "hov": "passenger", "vip": "passenger",
           "army": "truck", "authority": "passenger", "wheelchair": "pedestrian"}  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class TrafficFile:
-    """Traffic from a file of SUMO, with parked vehicles.
-
-    path  : floating car data, ``.xml`` or ``.xml.gz``
-    net   : SUMO network that the coordinates refer to; by default the one that the file names. Not needed
-            for longitudes and latitudes (``--fcd-output.geo``)
-    begin : SUMO's time in seconds at which the drive starts; the first in the file by default
-    side  : driving side
-
-    Raises InputError for values that are out of bounds.
-    """
-
-    path: Path
-    net: Path | None = None
-    begin: float | None = None
-    parked: float = parameter(
-        0.6, "share of the spaces along kerbs and in parking lots that are occupied", low=0, high=1
-    )
-    radius: float = parameter(
-        200.0,
-        "distance from the ego vehicle within which there are road users",
-        unit="m",
-        low=50,
-        high=1000,
-    )
-    side: Literal["right", "left"] = "right"
-
-    def __post_init__(self) -> None:
-        """Validate the values."""
-        check_parameters(self)
 
 
 @dataclass(frozen=True, slots=True)

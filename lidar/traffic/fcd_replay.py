@@ -18,8 +18,9 @@ from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.motion.vehicle import Vehicle
-from lidar.traffic.fcd import Fcd, TrafficFile, read_fcd
-from lidar.traffic.populate import TrafficOptions, TrafficSetup, parked_vehicles, traffic_setup
+from lidar.traffic.fcd import Fcd, read_fcd
+from lidar.traffic.options import TrafficFile, TrafficOptions
+from lidar.traffic.populate import TrafficSetup, parked_vehicles, traffic_setup
 from lidar.traffic.simulation_kernel import STEP_S
 from lidar.traffic.surroundings import LEFT
 from lidar.traffic.sweep import rectangles
@@ -292,7 +293,7 @@ def _find_touched(actors: Actors, ego: Trajectory, *, vehicle: Vehicle) -> Ints:
         near &= np.abs(at.position[:, 2] - pose.position[0, 2]) < 3.0
         if not near.any():
             continue
-        middle = pose.position[0, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+        middle = pose.position[0, :2] + scale * forward * vehicle.middle
         own = rectangles(
             middle[None], np.arctan2(forward[1:], forward[:1]), length=length * scale, width=width * scale
         )[0]

@@ -20,6 +20,7 @@ _ROUND = 3.0  # metres by which a junction reaches beyond half the width of its 
 _TOGETHER = (
     16.0  # metres between the parts of a junction with signals: carriageways apart, one set of signals
 )
+_CYCLE_S = 60.0
 AMBER = 5.0
 """Seconds without green at the end of each group's half cycle: amber and clearing."""
 
@@ -105,7 +106,7 @@ class JunctionPlan:
     signals: Signals
 
 
-def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 60.0) -> JunctionPlan:
+def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int) -> JunctionPlan:
     """Junctions with fixed-time signals of two groups where the map has signals."""
     zones = zones_of(graph)
     n = len(zones.polygon)
@@ -117,8 +118,8 @@ def junction_plan(graph: RoadGraph, lanes: Lanes, *, seed: int, cycle: float = 6
         signalised[z] = bool(graph.signals[nodes].any())
         if signalised[z]:
             first = int(graph.node_id[nodes].min())
-            shift[z] = generator(seed, "traffic", "signals", first).uniform(0, cycle)
-    return JunctionPlan(zones, axis, signalised, Signals(np.full(n, cycle), shift, np.empty((0, 4))))
+            shift[z] = generator(seed, "traffic", "signals", first).uniform(0, _CYCLE_S)
+    return JunctionPlan(zones, axis, signalised, Signals(np.full(n, _CYCLE_S), shift, np.empty((0, 4))))
 
 
 def signal_group(plan: JunctionPlan, zone: int, *, heading: float) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import shapely
@@ -16,14 +15,11 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
-from geoscene.support.registry import unknown_name
-from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
-from lidar.motion.road_conditions import DRY, RoadConditions
-from lidar.motion.vehicle import Vehicle
-from lidar.parameters import check_parameters, parameter
+from lidar.motion.vehicle import DRY, RoadConditions, Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
+from lidar.traffic.options import TrafficOptions
 from lidar.traffic.parked import ParkingSpaces, kerb_spaces, lot_spaces, parked_actors
 from lidar.traffic.pedestrians import pedestrian_trips, sidewalks_around
 from lidar.traffic.simulation import simulate_trips
@@ -37,35 +33,6 @@ _ROAD = ("road", "lane_marking", "crossing", "parking")
 _HEADROOM = 2.5  # metres, minimum height of a building part above a passage
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
-
-
-@dataclass(frozen=True, slots=True)
-class TrafficOptions:
-    """Densities of simulated road users, and the side of the road that they drive on.
-
-    Raises InputError for values that are out of bounds.
-    """
-
-    vehicles: float = parameter(12.0, "moving vehicles", unit="per km of lane", low=0, high=60)
-    cyclists: float = parameter(1.0, "cyclists", unit="per km of lane", low=0, high=30)
-    pedestrians: float = parameter(15.0, "pedestrians", unit="per km of sidewalk", low=0, high=400)
-    parked: float = parameter(
-        0.6, "share of the spaces along kerbs and in parking lots that are occupied", low=0, high=1
-    )
-    radius: float = parameter(
-        200.0,
-        "distance from the ego vehicle within which road users are simulated",
-        unit="m",
-        low=50,
-        high=1000,
-    )
-    side: Literal["right", "left"] = "right"
-
-    def __post_init__(self) -> None:
-        """Validate the values."""
-        check_parameters(self)
-        if self.side not in ("right", "left"):
-            raise InputError(unknown_name("`side`", self.side, known=("right", "left")))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +136,7 @@ def simulated_actors(
         setup.graph,
         plan=setup.plan,
         ego=ego,
-        ego_box=(vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang),
+        vehicle=vehicle,
         radius=setup.options.radius * setup.scale,
         obeys_signals=obeys_signals,
     )
@@ -253,7 +220,7 @@ def _ego_boxes(ego: Trajectory, vehicle: Vehicle, *, scale: float) -> NDArray[np
     every = np.unique(np.searchsorted(moved, np.arange(0.0, moved[-1] + 1.0, 1.0)).clip(0, len(moved) - 1))
     poses = ego.at(ego.time_ns[every])
     forward = poses.rotation[:, :2, 0]
-    middle = poses.position[:, :2] + scale * forward * (vehicle.length / 2 - vehicle.rear_overhang)
+    middle = poses.position[:, :2] + scale * forward * vehicle.middle
     heading = np.arctan2(forward[:, 1], forward[:, 0])
     return rectangles(middle, heading, length=vehicle.length + 1.2, width=vehicle.width + 0.5)
 

@@ -118,8 +118,7 @@ def signal_states(
     plan = junction_plan(graph, lanes, seed=seed)
     signals = plan.signals
     if fixed is not None:
-        box = vehicle.length, vehicle.width, vehicle.length / 2 - vehicle.rear_overhang
-        signals = signals._replace(window=green_windows(plan, ego_motion(fixed, box, graph=graph)))
+        signals = signals._replace(window=green_windows(plan, ego_motion(fixed, vehicle, graph=graph)))
     feature = np.asarray(layer.columns["feature"])[rows].astype(np.int32)
     rows, feature = rows[np.argsort(feature)], np.sort(feature)
     place = shapely.get_coordinates(layer.geometry[rows], include_z=True)

@@ -15,6 +15,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.geometry.poses import Trajectory
+from lidar.motion.vehicle import Vehicle
 from lidar.traffic.ego import EgoBox, EgoTrip, ego_motion, green_windows
 from lidar.traffic.junctions import JunctionPlan, Signals
 from lidar.traffic.lanes import STEP
@@ -72,21 +73,21 @@ def simulate_trips(
     *,
     plan: JunctionPlan,
     ego: Trajectory,
-    ego_box: tuple[float, float, float],
+    vehicle: Vehicle,
     radius: float,
     obeys_signals: bool = False,
 ) -> SimulatedTrips:
     """The motion of trips around a fixed ego trajectory, from its start to its end.
 
-    ego_box : length, width and metres from the rear axle to the middle of the ego's box
-    obeys_signals   : whether the ego's motion obeys the signals; otherwise they turn green for it
+    vehicle       : the ego
+    obeys_signals : whether the ego's motion obeys the signals; otherwise they turn green for it
 
     Trips that the ego would hit are left out.
     """
     moved = [SimulatedTrips.of_rows(np.empty((0, 4)))]
     if not trips:
         return moved[0]
-    known = ego_motion(ego, ego_box, graph=graph)
+    known = ego_motion(ego, vehicle, graph=graph)
     signals = plan.signals if obeys_signals else plan.signals._replace(window=green_windows(plan, known))
     simulation = TrafficSimulation(trips, graph, plan=plan, ego=known, signals=signals, radius=radius)
     excluded = np.zeros(len(trips), bool)
@@ -227,7 +228,6 @@ class TrafficSimulation:
             here, state = rows[stay], state[stay]
 
     def _tables(self, row: int) -> _Tables:
-        """The tables of a trip."""
         trip = self._trips[row]
         path, desired_speed = trip.course.path, trip.course.desired_speed
         xy, heading = trip.body()

@@ -12,7 +12,7 @@ import shapely
 from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
-from lidar.motion.road_conditions import DRY, GRAVITY, RoadConditions
+from lidar.motion.vehicle import DRY, GRAVITY, RoadConditions
 from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
 from lidar.traffic.surroundings import TrafficArea, entrances
 from lidar.traffic.sweep import body_poses, rectangles

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from geoscene.geometry.frames import Frame
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import GPS_EPOCH, LEAPS, check_start, gps_seconds, iso_times, leap_seconds
 from lidar.sensors.navigation.gnss import epochs, observe_gnss

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from helpers.sensor_worlds import driven
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.settings import PLAIN
 from lidar.sensors.rig.scanner import load_sensor

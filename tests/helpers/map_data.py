@@ -14,7 +14,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import gps_seconds
-from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.geometry.trajectory_files import write_trajectory
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 FRAME = Frame.at(24.945, 60.167)

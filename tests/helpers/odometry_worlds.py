@@ -7,7 +7,7 @@ from helpers.map_data import FRAME, START
 from lidar.dataset.formats import pcd
 from lidar.dataset.layout import open_dataset
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.geometry.trajectory_files import write_trajectory
 
 MOUNT = np.array([[0.0, -1, 0, 1.0], [1, 0, 0, 0.2], [0, 0, 1, 1.9], [0, 0, 0, 1]])
 CALIBRATION = {"kind": "lidar", "rate_hz": 10.0, "time_offset_ns": 0, "max_range": 100.0}

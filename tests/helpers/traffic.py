@@ -9,7 +9,6 @@ from lidar.traffic.lanes import STEP
 from lidar.traffic.sweep import rectangles
 
 CAR = load_vehicle("car")
-BOX = (CAR.length, CAR.width, CAR.length / 2 - CAR.rear_overhang)
 
 
 class Plane:

@@ -15,7 +15,7 @@ from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import rig_rows, sensor_rows
 from lidar.sensors.rig.scanner import load_sensor, sensor_names
 from lidar.sensors.rig.specs import load_rig, rig_names
-from lidar.settings import levels, list_settings, settings_of
+from lidar.settings import levels, setting_rows, settings_of
 from lidar.world.settings import WorldSettings
 
 
@@ -24,23 +24,23 @@ def program(*words, cwd="."):
 
 
 def test_every_setting_is_listed_with_its_value_at_each_level_and_a_meaning():
-    found = list_settings()
-    assert [s.name for s in found] == [
+    found = setting_rows()
+    assert [s["name"] for s in found] == [
         f.name for kind in (ScannerSettings, CameraSettings, WorldSettings) for f in fields(kind)
     ]
     for setting in found:
-        assert len(setting.values) == len(levels()) == 2
-        assert len(setting.meaning) > 10
-        assert "\n" not in setting.meaning
-    by_name = {s.name: s for s in found}
-    assert by_name["rays"].values == ("1", "19")
-    assert by_name["camera_noise"].values == ("off", "on")
-    assert "oren-nayar" in by_name["law"].meaning
+        assert list(setting)[2:4] == list(levels())
+        assert len(setting["meaning"]) > 10
+        assert "\n" not in setting["meaning"]
+    by_name = {s["name"]: s for s in found}
+    assert [by_name["rays"][level] for level in levels()] == ["1", "19"]
+    assert [by_name["camera_noise"][level] for level in levels()] == ["off", "on"]
+    assert "oren-nayar" in by_name["law"]["meaning"]
 
 
 def test_each_listed_value_can_be_set():
-    for k, level in enumerate(levels()):
-        pairs = [(s.name, s.values[k]) for s in list_settings()]
+    for level in levels():
+        pairs = [(s["name"], s[level]) for s in setting_rows()]
         assert settings_of("standard", pairs) == settings_of(level)
 
 

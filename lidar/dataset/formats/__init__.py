@@ -6,7 +6,6 @@ Modules are imported when a file is read or written, so that a list of the forma
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -78,10 +77,6 @@ class Format:
         """Raise MissingExtraError if the package that the format needs is not installed."""
         if self.extra:
             need(*self.extra.split())
-
-    def installed(self) -> bool:
-        """Whether the package that the format needs is installed."""
-        return not self.extra or importlib.util.find_spec(self.extra.split()[0]) is not None
 
     def read_chunks(self, path: Path) -> Iterator[Table]:
         """The point tables of a file of the world frame, some points at a time; raises as `read`."""

@@ -33,6 +33,7 @@ from geoscene.support.columns import row_blocks
 from geoscene.support.files import append, atomic_file, spool
 from geoscene.typing import Float
 from lidar.errors import FormatError, LidarError
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.laser.cloud import Cloud
 
@@ -214,3 +215,21 @@ def counted_file(
         yield write
         out.write(header(last, count))
         append(out, body)
+
+
+MOMENTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+"""Moments of a frame to which points can be de-skewed, as fractions of its period."""
+
+
+def deskew(placed: Float, trajectory: Trajectory, *, mount: Mount, time_ns: int) -> NDArray[np.float32]:
+    """Points (n, 3) in the frame that the sensor has at ``time_ns``, from the true poses.
+
+    placed : (n, 3) scene metres: each point at its own time
+
+    The ego vehicle's motion is removed; the motion of other road users is not.
+    """
+    pose = trajectory.at([time_ns]).mounted(mount.translation, mount.rotation)
+    local: NDArray[np.float32] = (((placed - pose.position) / pose.scale) @ pose.rotation[0]).astype(
+        np.float32
+    )
+    return local

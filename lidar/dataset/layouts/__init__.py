@@ -1,4 +1,4 @@
-"""Exporters of datasets to other layouts, one module and one row in `EXPORTERS` each.
+"""Exporters of datasets to other layouts, one function and one row in `EXPORTERS` each.
 
 Modules are imported when a dataset is exported, so that a list of the exporters costs nothing.
 """
@@ -36,18 +36,19 @@ class ExportSummary:
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A row of `EXPORTERS`, and a module with ``export``.
+    """A row of `EXPORTERS`, and a function of a module.
 
     ``export(dataset, folder, *, progress)`` writes a dataset into an empty folder and returns the number of
     objects that it wrote, by kind.
 
-    name    : by which users choose it
-    module  : in this folder
-    meaning : what is written, one line
-    mark    : a file that is always written: a folder is overwritten only if it holds one
-    names   : regular expression of the paths of the files that it writes; others are kept when overwriting
-    hint    : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell,
-              ``{date}`` for the time of the drive's start
+    name     : by which users choose it
+    module   : in this folder
+    meaning  : what is written, one line
+    mark     : a file that is always written: a folder is overwritten only if it holds one
+    names    : regular expression of the paths of the files that it writes; others are kept when overwriting
+    hint     : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell,
+               ``{date}`` for the time of the drive's start
+    function : of the module
     """
 
     name: str
@@ -56,6 +57,7 @@ class Exporter:
     mark: str
     names: str
     hint: str
+    function: str = "export"
 
     def export(
         self, dataset: Dataset, out: Path, *, overwrite: bool = False, progress: Progress = silent
@@ -68,11 +70,11 @@ class Exporter:
         if out.exists() and not overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
         from lidar.dataset.checksums import write_checksums  # noqa: PLC0415
-        from lidar.dataset.provenance import write_export_provenance  # noqa: PLC0415
+        from lidar.dataset.derived import write_export_provenance  # noqa: PLC0415
 
         module = importlib.import_module(f"{__name__}.{self.module}")
         with atomic_folder(out, mark=self.mark, names=f"{self.names}|{_OURS}") as folder:
-            counts = module.export(dataset, folder, progress=progress)
+            counts = getattr(module, self.function)(dataset, folder, progress=progress)
             write_export_provenance(dataset, folder, by=f"convert --to {self.name}")
             write_checksums(folder)
         hint = self.hint.format(path=out, quoted=shlex.quote(str(out)), date=dataset.start)
@@ -85,11 +87,12 @@ _OURS = r"provenance\.json|checksums\.sha256"
 _EXPORTERS = (
     Exporter(
         "bev",
-        "bev",
+        "sweep_images",
         "images from above of each sweep as GeoTIFF: height, intensity, number of returns",
         mark="bev.json",
         names=r"bev\.json|[^/]+/\d{6,}\.tif",
         hint="open a file of {path} with QGIS or rasterio",
+        function="export_from_above",
     ),
     Exporter(
         "coco",
@@ -139,19 +142,21 @@ _EXPORTERS = (
     ),
     Exporter(
         "kitti-tracking",
-        "kitti_tracking",
+        "kitti",
         "a sequence of KITTI's tracking benchmark: images, clouds and tracks of road users",
         mark="training/label_02/0000.txt",
         names=r"training/((label_02|calib)/0000\.txt|image_0[0-3]/0000/\d{6}\.png|velodyne/0000/\d{6}\.bin)",
         hint="the true tracks are {path}/training/label_02/0000.txt",
+        function="export_tracking",
     ),
     Exporter(
         "mcap",
-        "mcap",
+        "ros2",
         "one MCAP file of ROS 2 messages, with a layout for Foxglove",
         mark="foxglove.json",
         names=r"foxglove\.json|drive\.mcap",
         hint="open {path}/drive.mcap with Foxglove and import the layout foxglove.json",
+        function="export_for_foxglove",
     ),
     Exporter(
         "mot",
@@ -172,11 +177,12 @@ _EXPORTERS = (
     ),
     Exporter(
         "range-images",
-        "range_images",
+        "sweep_images",
         "each sweep as an image of its pulses, with labels, from which its points come back",
         mark="range_images.json",
         names=r"range_images\.json|[^/]+/(geometry\.json|(range|instance)/\d{6,}\.npy|(png|label)/\d{6,}\.png)",
         hint="a point is at range * (cos e cos a, cos e sin a, sin e): {path}/SCANNER/geometry.json",
+        function="export_range_images",
     ),
     Exporter(
         "ros2",

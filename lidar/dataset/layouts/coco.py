@@ -21,7 +21,7 @@ from geoscene.classes import Class, class_codes
 from geoscene.support.files import copy_file, write_atomically
 from geoscene.support.progress import Progress
 from geoscene.typing import Ints
-from lidar.dataset.boxes import boxes_by_frame
+from lidar.dataset.ground_truth import boxes_by_frame
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.png import feature_to_image, image_to_feature, read_png, write_png
 from lidar.dataset.recorded import Stream, all_images
@@ -162,15 +162,7 @@ class _Segments:
 
 def _segments(dataset: Dataset, camera: Stream, *, frame: int) -> _Segments:
     """The segments of a frame, by its semantic and instance images."""
-    paths = [dataset.paths.image(camera.name, frame, kind=kind) for kind in ("semantic", "instance")]
-    with reading_file(paths[0]):
-        klass = read_png(paths[0]).astype(np.int64)
-        if not np.isin(klass, [int(k) for k in Class]).all():
-            raise ValueError("pixels of no class")
-    with reading_file(paths[1]):
-        instance = image_to_feature(read_png(paths[1]).astype(np.uint8)).astype(np.int64)
-        if instance.shape != klass.shape:
-            raise ValueError("not of the size of the semantic image")
+    klass, instance = label_images(dataset, camera.name, frame=frame)
     instance = np.where(np.isin(klass, THINGS), instance, -1)
     keys, index = np.unique(klass << 32 | (instance + 1), return_inverse=True)
     index = index.reshape(klass.shape) + 1
@@ -264,21 +256,46 @@ def _numbers(segments: _Segments) -> list[int]:
 
 def _has_segments(dataset: Dataset, camera: Stream) -> bool:
     """Whether a camera recorded semantic and instance images of all its colour images."""
-    kinds = ("semantic", "instance")
-    for kind in kinds:
-        for frame in camera.frames.tolist():
-            if not dataset.frame_file(dataset.paths.image(camera.name, frame, kind=kind)).exists():
-                log.warning(
-                    "%s: boxes without masks: it has no %s image of frame %d; masks need images ="
-                    ' ["rgb", "semantic", "instance"] in the rig',
-                    camera.name, kind, frame,
-                )  # fmt: skip
-                return False
-    return True
+    missing = missing_labels(dataset, camera.name, frames=camera.frames)
+    if missing:
+        log.warning(
+            '%s: boxes without masks: it has no %s; masks need images = ["rgb", "semantic", "instance"]'
+            " in the rig",
+            camera.name, missing,
+        )  # fmt: skip
+    return not missing
+
+
+LABEL_IMAGES = ("semantic", "instance")
+
+
+def missing_labels(dataset: Dataset, name: str, *, frames: Ints) -> str:
+    """The first semantic or instance image that a camera lacks of some frames (n,); empty for none."""
+    for kind in LABEL_IMAGES:
+        for frame in frames.tolist():
+            if not dataset.frame_file(dataset.paths.image(name, frame, kind=kind)).exists():
+                return f"{kind} image of frame {frame}"
+    return ""
+
+
+def label_images(dataset: Dataset, name: str, *, frame: int) -> tuple[Ints, Ints]:
+    """Classes and feature numbers (h, w) of the pixels of a camera's frame, -1 for no feature.
+
+    Raises DatasetError for damaged images.
+    """
+    semantic, instance = (dataset.paths.image(name, frame, kind=kind) for kind in LABEL_IMAGES)
+    with reading_file(semantic):
+        klass = read_png(semantic).astype(np.int64)
+        if not np.isin(klass, [int(k) for k in Class]).all():
+            raise ValueError("pixels of no class")
+    with reading_file(instance):
+        feature = image_to_feature(read_png(instance).astype(np.uint8)).astype(np.int64)
+        if feature.shape != klass.shape:
+            raise ValueError("not of the size of the semantic image")
+    return klass, feature
 
 
 def _image(dataset: Dataset, camera: Stream, *, row: int, number: int) -> Row:
-    """The entry of an image."""
     stamp = iso_times(dataset.start, camera.time_ns[row : row + 1])[0]
     return {
         "id": number,

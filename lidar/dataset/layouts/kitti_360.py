@@ -21,12 +21,11 @@ from geoscene.classes import Class
 from geoscene.support.files import write_atomically, write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
-from lidar.dataset.kitti_sequence import numbers
-from lidar.dataset.layout import Dataset, reading_file
-from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive, write_stamps
-from lidar.dataset.png import image_to_feature, read_png, write_png
+from lidar.dataset.layout import Dataset
+from lidar.dataset.layouts.coco import label_images, missing_labels
+from lidar.dataset.layouts.kitti_drive import KittiDrive, numbers, read_drive, write_stamps
+from lidar.dataset.png import write_png
 from lidar.geometry.attitude import matrix_from_quat
-from lidar.geometry.mounts import Mount
 
 log = logging.getLogger(__name__)
 
@@ -99,16 +98,13 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     _write_poses(drive, folder / "data_poses" / SEQUENCE)
     images, scans = folder / "data_2d_raw" / SEQUENCE, folder / "data_3d_raw" / SEQUENCE / "velodyne_points"
     write_stamps(scans / "timestamps.txt", dataset, times=drive.clouds.time_ns)
-    for number, stream in drive.cameras.items():
-        times = stream.time_ns[drive.images[number]]
-        write_stamps(images / f"image_{number:02d}" / "timestamps.txt", dataset, times=times)
+    drive.write_times(images, "image_{0:02d}/timestamps.txt")
     instances = _instances(drive)
     labels = _Labels(drive, instances, out=folder / "data_2d_semantics" / "train" / SEQUENCE)
     for row in range(len(drive)):
         drive.write_cloud(scans / "data" / f"{row:010d}.bin", row=row)
-        for number in drive.cameras:
-            name = f"image_{number:02d}"
-            drive.write_image(images / name / "data_rect" / f"{row:010d}.png", number=number, row=row)
+        drive.write_images(images, f"image_{{0:02d}}/data_rect/{row:010d}.png", row=row)
+        for number in labels.cameras:
             labels.write(number, row=row)
         progress("KITTI-360", row + 1, total=len(drive))
     labels.close()
@@ -128,30 +124,20 @@ def _vehicle_from_unit(drive: KittiDrive) -> Float:
 def _write_calibration(drive: KittiDrive, folder: Path) -> None:
     """Write mounts and intrinsics; missing cameras are those of the first, as loaders need them all."""
     unit_from_vehicle = np.linalg.inv(_vehicle_from_unit(drive))
-    mounts = {number: stream.mount for number, stream in drive.cameras.items()}
-    to_unit = [
-        f"image_{number:02d}: {numbers((unit_from_vehicle @ _mount(drive, number).matrix)[:3])}"
-        for number in range(4)
-    ]
+    mounts = [drive.cameras[k].mount if k in drive.cameras else drive.reference for k in range(4)]
+    to_unit = (
+        f"image_{number:02d}: {numbers((unit_from_vehicle @ mount.matrix)[:3])}"
+        for number, mount in enumerate(mounts)
+    )
     write_lines(folder / "calib_cam_to_pose.txt", to_unit)
     write_lines(folder / "calib_cam_to_velo.txt", [numbers(np.linalg.inv(drive.camera_from_lidar)[:3])])
     lines = []
     for number in _CAMERAS:
-        stream = drive.cameras.get(number, next(iter(drive.cameras.values()), None))
-        size, K, own = np.ones(2), np.eye(3), mounts.get(number, drive.reference)
-        if stream is not None:
-            size = np.array([stream.sensor["width"], stream.sensor["height"]])
-            K = np.array(stream.sensor["K"], float)
-        moved = np.linalg.inv(own.matrix) @ drive.reference.matrix
-        values = {"S": size, "K": K, "D": np.zeros(5), "R": moved[:3, :3], "T": moved[:3, 3]}
-        values |= {"S_rect": size, "R_rect": np.eye(3), "P_rect": np.column_stack([K, K @ moved[:3, 3]])}
+        values = drive.rectified(number)
+        K = np.asarray(values["K"])
+        values["P_rect"] = np.column_stack([K, K @ values["T"]])
         lines += [f"{name}_{number:02d}: {numbers(value)}" for name, value in values.items()]
     write_lines(folder / "perspective.txt", lines)
-
-
-def _mount(drive: KittiDrive, number: int) -> Mount:
-    """Mount of a camera, or of the reference camera for a missing one."""
-    return drive.cameras[number].mount if number in drive.cameras else drive.reference
 
 
 def _write_poses(drive: KittiDrive, folder: Path) -> None:
@@ -197,36 +183,23 @@ class _Labels:
         for klass, name in _NAMES.items():
             self.ids[klass] = _LABELS[name][0]
         self.features = np.array(sorted(instances), np.int64)
-        self.values = np.array([_value(*instances[k][:2]) for k in self.features.tolist()], np.uint16)
-        self.cameras = [number for number in drive.cameras if self._recorded(number)]
+        self.values = np.array(
+            [_LABELS[instances[k][0]][0] * _INSTANCES + instances[k][1] for k in self.features.tolist()],
+            np.uint16,
+        )
+        self.cameras = [
+            number
+            for number, stream in drive.cameras.items()
+            if not missing_labels(drive.dataset, stream.name, frames=stream.frames[drive.images[number]])
+        ]
         self.images: dict[int, list[str]] = defaultdict(list)
 
-    def _paths(self, number: int, row: int) -> list[Path]:
-        stream, dataset = self.drive.cameras[number], self.drive.dataset
-        frame = int(stream.frames[self.drive.images[number][row]])
-        return [dataset.paths.image(stream.name, frame, kind=kind) for kind in ("semantic", "instance")]
-
-    def _recorded(self, number: int) -> bool:
-        """Whether a camera has both images of all frames."""
-        dataset = self.drive.dataset
-        return all(
-            dataset.frame_file(path).exists()
-            for row in range(len(self.drive))
-            for path in self._paths(number, row)
-        )
-
     def write(self, number: int, *, row: int) -> None:
-        """Write the labels of the pixels of a frame, of a camera that has them."""
-        if number not in self.cameras:
-            return
-        semantic, instance = self._paths(number, row)
-        with reading_file(semantic):
-            ids = self.ids[read_png(semantic)]
-        with reading_file(instance):
-            feature = image_to_feature(read_png(instance).astype(np.uint8))
-            if feature.shape != ids.shape:
-                raise ValueError("not of the size of the semantic image")
-        pixels = ids.astype(np.uint16) * _INSTANCES
+        """Write the labels of the pixels of a frame, of one of ``cameras``."""
+        stream = self.drive.cameras[number]
+        frame = int(stream.frames[self.drive.images[number][row]])
+        klass, feature = label_images(self.drive.dataset, stream.name, frame=frame)
+        pixels = self.ids[klass].astype(np.uint16) * _INSTANCES
         if len(self.features):
             place = np.searchsorted(self.features, feature).clip(max=len(self.features) - 1)
             pixels = np.where(self.features[place] == feature, self.values[place], pixels)
@@ -242,11 +215,6 @@ class _Labels:
         if self.cameras:
             document = json.dumps({str(value): names for value, names in sorted(self.images.items())})
             write_atomically(self.out / "instanceDict.json", document.encode("ascii"))
-
-
-def _value(name: str, number: int) -> int:
-    """The value of a pixel."""
-    return _LABELS[name][0] * _INSTANCES + number
 
 
 def _boxes(drive: KittiDrive, instances: dict[int, tuple[str, int, int]]) -> Iterator[dict[str, Any]]:

@@ -14,8 +14,8 @@ import numpy as np
 
 from geoscene.support.files import copy_file, write_json, write_lines
 from geoscene.support.progress import Progress
-from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset
+from lidar.dataset.layouts.kitti_drive import numbers
 from lidar.dataset.png import DEPTH_SCALE, depth_to_counts, write_png
 from lidar.dataset.recorded import cloud_points, scanner_clouds
 from lidar.dataset.seen_points import ImageView, motions_of, returns_of, views_of

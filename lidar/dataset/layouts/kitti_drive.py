@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from geoscene.support.files import copy_file, write_lines
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, boxes_by_frame
 from lidar.dataset.formats import FORMATS, LABELS, kitti
-from lidar.dataset.kitti_sequence import looking_ahead, projection
+from lidar.dataset.ground_truth import COLUMNS, boxes_by_frame
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import (
     Stream,
@@ -33,9 +33,11 @@ from lidar.dataset.recorded import (
     recorded_labels,
     still_points,
 )
-from lidar.geometry.mounts import Mount
-from lidar.geometry.poses import Trajectory
+from lidar.geometry.attitude import OPTICAL, Mount, quat_from_matrix
+from lidar.geometry.poses import Poses, Trajectory
 from lidar.geometry.time_scales import iso_times
+from lidar.sensors.rig.camera_model import intrinsic_matrix
+from lidar.sensors.rig.specs import Rig
 
 log = logging.getLogger(__name__)
 
@@ -74,6 +76,12 @@ class KittiDrive:
     def reference(self) -> Mount:
         """Mount of the camera in whose frame poses are; without cameras, at the scanner and looking ahead."""
         return self.cameras[min(self.cameras)].mount if self.cameras else looking_ahead(self.clouds.mount)
+
+    @functools.cached_property
+    def reference_poses(self) -> Poses:
+        """Poses (n,) of the reference camera at each frame."""
+        poses = self.trajectory.at(self.clouds.time_ns)
+        return poses.mounted(self.reference.translation, self.reference.rotation)
 
     @functools.cached_property
     def inertial_unit(self) -> Mount:
@@ -134,9 +142,33 @@ class KittiDrive:
             found = recorded_labels(table, self.boxes.get(int(self.clouds.frames[row]), {}).values())
             kitti.write_labels(labels, found)
 
-    def write_image(self, path: Path, *, number: int, row: int) -> None:
-        """Write the image of a frame from a camera."""
-        copy_file(self.cameras[number].files[self.images[number][row]], path)
+    def write_images(self, folder: Path, name: str, *, row: int) -> None:
+        """Write the images of a frame.
+
+        name : below the folder, in which ``{0}`` stands for the number of the camera
+        """
+        for number, stream in self.cameras.items():
+            copy_file(stream.files[self.images[number][row]], folder / name.format(number))
+
+    def write_times(self, folder: Path, name: str) -> None:
+        """Write the time stamps of each camera's images; names as for `write_images`."""
+        for number, stream in self.cameras.items():
+            times = stream.time_ns[self.images[number]]
+            write_stamps(folder / name.format(number), self.dataset, times=times)
+
+    def rectified(self, number: int) -> dict[str, ArrayLike]:
+        """Intrinsics and extrinsics of a camera as KITTI's calibrations name them, but for ``P_rect``.
+
+        Those of a missing camera are the first's; R and T are from the reference camera's frame to its own.
+        """
+        stream = self.cameras.get(number, next(iter(self.cameras.values()), None))
+        size, K, own = np.ones(2), np.eye(3), self.reference.matrix
+        if stream is not None:
+            size = np.array([stream.sensor["width"], stream.sensor["height"]])
+            K, own = np.array(stream.sensor["K"], float), stream.mount.matrix
+        moved = np.linalg.inv(own) @ self.reference.matrix
+        turn = {"R": moved[:3, :3], "T": moved[:3, 3]}
+        return {"S": size, "K": K, "D": np.zeros(5), **turn, "S_rect": size, "R_rect": np.eye(3)}
 
 
 def write_stamps(path: Path, dataset: Dataset, *, times: Ints) -> None:
@@ -178,3 +210,61 @@ def _assign_numbers(cameras: Sequence[Stream], numbers: Sequence[int]) -> dict[i
     for camera in others[len(free) :]:
         log.warning("%s: left out: there are %d cameras in this layout", camera.name, len(numbers))
     return dict(sorted({**own, **dict(zip(free, others, strict=False))}.items()))
+
+
+def write_sequence(
+    folder: Path, rig: Rig, *, mount: Mount, trajectory: Trajectory, time_ns: NDArray[np.int64]
+) -> None:
+    """Write calib.txt, times.txt and poses.txt of a scanner into its folder.
+
+    mount   : of the scanner
+    time_ns : (n,) starts of its frames
+
+    The cameras are the rig's first four; without one, a camera at the scanner that faces its x axis.
+    """
+    cameras = [(intrinsic_matrix(camera), camera.mount) for camera in rig.cameras[:4]]
+    first = cameras[0][1] if cameras else looking_ahead(mount)
+    projections = [projection(K, own, reference=first) for K, own in cameras] or [np.eye(3, 4)]
+    camera_from_lidar = np.linalg.inv(first.matrix) @ mount.matrix
+    write_calibration(folder / "calib.txt", projections, camera_from_lidar=camera_from_lidar)
+    if len(time_ns):
+        write_times(folder / "times.txt", time_ns)
+        write_poses(folder / "poses.txt", trajectory.at(time_ns).mounted(first.translation, first.rotation))
+
+
+def looking_ahead(mount: Mount) -> Mount:
+    """Extrinsics of a camera at a sensor's origin whose optical axis is the sensor's x axis."""
+    return Mount(mount.translation, tuple(quat_from_matrix(mount.rotation @ OPTICAL).tolist()))
+
+
+def projection(K: Float, mount: Mount, *, reference: Mount) -> Float:
+    """Projection (3, 4) from the frame of a reference camera to the pixels of a camera with intrinsics K."""
+    return np.asarray(K @ (np.linalg.inv(mount.matrix) @ reference.matrix)[:3], float)
+
+
+def write_calibration(path: Path, projections: Sequence[ArrayLike], *, camera_from_lidar: Float) -> None:
+    """Write ``calib.txt``: projections P0 to P3, and Tr, the transformation from scanner to first camera.
+
+    projections : (3, 4) each, from the first camera's frame to the pixels of each camera. Loaders need four:
+                  the first is repeated for missing ones, a fifth is left out
+    """
+    four = [*projections[:4], *[projections[0]] * (4 - len(projections))]
+    named = [*((f"P{k}", projection) for k, projection in enumerate(four)), ("Tr", camera_from_lidar)]
+    write_lines(path, (f"{name}: {numbers(np.asarray(matrix)[:3])}" for name, matrix in named))
+
+
+def write_times(path: Path, time_ns: NDArray[np.integer]) -> None:
+    """Write ``times.txt``: seconds since the first frame."""
+    write_lines(path, (f"{(int(t) - int(time_ns[0])) * 1e-9:.9e}" for t in time_ns))
+
+
+def write_poses(path: Path, camera: Poses) -> None:
+    """Write ``poses.txt``: the poses of the first camera at each frame relative to the first frame."""
+    world_from_camera = camera.matrices()
+    poses = np.linalg.inv(world_from_camera[0]) @ world_from_camera
+    write_lines(path, (numbers(pose[:3]) for pose in poses))
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers of any shape as KITTI writes them, separated by spaces."""
+    return " ".join(f"{value:.12e}" for value in np.asarray(values, float).ravel())

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
-from lidar.dataset.kitti_sequence import numbers
 from lidar.dataset.layout import Dataset, read_rows, reading_file
-from lidar.dataset.layouts.kitti_drive import CAMERAS, KittiDrive, read_drive, write_stamps
+from lidar.dataset.layouts.kitti_drive import CAMERAS, KittiDrive, numbers, read_drive, write_stamps
 from lidar.dataset.recorded import nearest
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.sensors.navigation.gnss import antenna_motion
@@ -76,19 +75,14 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
     period_ns = round(1e9 / float(drive.clouds.sensor["rate_hz"]))
     for name, times in {"": time_ns, "_start": time_ns, "_end": time_ns + period_ns}.items():
         write_stamps(out / "velodyne_points" / f"timestamps{name}.txt", dataset, times=times)
-    for number, stream in drive.cameras.items():
-        times = stream.time_ns[drive.images[number]]
-        write_stamps(out / f"image_{number:02d}" / "timestamps.txt", dataset, times=times)
+    drive.write_times(out, "image_{0:02d}/timestamps.txt")
     write_stamps(out / "oxts" / "timestamps.txt", dataset, times=time_ns)
     oxts = oxts_columns(drive)
     rows = zip(*(oxts[name].tolist() for name in _OXTS), strict=True)
     for row, values in enumerate(rows):
         write_lines(out / "oxts" / "data" / f"{row:010d}.txt", [" ".join(map(str, values))])
         drive.write_cloud(out / "velodyne_points" / "data" / f"{row:010d}.bin", row=row)
-        for number in drive.cameras:
-            drive.write_image(
-                out / f"image_{number:02d}" / "data" / f"{row:010d}.png", number=number, row=row
-            )
+        drive.write_images(out, f"image_{{0:02d}}/data/{row:010d}.png", row=row)
         progress("KITTI raw", row + 1, total=len(drive))
     return {"clouds": len(drive), "images": len(drive) * len(drive.cameras), "poses": len(drive)}
 
@@ -154,14 +148,7 @@ def _write_calibrations(drive: KittiDrive, folder: Path) -> None:
     )
     cameras: dict[str, ArrayLike] = {"corner_dist": 0.0}
     for number in range(CAMERAS):
-        stream = drive.cameras.get(number, next(iter(drive.cameras.values()), None))
-        size, K, own = np.ones(2), np.eye(3), drive.reference.matrix
-        if stream is not None:
-            size = np.array([stream.sensor["width"], stream.sensor["height"]])
-            K, own = np.array(stream.sensor["K"]), stream.mount.matrix
-        moved = _rigid(np.linalg.inv(own) @ drive.reference.matrix)
-        values = {"S": size, "K": K, "D": np.zeros(5), **moved, "S_rect": size, "R_rect": np.eye(3)}
-        values["P_rect"] = drive.projections[number]
+        values = drive.rectified(number) | {"P_rect": drive.projections[number]}
         cameras |= {f"{name}_{number:02d}": value for name, value in values.items()}
     _write_calibration(folder / "calib_cam_to_cam.txt", stamp, values=cameras)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from geoscene.classes import Class
 from geoscene.support.files import copy_file, write_lines
 from geoscene.support.progress import Progress
-from lidar.dataset.boxes import read_boxes
+from lidar.dataset.ground_truth import read_boxes
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, all_images
 from lidar.errors import DatasetError

@@ -24,8 +24,8 @@ from geoscene.scene import open_scene
 from geoscene.support.files import copy_file, write_atomically
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import nuscenes
+from lidar.dataset.ground_truth import COLUMNS, read_boxes
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.png import write_png
 from lidar.dataset.recorded import (
@@ -140,7 +140,7 @@ class _Export:
         samples = [
             {
                 "token": token_of(self.name, "sample", int(top.frames[k])),
-                "timestamp": self._stamp(int(top.time_ns[k])),
+                "timestamp": self.dataset.microseconds(int(top.time_ns[k])),
                 "scene_token": token_of(self.name, "scene"),
             }
             for k in keys
@@ -170,10 +170,6 @@ class _Export:
             "images": counts["camera"],
             "annotations": len(self.tables["sample_annotation"]),
         }
-
-    def _stamp(self, time_ns: int) -> int:
-        """Microseconds since 1970."""
-        return round(self.dataset.start.timestamp() * 1e6) + time_ns // 1000
 
     def _position(self, position: Float) -> list[float]:
         """A position (3,) of the scene in the tables' frame."""
@@ -206,13 +202,13 @@ class _Export:
         self.tables["ego_pose"].append(
             {
                 "token": token,
-                "timestamp": self._stamp(time),
+                "timestamp": self.dataset.microseconds(time),
                 "translation": self._position(pose.position[0]),
                 "rotation": _wxyz(pose.rotation[0]),
             }
         )
         suffix, folder = ".pcd.bin" if lidar else ".png", "samples" if key else "sweeps"
-        name = f"{folder}/{channel}/{self.name}__{channel}__{self._stamp(time)}{suffix}"
+        name = f"{folder}/{channel}/{self.name}__{channel}__{self.dataset.microseconds(time)}{suffix}"
         path = self.out / name
         if lidar:
             self._write_cloud(stream, k, path=path, token=token, labelled=key)
@@ -223,7 +219,7 @@ class _Export:
             "sample_token": samples[sample]["token"],
             "ego_pose_token": token,
             "calibrated_sensor_token": token_of(self.name, "calibrated", channel),
-            "timestamp": self._stamp(time),
+            "timestamp": self.dataset.microseconds(time),
             "fileformat": "pcd" if lidar else "png",
             "is_key_frame": key,
             "height": stream.sensor.get("height", 0),

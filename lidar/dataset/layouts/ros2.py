@@ -1,20 +1,21 @@
-"""A recorded drive as a ROS 2 recording: ``metadata.yaml`` and one MCAP file of messages."""
+"""A recorded drive as an MCAP file of ROS 2 messages: a recording of ROS 2, or with a layout for Foxglove."""
 
 from __future__ import annotations
 
 import heapq
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 from geoscene.errors import need
+from geoscene.support.files import write_json
 from geoscene.support.progress import Progress
 from lidar.dataset.layout import Dataset, reading_file
-from lidar.dataset.layouts.ros_drive import MAP, RosDrive, Topic
 from lidar.dataset.layouts.ros_messages import encode, typestore
-from lidar.dataset.layouts.ros_topics import topics_of
+from lidar.dataset.layouts.ros_topics import BASE, MAP, ODOMETRY, RosDrive, Topic, topics_of
 
 NAME = "drive"
 """Name of the file of messages."""
@@ -43,7 +44,7 @@ def write_recording(dataset: Dataset, folder: Path, *, progress: Progress) -> li
     bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
     for key, text in _about(drive).items():
         bag.set_custom_data(key, text)
-    total = sum(topic.count for topic in topics)
+    total = sum(len(topic.time_ns) for topic in topics)
     with bag:
         connections = [_connection(bag, topic) for topic in topics]
         for done, (time_ns, k, make) in enumerate(merge_messages(topics)):
@@ -59,8 +60,8 @@ def merge_messages(topics: list[Topic]) -> Iterator[tuple[int, int, Callable[[],
     """Messages in order of time, of equal times in the order of the topics."""
 
     def numbered(k: int, topic: Topic) -> Iterator[tuple[int, int, Callable[[], Any]]]:
-        for time_ns, make in topic.messages:
-            yield time_ns, k, make
+        for row, time_ns in enumerate(topic.time_ns.tolist()):
+            yield time_ns, k, partial(topic.make, row)
 
     return heapq.merge(*(numbered(k, topic) for k, topic in enumerate(topics)), key=itemgetter(0, 1))
 
@@ -103,5 +104,76 @@ def message_counts(topics: list[Topic]) -> dict[str, int]:
     counts: Counter[str] = Counter()
     for topic in topics:
         if topic.counted:
-            counts[topic.counted] += topic.count
+            counts[topic.counted] += len(topic.time_ns)
     return {"topics": len(topics), **counts}
+
+
+def export_for_foxglove(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
+    """Write ``drive.mcap`` and ``foxglove.json``; return the numbers of messages by type.
+
+    Raises DatasetError for damaged files, and MissingExtraError without rosbags.
+    """
+    topics = write_recording(dataset, folder, progress=progress)
+    (folder / "metadata.yaml").unlink()
+    write_json(folder / "foxglove.json", layout(topics))
+    return message_counts(topics)
+
+
+def layout(topics: list[Topic]) -> dict[str, Any]:
+    """A layout of Foxglove: the scene around the vehicle, images, its speed and, with fixes, a map."""
+    panels: dict[str, dict[str, Any]] = {"3D!scene": _scene(topics)}
+    for topic in topics:
+        if topic.name.endswith("/image_raw/compressed"):
+            camera = topic.name.split("/")[1]
+            panels[f"Image!{camera}"] = {
+                "imageMode": {"imageTopic": topic.name, "calibrationTopic": f"/{camera}/camera_info"}
+            }
+    if any(topic.name.endswith("/fix") for topic in topics):
+        panels["map!fixes"] = {"layer": "map", "followTopic": ""}
+    speed = {"value": f"{ODOMETRY}.twist.twist.linear.x", "enabled": True, "timestampMethod": "headerStamp"}
+    panels["Plot!speed"] = {"title": "speed, m/s", "paths": [speed], "xAxisVal": "timestamp"}
+    first, *others = panels
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": {
+            "direction": "row",
+            "first": first,
+            "second": _stack(others),
+            "splitPercentage": 65,
+        },
+    }
+
+
+def _scene(topics: list[Topic]) -> dict[str, Any]:
+    """The panel of clouds, coloured by intensity, scans, and boxes of the first scanner with some."""
+    shown: dict[str, dict[str, Any]] = {}
+    colors = {"colorField": "intensity", "colorMode": "colormap", "colorMap": "turbo"}
+    for topic in topics:
+        if topic.name.endswith("/points"):
+            shown[topic.name] = {"visible": True, "pointSize": 2, "minValue": 0, "maxValue": 100, **colors}
+        elif topic.name.endswith("/scan"):
+            shown[topic.name] = {"visible": True, "pointSize": 3}
+        elif topic.name.endswith("/boxes"):
+            first = not any(name.endswith("/boxes") for name in shown)
+            shown[topic.name] = {"visible": first}
+    return {
+        "followMode": "follow-pose",
+        "followTf": BASE,
+        "fixedFrame": MAP,
+        "cameraState": {"distance": 40, "phi": 60, "thetaOffset": 90, "perspective": True, "fovy": 45},
+        "topics": shown,
+    }
+
+
+def _stack(panels: list[str]) -> Any:
+    """Panels one above the other, of equal height."""
+    first, *others = panels
+    if not others:
+        return first
+    share = 100 / len(panels)
+    return {
+        "direction": "column", "first": first, "second": _stack(others), "splitPercentage": share
+    }  # fmt: skip

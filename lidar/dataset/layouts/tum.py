@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.support.progress import Progress
-from lidar.dataset.kitti_sequence import write_poses
 from lidar.dataset.layout import Dataset
+from lidar.dataset.layouts.kitti_drive import write_poses
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Poses
 from lidar.geometry.time_scales import posix_ns
-from lidar.geometry.trajectory_tum import write_tum
+from lidar.geometry.trajectory_files import write_tum
 
 
 def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:

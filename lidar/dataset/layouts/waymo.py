@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,14 @@ from geoscene.classes import Class
 from geoscene.support.files import write_lines
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, boxes_by_frame, read_boxes
+from lidar.dataset.ground_truth import COLUMNS, boxes_by_frame, read_boxes
 from lidar.dataset.layout import Dataset, reading_file
-from lidar.dataset.layouts.waymo_parquet import DISTORTION, SHUTTER, Component, Row
-from lidar.dataset.layouts.waymo_range_images import (
+from lidar.dataset.layouts.waymo_components import (
+    DISTORTION,
+    SHUTTER,
+    Component,
     RangeImageGrid,
+    Row,
     grid_of,
     laser_calibration,
     pixels,
@@ -39,11 +43,9 @@ from lidar.dataset.recorded import (
     nearest,
 )
 from lidar.errors import DatasetError
-from lidar.geometry.attitude import body_rates
-from lidar.geometry.mounts import OPTICAL
+from lidar.geometry.attitude import OPTICAL, body_rates
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import scanners
-from lidar.sensors.rig.specs import rig_of
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +78,8 @@ def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, i
 
     Raises DatasetError for a drive without labelled clouds in the sensor frame.
     """
-    drive = _drive(dataset)
+    lasers = _lasers(dataset)
+    drive = _Drive(dataset, lasers, _cameras(dataset), *_boxes(dataset, lasers[0].stream))
     write_lines(folder / SEGMENTS, [drive.context])
     counts = dict.fromkeys(("frames", "clouds", "images", "3D boxes", "2D boxes", "points without pixel"), 0)
     with ExitStack() as opened:
@@ -105,29 +108,46 @@ class _Drive:
 
     lasers  : of scanners, the first of which gives the frames
     cameras : by number
-    near    : row (n,) of each frame in the stream of a sensor, by its name
     boxes   : 3D boxes of the first scanner by frame
     hits    : returns of all scanners by frame and road user
-    flat    : 2D boxes by camera's name and frame
     """
 
     dataset: Dataset
-    context: str
     lasers: tuple[RangeImageGrid, ...]
     cameras: dict[int, Stream]
-    trajectory: Trajectory
-    near: dict[str, Ints]
     boxes: Mapping[int, list[Row]]
     hits: Mapping[tuple[int, int], int]
-    flat: Mapping[str, Mapping[int, list[Row]]]
 
     def __len__(self) -> int:
         """Number of frames."""
         return len(self.lasers[0].stream.files)
 
-    def micros(self, time_ns: int) -> int:
-        """Microseconds since 1970."""
-        return round(self.dataset.start.timestamp() * 1e6) + time_ns // 1000
+    @property
+    def context(self) -> str:
+        """Name of the segment."""
+        return self.dataset.path.resolve().name
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The ego vehicle's poses."""
+        return self.dataset.trajectory()
+
+    @cached_property
+    def near(self) -> dict[str, Ints]:
+        """Row (n,) of each frame in the stream of a sensor, by its name."""
+        streams = (*(grid.stream for grid in self.lasers), *self.cameras.values())
+        return {stream.name: nearest(stream.time_ns, self.lasers[0].stream.time_ns) for stream in streams}
+
+    @cached_property
+    def flat(self) -> dict[str, dict[int, list[Row]]]:
+        """2D boxes with visible pixels by camera's name and frame."""
+        found: dict[str, dict[int, list[Row]]] = {}
+        for camera in self.cameras.values():
+            path = self.dataset.paths.sensor_boxes(camera.name)
+            boxes = boxes_by_frame(path, ("frame", "id", "class", "pixels"))
+            seen = {frame: [box for box in of.values() if box["pixels"]] for frame, of in boxes.items()}
+            found[camera.name] = {frame: of for frame, of in seen.items() if of}
+        return found
 
     def seconds(self, time_ns: int) -> float:
         """Seconds since 1970."""
@@ -137,25 +157,6 @@ class _Drive:
         """The pose (4, 4) of the vehicle at a time, world from vehicle."""
         matrix: Float = self.trajectory.at([time_ns]).matrices()[0]
         return matrix
-
-
-def _drive(dataset: Dataset) -> _Drive:
-    lasers = _lasers(dataset)
-    cameras = _cameras(dataset)
-    frames = lasers[0].stream.time_ns
-    streams = [*(grid.stream for grid in lasers), *cameras.values()]
-    boxes, hits = _boxes(dataset, lasers[0].stream)
-    return _Drive(
-        dataset,
-        dataset.path.resolve().name,
-        lasers,
-        cameras,
-        dataset.trajectory(),
-        {stream.name: nearest(stream.time_ns, frames) for stream in streams},
-        boxes,
-        hits,
-        {stream.name: _flat_boxes(dataset, stream) for stream in cameras.values()},
-    )
 
 
 def _written(drive: _Drive) -> list[str]:
@@ -168,8 +169,7 @@ def _written(drive: _Drive) -> list[str]:
 
 def _lasers(dataset: Dataset) -> tuple[RangeImageGrid, ...]:
     """Grids of the scanners that have rows of one elevation, five at most."""
-    with reading_file(dataset.paths.manifest):
-        devices = {device.name: device for device in scanners(rig_of(dataset.manifest["recipe"]["rig"]))}
+    devices = {device.name: device for device in scanners(dataset.rig())}
     found: list[RangeImageGrid] = []
     for name in dataset.sensors("lidar"):
         stream = labelled_clouds(dataset, name)
@@ -229,13 +229,6 @@ def _boxes(dataset: Dataset, top: Stream) -> tuple[dict[int, list[Row]], dict[tu
     return found, hits
 
 
-def _flat_boxes(dataset: Dataset, camera: Stream) -> dict[int, list[Row]]:
-    """2D boxes with visible pixels of a camera, by frame."""
-    boxes = boxes_by_frame(dataset.paths.sensor_boxes(camera.name), ("frame", "id", "class", "pixels"))
-    seen = {frame: [box for box in of.values() if box["pixels"]] for frame, of in boxes.items()}
-    return {frame: of for frame, of in seen.items() if of}
-
-
 def _frame_rows(drive: _Drive, row: int) -> tuple[dict[str, list[Row]], int]:
     """The rows of a frame by component, and the number of points without a pixel."""
     top = drive.lasers[0].stream
@@ -260,7 +253,10 @@ def _frame_rows(drive: _Drive, row: int) -> tuple[dict[str, list[Row]], int]:
             rows["camera_box"].append(key | _camera_box(box))
             if box["id"] in known:
                 rows["camera_to_lidar_box_association"].append(key | {"laser_object_id": str(box["id"])})
-    stamp = {"segment_context_name": drive.context, "frame_timestamp_micros": drive.micros(time_ns)}
+    stamp = {
+        "segment_context_name": drive.context,
+        "frame_timestamp_micros": drive.dataset.microseconds(time_ns),
+    }
     return {tag: [stamp | one for one in of_tag] for tag, of_tag in rows.items() if of_tag}, lost
 
 
@@ -330,7 +326,6 @@ def _laser_box(box: Row, *, hits: Mapping[tuple[int, int], int]) -> Row:
 
 
 def _camera_box(box: Row) -> Row:
-    """The 2D box of a road user's visible pixels."""
     left, top, right, bottom = (box[f"seen_{side}"] + _EDGE for side in ("left", "top", "right", "bottom"))
     return {
         "box.center.x": (left + right) / 2,
@@ -342,5 +337,4 @@ def _camera_box(box: Row) -> Row:
 
 
 def _type(box: Row) -> int:
-    """Waymo's type of a road user."""
     return _TYPES.get(Class[box["class"].upper()], 0)

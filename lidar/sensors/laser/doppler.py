@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.typing import Float
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.laser.cloud import Cloud
 from lidar.world.actors import Actors, rotations, states

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import KNOT_NS, Poses, Trajectory
 from lidar.sensors.physics.echoes import Gap
 from lidar.sensors.physics.settings import MOST_RAYS

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.laser.cloud import Cloud

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.typing import Float
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator, uniform_of
 from lidar.raycast import Caster, Hits

@@ -11,8 +11,7 @@ import numpy as np
 from geoscene.support.digests import recipe_digest
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, RigError
-from lidar.geometry.attitude import quat_from_euler, quat_product
-from lidar.geometry.mounts import OPTICAL_QUAT, Mount
+from lidar.geometry.attitude import OPTICAL_QUAT, Mount, quat_from_euler, quat_product
 from lidar.sensors.rig.scanner import MOST_CODE_BITS, MOST_JITTER_NS
 from lidar.toml_table import Table, built_in_names, read_named_table
 

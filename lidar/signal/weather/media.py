@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.motion.road_conditions import DRY_GRIP, SNOW_GRIP, WET_GRIP, RoadConditions
+from lidar.motion.vehicle import DRY_GRIP, SNOW_GRIP, WET_GRIP, RoadConditions
 from lidar.signal.weather.mie import mie_efficiencies
 from lidar.signal.weather.setting import WeatherSetting
 

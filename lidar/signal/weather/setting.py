@@ -10,8 +10,7 @@ from typing import Any
 
 from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
-from lidar.grammar import Item, read_items
-from lidar.parameters import parameter, read_values
+from lidar.parameters import Item, parameter, read_items, read_values
 from lidar.signal.registry import STAGES, NamedStage, number_stages
 from lidar.signal.stage import POSES, ROAD_USERS, Stage
 

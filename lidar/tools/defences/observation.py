@@ -18,7 +18,7 @@ from lidar.dataset.layout import Dataset, opened_rows, reading_file
 from lidar.dataset.png import read_png
 from lidar.dataset.recorded import Stream, cloud_points, clouds_in, color_images
 from lidar.errors import DatasetError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.sensors.physics.link import amplitude, apparent_of_code
 from lidar.sensors.rig.devices import Scanner, cameras, scanners

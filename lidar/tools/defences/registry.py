@@ -16,8 +16,7 @@ from geoscene.support.registry import Registry
 from geoscene.support.storage import url_of
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
-from lidar.grammar import Item, read_items
-from lidar.parameters import build, parameter_rows
+from lidar.parameters import Item, build, parameter_rows, read_items
 from lidar.tools.defences.defence import Defence, Verdict, Window
 from lidar.tools.defences.observation import Observation, RecordedScans
 from lidar.world.world import World

@@ -16,7 +16,13 @@ from geoscene.support.files import write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
-from lidar.dataset.derived import check_target, complete_folder, copy_dataset
+from lidar.dataset.derived import (
+    check_target,
+    complete_folder,
+    copy_dataset,
+    derived_from,
+    write_folder_provenance,
+)
 from lidar.dataset.foreign import (
     foreign_clouds,
     foreign_labels,
@@ -25,10 +31,9 @@ from lidar.dataset.foreign import (
     write_foreign_stages,
 )
 from lidar.dataset.formats import Format, read_table
+from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
-from lidar.dataset.provenance import derived_from, write_folder_provenance
 from lidar.dataset.recorded import cloud_points
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.devices import Scanner, scanners

@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 from geoscene.support.registry import Registry
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.grammar import item_text, read_items
-from lidar.parameters import Parameters, build, parameter
+from lidar.parameters import Parameters, build, item_text, parameter, read_items
 
 Bools = NDArray[np.bool_]
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.layout import Dataset
-from lidar.dataset.layouts.kitti import OBJECTS
+from lidar.dataset.layouts.kitti import CORNERS, OBJECTS, outline
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
-from lidar.dataset.layouts.kitti_objects import CORNERS, outline
 from lidar.dataset.layouts.nuscenes import streams_of, table_frame
 from lidar.dataset.recorded import Stream, still_points
 from lidar.errors import DatasetError, InputError

@@ -21,7 +21,7 @@ from geoscene.classes import Class, class_codes
 from geoscene.errors import reading
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import COLUMNS, read_boxes
+from lidar.dataset.ground_truth import COLUMNS, read_boxes
 from lidar.dataset.layout import Dataset
 from lidar.dataset.layouts.nuscenes import (
     CATEGORIES,

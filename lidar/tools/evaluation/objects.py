@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,8 @@ import numpy as np
 
 from geoscene.drawing.report import Column, ReportTable, table_of
 from lidar.dataset.layout import Dataset, open_dataset
-from lidar.dataset.layouts.kitti import OBJECTS
+from lidar.dataset.layouts.kitti import OBJECTS, true_lines
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
-from lidar.dataset.layouts.kitti_objects import object_lines
 from lidar.dataset.layouts.mot import TrackedBox, sequence
 from lidar.dataset.recorded import color_images
 from lidar.errors import DatasetError, InputError
@@ -127,14 +126,6 @@ def _drive(dataset: Dataset) -> KittiDrive:
             " `traffic` and the rig kitti, or give detections in nuScenes' layout, which need a scanner alone"
         )
     return drive
-
-
-def true_lines(drive: KittiDrive) -> Iterator[dict[int, str]]:
-    """Lines of the road users in the image of each frame, by their numbers."""
-    boxes, stream = drive.image_boxes(OBJECTS), drive.cameras[OBJECTS]
-    for row in range(len(drive)):
-        frame = int(stream.frames[drive.images[OBJECTS][row]])
-        yield object_lines(drive, number=OBJECTS, row=row, image_boxes=boxes.get(frame, {}))
 
 
 def _detections(folder: Path, drive: KittiDrive, *, against: Path) -> ObjectScores:

@@ -17,8 +17,7 @@ from lidar.errors import FormatError, InputError
 from lidar.geometry.attitude import matrix_from_quat, quat_from_matrix
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
-from lidar.geometry.trajectory_csv import MANIFEST
-from lidar.geometry.trajectory_tum import read_tum, write_tum
+from lidar.geometry.trajectory_files import MANIFEST, read_tum, write_tum
 
 ESTIMATE = "trajectory.tum"
 """Name of the trajectory in folders of estimates."""

@@ -12,11 +12,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.classes import Class, class_codes
 from geoscene.typing import Bools, Float
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table, placed_returns
+from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.recorded import Images, Stream, cloud_points
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import InputError
 from lidar.geometry.attitude import matrix_from_quat
 from lidar.geometry.poses import Trajectory

@@ -15,11 +15,11 @@ from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.scene import open_scene
 from geoscene.support.files import atomic_folder, exclusive
 from geoscene.support.progress import Progress, silent
+from lidar.dataset.derived import write_map_provenance
 from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
-from lidar.dataset.provenance import write_map_provenance
 from lidar.errors import InputError
 from lidar.options import MapOptions
 from lidar.tools.maps.colors import distinct, ramp

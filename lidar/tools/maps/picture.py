@@ -17,7 +17,7 @@ from geoscene.classes import Class, class_codes
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.specs import CameraSpec

@@ -13,7 +13,7 @@ from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
-from lidar.geometry.trajectory_tum import read_tum, write_tum
+from lidar.geometry.trajectory_files import read_tum, write_tum
 
 _STEP_NS = 100_000_000  # between poses that are compared with the truth
 _FARTHEST = 1e6  # metres from the scene's origin
@@ -35,7 +35,7 @@ class PoseErrors:
 def read_poses(path: Path, dataset: Dataset) -> Trajectory:
     """The vehicle's trajectory in the scene, from a TUM file of true metres from the scene's origin.
 
-    Raises as `lidar.geometry.trajectory_tum.read_tum`, and InputError for poses that are not of the drive.
+    Raises as `lidar.geometry.trajectory_files.read_tum`, and InputError for poses that are not of the drive.
     """
     absolute_ns, position, quat = read_tum(path)
     begin, last = posix_ns(dataset.start), dataset.trajectory().duration_ns

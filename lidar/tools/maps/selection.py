@@ -13,8 +13,8 @@ from pyproj import Transformer
 
 from geoscene.classes import Class
 from lidar.dataset.formats.table import Table, rows
+from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, read_rows, reading_file
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import gps_seconds

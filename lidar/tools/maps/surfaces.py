@@ -10,8 +10,7 @@ import numpy as np
 from geoscene.scene import Scene
 from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
-from lidar.geometry.box_tree import Tree, tree_of
-from lidar.geometry.nearest import lower_to_nearest
+from lidar.geometry.box_tree import Tree, lower_to_nearest, tree_of
 
 _KEPT = 12
 """Tiles whose triangles are in memory: those around a place, and some of the way."""

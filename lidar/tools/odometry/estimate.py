@@ -14,12 +14,12 @@ from geoscene.geometry.frames import Frame
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_json
 from geoscene.typing import Float, Ints
-from lidar.dataset.kitti_sequence import write_poses
 from lidar.dataset.layout import Dataset
+from lidar.dataset.layouts.kitti_drive import write_poses
 from lidar.geometry.attitude import euler_from_quat, quat_from_matrix
 from lidar.geometry.poses import Poses, Trajectory
 from lidar.geometry.time_scales import iso_times, posix_ns
-from lidar.geometry.trajectory_tum import write_tum
+from lidar.geometry.trajectory_files import write_tum
 from lidar.simulation.metadata import pose_columns
 
 TRAJECTORY, REPORT = "trajectory.tum", "odometry.json"

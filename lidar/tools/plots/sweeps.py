@@ -17,11 +17,11 @@ from geoscene.drawing.panels import Panel, Raster, Scale, Series, figure
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
+from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, cloud_points, frames_within, scanner_clouds
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import DatasetError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.options import PlotOptions
 from lidar.sensors.physics.echoes import Origin
 from lidar.tools.maps.colors import ramp

@@ -19,7 +19,7 @@ from geoscene.support.digests import file_digest
 from geoscene.support.files import write_json
 from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float, Ints
-from lidar.dataset.boxes import read_boxes
+from lidar.dataset.ground_truth import read_boxes
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.errors import LidarError
 from lidar.tools.defences.observation import Observation, RecordedScans, read_scans

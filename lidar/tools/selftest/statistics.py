@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from geoscene.typing import Float
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.random_streams import generator, normal_of, uniform_of
 from lidar.sensors.navigation.gnss import gauss_markov
 from lidar.sensors.navigation.imu import inertial_noise

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.time_scales import GPS_EPOCH, LEAPS, gps_seconds, leap_seconds
 from lidar.sensors.navigation.gnss import epochs
 from lidar.sensors.rig.patterns.beams import frame_window_ns

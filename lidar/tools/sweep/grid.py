@@ -29,12 +29,12 @@ from geoscene.support.storage import cache_folder, url_of
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, LidarError
 from lidar.geometry.time_scales import check_start
-from lidar.grammar import item_of, item_text, value_text
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import AccuracyOptions, DriveOptions
+from lidar.parameters import item_of, item_text, value_text
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.plan import sensors_of
-from lidar.traffic.fcd import TrafficFile
+from lidar.traffic.options import TrafficFile
 
 _OF_THE_SWEEP = ("out", "workers", "scheduler", "overwrite", "json", "quiet")
 """Options of the command, not of a drive."""

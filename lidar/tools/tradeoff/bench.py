@@ -22,7 +22,7 @@ from lidar.sensors.rig.camera_model import exposure_times
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.simulation.plan import DrivePlan
-from lidar.simulation.signals import lamps_at
+from lidar.simulation.record_images import lamps_at
 from lidar.tools.tradeoff.errors import ImageError, PulseReturns
 from lidar.world.actors import actor_shapes, actor_transforms
 from lidar.world.settings import PLAIN as WHOLE

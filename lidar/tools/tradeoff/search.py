@@ -19,9 +19,8 @@ from geoscene.support.progress import Progress
 from lidar.errors import InputError
 from lidar.options import AccuracyOptions, AccuracyTarget, DriveOptions, read_accuracy, read_budget
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.simulation.frame_loop import chunks
+from lidar.simulation.frame_loop import chunks, record_frame
 from lidar.simulation.plan import DrivePlan, plan_drive
-from lidar.simulation.record import record_frame
 from lidar.tools.tradeoff.bench import spread_frames
 from lidar.tools.tradeoff.errors import ErrorEstimate, median
 from lidar.tools.tradeoff.pick import (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from geoscene.relief import RELIEFS
-from lidar.grammar import value_text
+from lidar.parameters import value_text
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import MOST_RAYS, POSES, ScannerSettings

@@ -15,11 +15,10 @@ from geoscene.classes import Class, class_codes
 from geoscene.errors import GeosceneError
 from geoscene.scene.layout import open_scene
 from geoscene.typing import Float, Ints
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats.table import Table
+from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.layout import Dataset, frame_numbers, reading_file
 from lidar.dataset.recorded import Stream, cloud_points, frames_within, mount_of, nearest, scanner_clouds
-from lidar.dataset.truth_files import read_truth
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Trajectory

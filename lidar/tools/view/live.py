@@ -19,8 +19,8 @@ from lidar.geometry.poses import Trajectory
 from lidar.sensors.rig.devices import Camera
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.simulation.drive import Live
-from lidar.simulation.measured import Columns, MeasuredCloud, MeasuredImages
 from lidar.simulation.plan import DrivePlan
+from lidar.simulation.recording import Columns, MeasuredCloud, MeasuredImages
 
 _TIMELINE = "drive"
 """Of the viewer: time since the drive's start."""

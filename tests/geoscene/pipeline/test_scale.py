@@ -30,7 +30,7 @@ from lidar.errors import RouteError
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.simulation.plan import plan_drive
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 
 @pytest.fixture(scope="module")

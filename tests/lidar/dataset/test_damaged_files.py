@@ -15,8 +15,7 @@ from geoscene.sources.tracks import read_track
 from lidar.dataset.journal import read_journal
 from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import write_trajectory
-from lidar.geometry.trajectory_tum import read_tum
+from lidar.geometry.trajectory_files import read_tum, write_trajectory
 from lidar.motion.replay import read_replay
 from lidar.motion.vehicle import load_vehicle
 from lidar.motion.waypoints import read_track as read_route

@@ -13,18 +13,18 @@ from geoscene.errors import InputError as FolderError
 from geoscene.geometry.frames import Frame
 from geoscene.support.csv_tables import write_columns
 from geoscene.support.files import write_json
-from lidar.dataset.boxes import COLUMNS
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import FORMATS
+from lidar.dataset.ground_truth import COLUMNS
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.dataset.layouts import EXPORTERS
+from lidar.dataset.layouts.kitti import truncation
 from lidar.dataset.layouts.kitti_drive import KittiDrive
-from lidar.dataset.layouts.kitti_objects import truncation
 from lidar.dataset.layouts.kitti_raw import oxts_columns
 from lidar.dataset.recorded import Stream
 from lidar.errors import DatasetError, InputError
-from lidar.geometry.mounts import OPTICAL
-from lidar.geometry.trajectory_csv import write_trajectory
+from lidar.geometry.attitude import OPTICAL
+from lidar.geometry.trajectory_files import write_trajectory
 
 START = datetime(2026, 6, 21, 8, 0, 0, 250_000, tzinfo=UTC)
 EPOCH_NS = 1_782_028_800_250_000_000  # date -u -d 2026-06-21T08:00:00.25 +%s%N

@@ -19,7 +19,7 @@ from lidar.options import DriveOptions
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.info import describe
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 STAGES = read_stages(["dropped_packets:loss=0.1", "weather:kind=fog"]).stages
 

@@ -17,18 +17,18 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats import read_table
+from lidar.dataset.ground_truth import read_boxes
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.dataset.layouts.coco import THINGS, encoded_mask
 from lidar.dataset.layouts.kitti_360 import SEQUENCE
-from lidar.dataset.layouts.waymo_range_images import RangeImageGrid, pixels
+from lidar.dataset.layouts.waymo_components import RangeImageGrid, pixels
 from lidar.dataset.recorded import Stream, labelled_clouds, still_points
 from lidar.errors import DatasetError
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # pycocotools
 

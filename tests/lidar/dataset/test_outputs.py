@@ -21,16 +21,15 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class, class_codes
 from geoscene.scene import open_scene
-from lidar.dataset.deskew import MOMENTS, deskew
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.kitti import semantic_kitti_labels
-from lidar.dataset.formats.table import PointLabels, placed_returns
+from lidar.dataset.formats.table import MOMENTS, PointLabels, deskew, placed_returns
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.dataset.layouts.nuscenes import CATEGORIES, VERSION
 from lidar.errors import DatasetError, InputError
+from lidar.geometry.attitude import Mount
 from lidar.geometry.georeference import Georeference
-from lidar.geometry.mounts import Mount
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
 from lidar.sensors.laser.scan import scan
@@ -38,7 +37,7 @@ from lidar.sensors.rig.scanner import load_sensor
 from lidar.settings import RecordingSettings
 from lidar.simulation.drive import drive
 from lidar.tools.maps.aggregate import aggregate
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 from lidar.traffic.signal_heads import STATES, signal_states
 
 ROADS = [k for k in Class if Class.CAR <= k <= Class.MOTORCYCLIST]

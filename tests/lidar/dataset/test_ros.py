@@ -20,13 +20,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from geoscene.classes import Class
 from geoscene.errors import MissingExtraError
 from geoscene.support.files import write_json
-from lidar.dataset.boxes import COLUMNS, read_boxes
 from lidar.dataset.formats import FORMATS, read_table
+from lidar.dataset.ground_truth import COLUMNS, read_boxes
 from lidar.dataset.layout import open_dataset, read_rows
 from lidar.dataset.layouts import EXPORTERS, ros_topics
-from lidar.dataset.layouts.ros_drive import RosDrive, ros_name
 from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
-from lidar.dataset.layouts.ros_topics import topics_of
+from lidar.dataset.layouts.ros_topics import RosDrive, ros_name, topics_of
 from lidar.dataset.navigation_files import FixHeights, read_fixes
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png
 from lidar.errors import DatasetError, FormatError, InputError
@@ -37,7 +36,7 @@ from lidar.sensors.rig.patterns.repeating import Scan2d
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive
 from lidar.tools.convert import convert
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "robot"
@@ -417,7 +416,7 @@ def test_altitudes_are_above_the_ellipsoid(recorded, monkeypatch, caplog):
         heights = FixHeights("orthometric", known)
         monkeypatch.setattr(ros_topics, "read_fixes", lambda *_, h=heights, **__: (fixes, h))
         (topic,) = (t for t in topics_of(RosDrive(recorded)) if t.name == "/gnss/fix")
-        np.testing.assert_allclose([make().altitude for _, make in topic.messages], altitude)
+        np.testing.assert_allclose([topic.make(k).altitude for k in range(len(fixes))], altitude)
     assert "no altitudes" in caplog.text
 
 

@@ -19,7 +19,7 @@ from lidar.geometry.attitude import (
     quat_from_euler_intrinsic,
 )
 from lidar.geometry.poses import Trajectory
-from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
+from lidar.geometry.trajectory_files import read_trajectory, write_trajectory
 from lidar.simulation.metadata import pose_columns
 
 angles = st.one_of(st.floats(-np.pi, np.pi), st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1e-9]))

@@ -63,7 +63,7 @@ def test_surveys_follow_the_ground_or_fly_level_above_its_highest_point(follow, 
 def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
     craft = load_vehicle("aircraft")
     route = survey_flight(AREA, spacing=400.0, height=500.0, radius=700.0, run_out=400.0)
-    trajectory = drive_path(plan_path(route, craft, frame=FRAME), craft, rate_hz=20.0)
+    trajectory = drive_path(plan_path(route, craft, frame=FRAME), craft)
     speed = np.linalg.norm(trajectory.velocity, axis=1)
     assert speed.min() > 30.0  # slower only to limit the roll rate
     yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])

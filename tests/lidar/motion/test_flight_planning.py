@@ -19,7 +19,7 @@ from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.errors import FormatError, InputError, RouteError
-from lidar.geometry.trajectory_csv import read_trajectory
+from lidar.geometry.trajectory_files import read_trajectory
 from lidar.motion.replay import read_replay
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions

@@ -12,10 +12,10 @@ from geoscene.roadgraph import build_road_graph
 from geoscene.sources import read_osm
 from lidar.errors import BlockedError, RouteError
 from lidar.geometry.attitude import matrix_from_quat, quat_from_euler
-from lidar.motion.clearance import body_outlines
 from lidar.motion.path import plan_path
-from lidar.motion.rerouting import plan_route_and_path
+from lidar.motion.road_drive import plan_route_and_path
 from lidar.motion.route import RouteOptions, free_route, lane_route, plan_route
+from lidar.motion.steering import body_outlines
 from lidar.motion.vehicle import load_vehicle
 
 FRAME = Frame.at(-76.3, 36.88)

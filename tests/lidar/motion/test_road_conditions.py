@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from lidar.errors import InputError
-from lidar.motion.road_conditions import DRY, ROADS, RoadConditions, vehicle_on
-from lidar.motion.vehicle import load_vehicle
+from lidar.motion.vehicle import DRY, ROADS, RoadConditions, load_vehicle, vehicle_on
 from lidar.options import DriveOptions
 from lidar.signal.weather.setting import read_weather
 from lidar.traffic.trips import DRIVERS, driver_on
@@ -24,14 +23,6 @@ def in_weather(text, *more, **options):
 def test_speed_by_sight_is_that_of_the_stopping_sight_distance(metres, kmh):
     """Speeds and distances of AASHTO's table of stopping sight distances on level roads."""
     assert RoadConditions(visibility=metres).sight_speed * 3.6 == pytest.approx(kmh, rel=0.005)
-
-
-def test_braking_distances_grow_with_the_inverse_of_the_grip():
-    dry = DRY.braking_distance(50 / 3.6)
-    assert dry == pytest.approx(11.57, abs=0.01)  # v^2 / (2 mu g)
-    assert [ROADS[name].braking_distance(50 / 3.6) / dry for name in ("wet", "snow", "ice")] == pytest.approx(
-        [0.85 / 0.6, 4.25, 8.5]
-    )
 
 
 def test_desired_speeds_are_within_those_measured_on_motorways():

@@ -16,8 +16,7 @@ from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.routing import turn_table, turns_back
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
-from lidar.motion.random_route import random_edges
-from lidar.motion.route import RouteOptions, lane_route, plan_route
+from lidar.motion.route import RouteOptions, lane_route, plan_route, random_edges
 
 FRAME = Frame.at(-76.3, 36.88)
 
@@ -258,9 +257,6 @@ def test_a_noisy_gpx_track_is_matched_to_the_streets_it_was_driven_on(tmp_path):
     assert nodes == [
         (100, 0), (200, 0), (200, 100), (200, 200), (100, 200), (100, 300), (200, 300)
     ]  # fmt: skip
-    as_is = plan_route(graph, FRAME, spec=path, options=RouteOptions(as_is=True))
-    assert (as_is.edge == -1).all()
-    assert len(as_is.line) == points.count("trkpt")
 
 
 def test_a_geojson_line_and_points_are_read(tmp_path):

@@ -11,7 +11,7 @@ from lidar.dataset.formats import read_cloud
 from lidar.errors import BackendError, InputError
 from lidar.options import DriveOptions
 from lidar.raycast import device
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 from lidar.world.settings import WorldSettings
 
 HAS_WARP = importlib.util.find_spec("warp") is not None

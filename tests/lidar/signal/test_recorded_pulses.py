@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.sensor_worlds import box, driven, world
 
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.recorded import complete, recorded_pulses

@@ -25,7 +25,7 @@ from lidar.simulation.drive import drive
 from lidar.simulation.frame_loop import chunks, recording_chunks
 from lidar.simulation.plan import plan_drive
 from lidar.tools.apply import apply_stages
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "small"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud

@@ -19,7 +19,7 @@ from geoscene.support.cluster import connect
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.sweep import sweep
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 OPTIONS = DriveOptions(
     rig="vlp16",

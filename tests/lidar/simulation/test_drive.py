@@ -35,7 +35,7 @@ from lidar.motion.vehicle import load_vehicle
 from lidar.simulation.drive import drive
 from lidar.simulation.frame_loop import _pool
 from lidar.traffic.ego_drive import drive_with_signals
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 
 @pytest.fixture(scope="module")

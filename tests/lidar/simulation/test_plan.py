@@ -11,7 +11,7 @@ from helpers.roadgrids import grid
 from geoscene.geometry.frames import Frame
 from lidar.errors import InputError, RouteError
 from lidar.geometry import time_scales
-from lidar.motion.rerouting import plan_route_and_path
+from lidar.motion.road_drive import plan_route_and_path
 from lidar.motion.vehicle import load_vehicle
 from lidar.options import DriveOptions
 from lidar.sensors.rig.devices import scanners

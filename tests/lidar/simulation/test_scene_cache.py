@@ -24,10 +24,10 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError, RouteError
 from lidar.options import DriveOptions, PlaceOptions
 from lidar.simulation import scene_cache
-from lidar.simulation.course import _stretches
 from lidar.simulation.drive import drive
+from lidar.simulation.scene_cache import _stretches
 from lidar.simulation.scene_source import open_scene_or_map
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "one scanner"

@@ -19,7 +19,7 @@ from lidar.errors import InputError
 from lidar.options import DriveOptions
 from lidar.signal.registry import read_attacks, read_stages
 from lidar.simulation.drive import drive
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "several"

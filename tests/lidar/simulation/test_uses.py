@@ -13,7 +13,7 @@ from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, pedestrians=40.0, parked=0.7, radius=150.0)
 OPTIONS = DriveOptions(rig="vlp16", duration=0.3, seed=3, formats=("pcd",), traffic=BUSY)

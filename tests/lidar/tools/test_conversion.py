@@ -16,7 +16,7 @@ from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.convert import convert
 from lidar.tools.verify import verify_dataset
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "two"

@@ -14,8 +14,7 @@ from geoscene.classes import Class
 from lidar import drive
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
-from lidar.dataset.layouts.bev import REACH
-from lidar.dataset.layouts.range_images import points
+from lidar.dataset.layouts.sweep_images import REACH, points
 from lidar.dataset.png import image_to_feature, write_png
 from lidar.dataset.recorded import cloud_points, scanner_clouds, still_points
 from lidar.dataset.seen_points import motions_of, returns_of, views_of
@@ -24,7 +23,7 @@ from lidar.geometry.georeference import Georeference
 from lidar.options import DriveOptions, MapOptions
 from lidar.tools.evaluation.objects import evaluate_objects
 from lidar.tools.maps.aggregate import aggregate
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "fusion"

@@ -14,7 +14,7 @@ from lidar.dataset.png import counts_to_depth, read_png
 from lidar.errors import DatasetError, InputError
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 RIG = """
 name = "tilted"

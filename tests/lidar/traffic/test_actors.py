@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
-from lidar.dataset.boxes import COLUMNS
+from lidar.dataset.ground_truth import COLUMNS
 from lidar.dataset.layout import Paths
 from lidar.errors import DatasetError, InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
 from lidar.motion.vehicle import load_vehicle
 from lidar.sensors.camera.render import render
@@ -25,7 +25,8 @@ from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.simulation.boxes import box_rows, count_points, image_boxes, merge_box_files
 from lidar.traffic.ego_drive import drive_with_signals
-from lidar.traffic.populate import TrafficOptions, populate
+from lidar.traffic.options import TrafficOptions
+from lidar.traffic.populate import populate
 from lidar.traffic.sweep import rectangles
 from lidar.world.actors import actor_shapes, actor_transforms, existing_actors, rotations, states, velocities
 from lidar.world.world import World
@@ -280,6 +281,9 @@ def test_boxes_of_a_dataset_include_those_that_only_its_second_scanner_has(tmp_p
         merge_box_files(tmp_path)
 
 
+SIDES = ("left", "top", "right", "bottom")
+
+
 def test_every_road_user_in_an_image_has_a_box(actors, ego):
     k = int(np.flatnonzero(actors.parked)[0])
     camera = CameraSpec("c", Mount(), 40, 24, 30.0, 30.0, 19.5, 11.5, near=0.1, far=np.inf)
@@ -287,10 +291,11 @@ def test_every_road_user_in_an_image_has_a_box(actors, ego):
     pose = type(ego.at([0]))(away, np.eye(3)[None], np.ones((1, 3)))
     instance = np.full((24, 40), -1)
     instance[3:5, 7:11] = actors.feature[k]
-    boxes = image_boxes(actors, camera, pose=pose, time_ns=0, instance=instance)
-    row = boxes.row.tolist().index(k)
-    assert boxes.box[row].tolist() == boxes.seen[row].tolist() == [6.5, 2.5, 10.5, 4.5]
-    assert (boxes.pixels[row], boxes.visibility[row]) == (8, 1.0)
+    boxes = image_boxes(actors, camera, pose=pose, frame=0, time_ns=0, instance=instance)
+    row = boxes["id"].tolist().index(k)
+    assert [boxes[side][row] for side in SIDES] == [6.5, 2.5, 10.5, 4.5]
+    assert [boxes[f"seen_{side}"][row] for side in SIDES] == [6.5, 2.5, 10.5, 4.5]
+    assert (boxes["pixels"][row], boxes["visibility"][row]) == (8, 1.0)
 
 
 def test_image_boxes_give_the_visible_share(actors, scene, ego):
@@ -322,14 +327,15 @@ def test_image_boxes_give_the_visible_share(actors, scene, ego):
             feature=np.append(feature[mine], np.int32(10**6)),
         )
         image = render(camera, pose, world=world, sun=(0.0, 0.0, 1.0), settings=CameraSettings())
-        boxes = image_boxes(actors, camera, pose=pose, time_ns=0, instance=image.feature)
-        row = int(np.flatnonzero(boxes.row == k)[0])
-        shown.append(boxes.visibility[row])
+        boxes = image_boxes(actors, camera, pose=pose, frame=0, time_ns=0, instance=image.feature)
+        row = int(np.flatnonzero(boxes["id"] == k)[0])
+        shown.append(boxes["visibility"][row])
         v, u = np.nonzero(image.feature == actors.feature[k])
-        assert boxes.pixels[row] == len(u)
-        assert boxes.seen[row].tolist() == [u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5]
+        assert boxes["pixels"][row] == len(u)
+        seen = [boxes[f"seen_{side}"][row] for side in SIDES]
+        assert seen == [u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5]
         if not blocked:
-            np.testing.assert_allclose(boxes.box[row], boxes.seen[row], atol=1.01)
+            np.testing.assert_allclose([boxes[side][row] for side in SIDES], seen, atol=1.01)
     assert shown[0] > 0.97
     assert 0.3 < shown[1] < 0.95
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import shapely
 from helpers.roadgrids import grid, road_graph
-from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
+from helpers.traffic import CAR, Plane, boxes_at, tracks, with_speed
 
 from lidar.motion.motion import drive_path, poses_along
 from lidar.motion.path import plan_path
@@ -41,7 +41,7 @@ def path_on(graph, seed, seconds):
 def middle_of(ego, times):
     at = ego.at((times * 1e9).astype(np.int64))
     forward = at.rotation[:, :2, 0]
-    return at.position[:, :2] + BOX[2] * forward, np.arctan2(forward[:, 1], forward[:, 0])
+    return at.position[:, :2] + CAR.middle * forward, np.arctan2(forward[:, 1], forward[:, 0])
 
 
 def speed_of(ego):
@@ -140,7 +140,7 @@ def test_the_ego_keeps_its_distance_from_a_slow_leader(seed):
         path, CAR, time_s=np.arange(len(travelled)) * STEP_S, max_distance=np.minimum(travelled, path.length)
     )
     ego = poses_along(path, CAR, motion=motion)
-    flow = simulate_trips(slow, graph, plan=plan, ego=ego, ego_box=BOX, radius=600.0, obeys_signals=True)
+    flow = simulate_trips(slow, graph, plan=plan, ego=ego, vehicle=CAR, radius=600.0, obeys_signals=True)
     # Trips without room at the first step never appear; those that do stay to the end of the drive or street.
     for trip in np.unique(flow.trip):
         rows = flow.trip == trip
@@ -173,10 +173,10 @@ def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, signa
     )
     ego = poses_along(path, CAR, motion=motion)
     check_gentle(ego)
-    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=300.0, obeys_signals=True)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, vehicle=CAR, radius=300.0, obeys_signals=True)
     poses = tracks(trips, flow)
     times = np.arange(len(poses)) * STEP_S
-    own = rectangles(*middle_of(ego, times), length=BOX[0], width=BOX[1])
+    own = rectangles(*middle_of(ego, times), length=CAR.length, width=CAR.width)
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()

@@ -15,8 +15,9 @@ from lidar.cli import app
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.motion.vehicle import load_vehicle
-from lidar.traffic.fcd import TrafficFile, read_fcd
+from lidar.traffic.fcd import read_fcd
 from lidar.traffic.fcd_replay import replay
+from lidar.traffic.options import TrafficFile
 from lidar.world.actors import existing_actors, rotations, states
 from lidar.world.ground import ground_heights
 

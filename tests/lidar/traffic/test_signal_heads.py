@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.roadgrids import grid, road_graph
-from helpers.traffic import BOX, CAR
+from helpers.traffic import CAR
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -167,7 +167,7 @@ def test_a_vehicle_on_a_fixed_way_meets_green_heads():
         np.tile([10.0, 0.0, 0.0], (len(x), 1)),
         np.ones(len(x)),
     )
-    signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, BOX, graph=graph)))
+    signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, CAR, graph=graph)))
     place, heading = beside(graph, before=8.0, aside=4.0)
     zone, group = find_served_heads(place, heading, graph=graph, plan=plan)
     heads = SignalHeads(np.arange(len(graph), dtype=np.int32), place, heading, zone, group)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import shapely
 from helpers.roadgrids import grid, road_graph
-from helpers.traffic import BOX, CAR, Plane, boxes_at, tracks, with_speed
+from helpers.traffic import CAR, Plane, boxes_at, tracks, with_speed
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,8 +15,8 @@ from geoscene.geometry.polylines import curvatures
 from lidar.geometry.poses import Trajectory
 from lidar.motion.motion import drive_path
 from lidar.motion.path import plan_path
-from lidar.motion.road_conditions import DRY, ROADS
 from lidar.motion.route import RouteOptions, plan_route
+from lidar.motion.vehicle import DRY, ROADS
 from lidar.traffic import simulation
 from lidar.traffic.ego import ego_motion, ego_trip, green_windows
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
@@ -51,7 +51,7 @@ def flow_on(graph, ego, *, seed, density=25.0, radius=400.0, shares=None, road=D
     plan = junction_plan(graph, lanes, seed=seed)
     area = surroundings_of(lanes, ego, radius=radius, scale=1.0)
     trips = vehicle_trips(lanes, area, seed=seed, density=density, shares=shares, road=road)
-    return trips, simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=radius), plan
+    return trips, simulate_trips(trips, graph, plan=plan, ego=ego, vehicle=CAR, radius=radius), plan
 
 
 def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
@@ -107,7 +107,7 @@ def test_reckless_drivers_do_not_collide():
         for t in trips
     ]
     flow = simulate_trips(
-        wild, graph, plan=junction_plan(graph, lanes, seed=9), ego=ego, ego_box=BOX, radius=600.0
+        wild, graph, plan=junction_plan(graph, lanes, seed=9), ego=ego, vehicle=CAR, radius=600.0
     )
     for moment in tracks(wild, flow)[::2]:
         assert overlaps(boxes_at(wild, moment)) == 0
@@ -185,10 +185,10 @@ def test_the_ego_is_never_touched(seed, signalised):
     at = ego.at(times)
     forward = at.rotation[:, :2, 0]
     own = rectangles(
-        at.position[:, :2] + BOX[2] * forward,
+        at.position[:, :2] + CAR.middle * forward,
         np.arctan2(forward[:, 1], forward[:, 0]),
-        length=BOX[0],
-        width=BOX[1],
+        length=CAR.length,
+        width=CAR.width,
     )
     for mine, moment in zip(own, poses, strict=True):
         if np.isfinite(moment).any():
@@ -226,7 +226,7 @@ def test_no_road_user_stands_for_good(seed):
     shares = {"sedan": 0.6, "cyclist": 0.3, "truck": 0.1}
     trips = vehicle_trips(lanes, area, seed=seed, density=15.0, shares=shares)
     plan = junction_plan(graph, lanes, seed=seed)
-    flow = simulate_trips(trips, graph, plan=plan, ego=ego, ego_box=BOX, radius=400.0)
+    flow = simulate_trips(trips, graph, plan=plan, ego=ego, vehicle=CAR, radius=400.0)
     assert len(np.unique(flow.trip)) > 20
     assert longest_rests(flow).max() < 100.0
 
@@ -331,7 +331,7 @@ def test_signals_are_green_for_the_ego_when_it_comes():
     ego = driving(graph, 3, 40.0)
     lanes = lanes_of(graph)
     plan = junction_plan(graph, lanes, seed=11)
-    signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, BOX, graph=graph)))
+    signals = plan.signals._replace(window=green_windows(plan, ego_motion(ego, CAR, graph=graph)))
     times = np.arange(0.0, 40.0, 0.1)
     at = ego.at((times * 1e9).astype(np.int64))
     zone = zone_at(plan.zones, at.position[:, :2])

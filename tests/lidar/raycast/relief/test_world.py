@@ -14,7 +14,7 @@ from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.scene import SceneFiles, open_scene
 from geoscene.scene.layout import SCHEMA, manifest_digest
 from geoscene.scene.tile_files import Tile, write_tile
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.raycast import Hits
 from lidar.raycast.relief import FRAME, INFILL, PARTS, SILL
 from lidar.sensors.laser.scan import scan

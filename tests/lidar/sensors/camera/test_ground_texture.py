@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import Mesh
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera.ground_texture import (
     ASPHALT,

@@ -14,7 +14,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import concatenate
 from geoscene.objects.shapes import shapes
 from lidar.errors import InputError
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.light import (

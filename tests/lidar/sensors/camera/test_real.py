@@ -10,7 +10,7 @@ from geoscene.classes import Class
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
 from lidar.dataset.png import depth_to_counts, encode_png
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera.light import sun_direction
 from lidar.sensors.camera.render import render

@@ -12,7 +12,7 @@ from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import ROOF, WALL, Mesh, concatenate
 from lidar.dataset.png import encode_png
 from lidar.errors import InputError
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels

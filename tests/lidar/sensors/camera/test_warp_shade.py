@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from geoscene.classes import Class, materials
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
-from lidar.geometry.mounts import OPTICAL, Mount
+from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast.relief import pairs_of, tables_of
 from lidar.sensors.camera import shade

@@ -5,7 +5,7 @@ import pytest
 from helpers.sensor_worlds import LEAVES, box, driven, plate, world
 
 from geoscene.classes import Class
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.laser.surface_echoes import PROJECTION
 from lidar.sensors.physics.settings import ScannerSettings

@@ -7,7 +7,7 @@ import pytest
 from helpers.sensor_worlds import MeshWorld, box, driven, plate, world
 
 from geoscene.classes import Class, materials
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import cast, scan
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor

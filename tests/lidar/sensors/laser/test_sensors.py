@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers.sensor_worlds import driven, plate, world
 
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.doppler import radial_velocity
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.patterns.beams import blocks, frame_window_ns

@@ -14,8 +14,7 @@ from pyproj import Geod
 
 from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
-from lidar.geometry.attitude import quat_from_euler
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount, quat_from_euler
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.navigation.gnss import antenna_motion, epochs, gauss_markov, gnss_columns, observe_gnss

@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
-from lidar.geometry.attitude import quat_from_euler
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount, quat_from_euler
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.navigation.imu import (
     EARTH_RATE,

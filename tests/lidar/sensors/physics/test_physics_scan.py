@@ -8,7 +8,7 @@ import pytest
 from helpers.sensor_worlds import box, driven, plate, world
 
 from geoscene.classes import Class, materials
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.link import detection_probability
 from lidar.sensors.physics.reflect import pane_reflection

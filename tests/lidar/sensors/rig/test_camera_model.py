@@ -8,7 +8,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.rig.camera_model import intrinsic_matrix, pixel_rays, project, unproject
 from lidar.sensors.rig.specs import CameraSpec
 

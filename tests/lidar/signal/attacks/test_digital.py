@@ -11,7 +11,7 @@ from PIL import Image
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame as SceneFrame
 from lidar.errors import InputError
-from lidar.geometry.mounts import OPTICAL_QUAT, Mount
+from lidar.geometry.attitude import OPTICAL_QUAT, Mount
 from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud

@@ -11,7 +11,7 @@ from scipy import stats
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import cast
 from lidar.sensors.physics.detector import METRES_PER_NS
 from lidar.sensors.physics.echoes import Origin

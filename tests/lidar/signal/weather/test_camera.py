@@ -9,7 +9,7 @@ import pytest
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame as GeoFrame
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera import shade
 from lidar.sensors.camera.light import daylight

@@ -10,7 +10,7 @@ from helpers.sensor_worlds import box, driven, world
 
 from geoscene.geometry.frames import Frame
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.laser.scan import cast
 from lidar.sensors.physics.echoes import Origin, trace

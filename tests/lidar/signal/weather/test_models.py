@@ -7,7 +7,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.physics.echoes import Origin
 from lidar.sensors.rig.scanner import load_sensor

@@ -8,7 +8,7 @@ from helpers.sensor_worlds import box, driven, world
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame as GeoFrame
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import CameraImage

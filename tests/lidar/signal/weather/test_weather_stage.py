@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 from scipy.special import erfc
 
 from geoscene.classes import Class
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast
 from lidar.sensors.physics.echoes import Origin

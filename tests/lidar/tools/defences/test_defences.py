@@ -11,7 +11,7 @@ from helpers.sensor_worlds import box, driven, world
 from geoscene.classes import Class
 from lidar.dataset.png import write_png
 from lidar.errors import InputError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.physics.detector import METRES_PER_NS
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.specs import CameraSpec

@@ -29,7 +29,7 @@ from lidar.tools.redteam.evaluate import accuracies
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure
 from lidar.tools.train import examples_of, train
-from lidar.traffic.populate import TrafficOptions
+from lidar.traffic.options import TrafficOptions
 
 TRAFFIC = TrafficOptions(vehicles=60.0, parked=1.0, pedestrians=40.0, cyclists=20.0)
 

@@ -9,6 +9,7 @@ from helpers.programs import run_program
 from shapely import affinity, box
 
 from lidar.dataset.layout import open_dataset
+from lidar.dataset.layouts.kitti import true_lines
 from lidar.dataset.layouts.kitti_drive import read_drive
 from lidar.dataset.layouts.nuscenes import token_of
 from lidar.errors import FormatError, InputError
@@ -31,7 +32,7 @@ from lidar.tools.evaluation.nuscenes_detection import (
     samples_of,
     true_boxes,
 )
-from lidar.tools.evaluation.objects import evaluate_objects, kind_of, true_lines
+from lidar.tools.evaluation.objects import evaluate_objects, kind_of
 from lidar.tools.evaluation.overlap import area_overlap, flat_overlap, footprints, volume_overlap
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from geoscene.drawing.canvas import Canvas
-from lidar.dataset.kitti_sequence import write_poses
+from lidar.dataset.layouts.kitti_drive import write_poses
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns

@@ -15,9 +15,8 @@ from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
-from lidar.geometry.box_tree import tree_of
+from lidar.geometry.box_tree import lower_to_nearest, tree_of
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.geometry.nearest import lower_to_nearest
 from lidar.tools.maps.compare import LIMIT, SurfaceComparison
 from lidar.tools.maps.surfaces import TrueSurfaces
 from lidar.world.world import World

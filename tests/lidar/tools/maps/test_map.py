@@ -19,7 +19,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.time_scales import gps_seconds
-from lidar.geometry.trajectory_csv import read_trajectory, write_trajectory
+from lidar.geometry.trajectory_files import read_trajectory, write_trajectory
 from lidar.options import ORIGINS, MapOptions
 from lidar.sensors.physics.echoes import Origin
 from lidar.tools.maps.aggregate import aggregate

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.support.progress import silent
 from lidar.errors import DatasetError, InputError
-from lidar.geometry.trajectory_tum import read_tum
+from lidar.geometry.trajectory_files import read_tum
 from lidar.motion.replay import read_replay
 from lidar.options import OdometryOptions
 from lidar.tools.odometry.deskewing import still

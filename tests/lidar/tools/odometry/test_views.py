@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lidar.errors import DatasetError
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.tools.odometry.deskewing import moved_back, scaled_motion

@@ -25,7 +25,7 @@ from geoscene.classes import Class, class_codes
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
-from lidar.geometry.mounts import Mount
+from lidar.geometry.attitude import Mount
 from lidar.options import DriveOptions
 from lidar.tools.plots import FIGURES, plot
 from lidar.tools.plots.coverage import _coarser

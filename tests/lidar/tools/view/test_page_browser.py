@@ -8,11 +8,10 @@ import pytest
 from helpers.browser import browser
 from PIL import Image
 
-from lidar.dataset.boxes import read_boxes
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
+from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.layout import open_dataset
-from lidar.dataset.truth_files import read_truth
 from lidar.options import PlaybackOptions
 from lidar.sensors.physics.echoes import Origin
 from lidar.tools.view import view_drive

@@ -9,8 +9,18 @@ from hypothesis import strategies as st
 
 from geoscene.support.registry import Registry
 from lidar.errors import InputError
-from lidar.grammar import Item, item_text, read_items, split_items, split_pairs
-from lidar.parameters import Parameters, build, parameter, parameter_rows, read_values
+from lidar.parameters import (
+    Item,
+    Parameters,
+    build,
+    item_text,
+    parameter,
+    parameter_rows,
+    read_items,
+    read_values,
+    split_items,
+    split_pairs,
+)
 from lidar.signal.registry import STAGES
 from lidar.tools.defences.registry import DEFENCES
 from lidar.tools.denoise.filters import METHODS

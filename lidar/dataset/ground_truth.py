@@ -1,4 +1,4 @@
-"""Bounding boxes of road users: 3D boxes in the scene and from the ego vehicle, 2D boxes in images."""
+"""Ground truth of a dataset: bounding boxes of road users (3D, and 2D in images), and changes by stages."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from geoscene.classes import Class
+from geoscene.support.untrusted import read_arrays
 from lidar.dataset.layout import read_rows, reading_file
 
 COLUMNS = (
@@ -54,9 +56,24 @@ def boxes_by_frame(
 
 
 def _value(name: str, text: str) -> str | int | float | bool:
-    """A value of a file of boxes."""
     if name in _TEXT:
         return text
     if name == "moving":
         return {"True": True, "False": False}[text]
     return int(text) if name in _WHOLE else float(text)
+
+
+def read_truth(path: Path, *, count: int | None = None) -> dict[str, NDArray[Any]] | None:
+    """The columns of a truth file of a cloud or an image; None if there is none.
+
+    count : returns of the cloud
+
+    Raises DatasetError for a file that is damaged or of another cloud.
+    """
+    if not path.exists():
+        return None
+    with reading_file(path):
+        truth = read_arrays(path)
+        if count is not None and len(truth["origin"]) != count:
+            raise ValueError(f"is of {len(truth['origin'])} returns, the cloud has {count}")
+    return truth
