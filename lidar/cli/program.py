@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
@@ -34,7 +35,7 @@ JsonFlag = Annotated[bool, Parameter(group=OUTPUT)]
 QuietFlag = Annotated[bool, Parameter(name=["--quiet", "-q"], group=OUTPUT)]
 
 
-def show(document: object, text: str, *, json: bool) -> int:
+def show(document: Mapping[str, Any], text: str, *, json: bool) -> int:
     """Print a result as JSON or as text; the exit code of success."""
     if json:
         print_json(document)
