@@ -116,14 +116,7 @@ _LEFT_OUT = {
 """Returns that maps leave out, by the reason."""
 
 
-def convert(
-    dataset: Path,
-    /,
-    *,
-    out: Out,
-    options: ConvertOptions,
-    report: Reporting = Report(),
-) -> int:
+def convert(dataset: Path, /, *, out: Out, options: ConvertOptions, report: Reporting = Report()) -> int:
     """Write a dataset in the layout of another dataset, or its point clouds in another format.
 
     With a format of clouds, the result is the same dataset with its clouds in this format: those of a drive
@@ -238,14 +231,7 @@ def denoise(
     return show(found.to_json(), found.table().to_text(), json=report.json)
 
 
-def odometry(
-    dataset: Path,
-    /,
-    *,
-    options: OdometryOptions,
-    out: Out,
-    report: Reporting = Report(),
-) -> int:
+def odometry(dataset: Path, /, *, options: OdometryOptions, out: Out, report: Reporting = Report()) -> int:
     """Estimate the motion of the vehicle from recorded measurements, without ground truth.
 
     Writes trajectory.tum (TUM), trajectory.kitti (KITTI), poses.csv with standard deviations where the method
