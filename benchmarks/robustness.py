@@ -44,7 +44,7 @@ from geoscene.errors import GeosceneError
 from geoscene.errors import InputError as SceneInputError
 from geoscene.support.console import main as main_of
 from geoscene.support.digests import file_digest
-from geoscene.support.memory import peak_memory
+from geoscene.support.processes import peak_memory
 from lidar.errors import InputError, LidarError
 
 _SHARES = {"maps": 2, "scenes": 3, "datasets": 6, "configurations": 5}

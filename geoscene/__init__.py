@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geoscene.support.lazy import lazily
-from geoscene.support.notebooks import register_previews
+from geoscene.support.lazy import lazily, register_previews
 
 if TYPE_CHECKING:
     from geoscene.export import export_scene as export_scene

@@ -8,10 +8,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from geoscene.errors import InputError
-from geoscene.relief import MESH, RELIEFS
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.registry import unknown_name
-from geoscene.uses import USES
+from geoscene.uses import MESH, RELIEFS, USES
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """Kinds of features that a scene can have besides its ground."""

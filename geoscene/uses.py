@@ -1,9 +1,33 @@
-"""Uses of scenes: a drive, a map or a GIS needs only part of a scene."""
+"""Contents of scenes: levels of relief, and what a drive, a map or a GIS needs of a scene.
+
+Levels of relief:
+
+off   : walls are planes and the ground is smooth
+plain : windows and doors in depth, kerbs, rough ground, lined tunnels, trees with limbs
+full  : guessed small parts, too
+scene : what the scene was built with
+mesh  : openings of walls as triangles, instead of surfaces that rays meet by formula
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+
+RELIEFS = ("off", "plain", "full")
+"""Relief that a scene is built with; each has all of the former."""
+
+MESH = "mesh"
+
+USED_RELIEFS = ("scene", *RELIEFS, MESH)
+"""Relief of a scene that a drive uses."""
+
+
+def sufficient_reliefs(used: str) -> tuple[str, ...]:
+    """Reliefs of which a scene must be built with one, for a relief of `USED_RELIEFS` to be used."""
+    if used == "full":
+        return ("full",)
+    return RELIEFS[1:] if used in ("plain", MESH) else RELIEFS
 
 
 @dataclass(frozen=True, slots=True)

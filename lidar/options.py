@@ -17,10 +17,10 @@ from cyclopts import Group, Parameter, Token
 
 from geoscene.classes import Class
 from geoscene.options import KINDS, BuildOptions, Degrees
-from geoscene.relief import RELIEFS
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.digests import recipe_digest
 from geoscene.support.registry import unknown_name
+from geoscene.uses import RELIEFS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
@@ -646,7 +646,7 @@ class PlaceOptions:
     def build_options(self, name: str, *, relief: str) -> BuildOptions:
         """Options of the build, with a title of the scene; raises InputError for invalid ones.
 
-        relief : that the drive uses, of `geoscene.relief.USED_RELIEFS`; the default of builds unless a scene
+        relief : that the drive uses, of `geoscene.uses.USED_RELIEFS`; the default of builds unless a scene
                  can be built with it
         """
         return BuildOptions(

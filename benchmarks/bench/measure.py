@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Literal, TypeVar
 
 from geoscene.errors import GeosceneError
-from geoscene.support.memory import peak_memory
+from geoscene.support.processes import peak_memory
 
 T = TypeVar("T")
 

@@ -10,13 +10,19 @@ import numpy as np
 import shapely
 from shapely.errors import GEOSException
 
-from geoscene.buildings.appearance import choose_appearance, read_roof, read_walls
-from geoscene.buildings.footprints import clean, groups, project
+from geoscene.buildings.appearance import choose_appearance, read_roof, read_roof_tags, read_walls
+from geoscene.buildings.footprints import (
+    assign,
+    clean,
+    clusters,
+    cut_overlaps,
+    duplicates,
+    groups,
+    project,
+    remainder,
+)
 from geoscene.buildings.heights import CLOUD_TOP, read_heights
-from geoscene.buildings.parts import assign, clusters, cut_overlaps, duplicates, remainder
-from geoscene.buildings.resolve import BuildingHeights, BuildingRow, resolve_heights, texts
-from geoscene.buildings.roof_tags import read_roof_tags
-from geoscene.buildings.stacks import with_support
+from geoscene.buildings.resolve import BuildingHeights, BuildingRow, resolve_heights, texts, with_support
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags

@@ -1,4 +1,4 @@
-"""Resolves the heights of every building and part: from its tags, its building, its parts, or inferred."""
+"""Heights and roofs of buildings and their parts from tags; support of stacked parts."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.buildings.appearance import Appearance
+from geoscene.buildings.appearance import Appearance, RoofTags, default_roof_height
+from geoscene.buildings.footprints import Polygons, subtract
 from geoscene.buildings.heights import HIGHEST, SIGMA_PRIOR, THINNEST, Tagged, infer_heights
-from geoscene.buildings.roof_tags import RoofTags, default_roof_height
-from geoscene.buildings.table import BuildingOptions, Texts
+from geoscene.buildings.table import GRID, BuildingOptions, Texts
 from geoscene.sources.data import Tags
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
@@ -27,6 +27,13 @@ _OPEN_BELOW = ("roof", "carport", "canopy")
 
 _SIGMA_ROOF = {"default": 0.5, "angle": 0.2}
 """Assumed standard deviation of a roof's height as a share of it, by its source."""
+
+_SLIT = 0.3
+"""Metres between a part's top and the underside of one above it that count as no gap; assumed, far below a
+storey."""
+
+_SUPPORT = 0.01
+"""Square metres; parts that share less in plan do not stand on one another."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,3 +206,36 @@ def _resolve_remainders(
             if not h.high[k] <= h.high[lowest]:
                 h.high[k], h.source[k], h.sigma[k] = h.high[lowest], "parts", SIGMA_PRIOR * h.high[lowest]
                 h.roof[k] = min(h.roof[k], h.high[k])
+
+
+def with_support(
+    rows: Sequence[BuildingRow], footprint: Polygons, *, heights: BuildingHeights
+) -> list[Problem]:
+    """Extend remainders of outlines under the parts above them, and close slits, both in place.
+
+    A remainder keeps the ground of the parts that begin at its top or above: a penthouse does not stand over
+    a hole. The underside of a part that lies less than 0.3 m over the flat top of another one is put on it,
+    and reported.
+    """
+    low, high = heights.low, heights.high
+    is_part = np.array([r.is_part for r in rows], np.bool_)
+    outline = np.array([r.outline for r in rows], np.int64)
+    raised = np.flatnonzero(is_part & (low > 0))
+    problems: list[Problem] = []
+    for building in np.unique(outline[raised]).tolist():
+        family = np.flatnonzero(is_part & (outline == building))
+        for k in (k for k in family.tolist() if rows[k].is_remainder):
+            cutters = family[(family != k) & (low[family] < high[k] - _SLIT)]
+            union = shapely.union_all(footprint[cutters], grid_size=GRID)
+            footprint[k] = subtract(footprint[building], union)
+        flat = family[heights.roof[family] <= 0]
+        for k in family[low[family] > 0].tolist():
+            gap = low[k] - high[flat]
+            below = flat[(gap > 0) & (gap < _SLIT)]
+            below = below[shapely.area(shapely.intersection(footprint[below], footprint[k])) > _SUPPORT]
+            if len(below):
+                top = float(high[below].max())
+                detail = f"underside at {low[k]:z.2f} m put on the part below, at {top:z.2f} m"
+                problems.append(Problem(rows[k].osm_id, "building", "repaired", "slit-between-parts", detail))
+                low[k] = top
+    return problems

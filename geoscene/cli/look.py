@@ -7,8 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter, validators
 
-from geoscene.cli.program import Out, Reporting, print_file
-from geoscene.cli.scene_text import print_scene
+from geoscene.cli.program import Out, Reporting, print_file, print_scene
 from geoscene.options import ExportOptions, ViewOptions
 from geoscene.support.console import FAILURE, Report, note_new_folder, print_json, progress_bar
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import shapely
 
+from geoscene.buildings.appearance import read_roof_tags
 from geoscene.buildings.heights import CLOUD_ROOF, CLOUD_SIGMA, CLOUD_TOP, THINNEST, read_heights
-from geoscene.buildings.roof_tags import read_roof_tags
 from geoscene.buildings.table import BuildingOptions
 from geoscene.clouds.levels import Body
 from geoscene.clouds.measure import CloudMeasurements

@@ -8,8 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.clouds.read import GROUND
-from geoscene.clouds.spool import SurveyPoints
+from geoscene.clouds.read import GROUND, SurveyPoints
 from geoscene.typing import Bools, Float
 
 WINDOW = 18.0

@@ -11,13 +11,11 @@ import numpy as np
 import shapely
 
 from geoscene.buildings import Buildings
-from geoscene.clouds import shift as shifts
 from geoscene.clouds import trees as canopy
 from geoscene.clouds.ground import MARGIN, CloudGrid, ground_heights
 from geoscene.clouds.levels import Body, split_bodies
-from geoscene.clouds.read import GROUND, VEGETATION
+from geoscene.clouds.read import GROUND, SIDE, VEGETATION, Spool, Square, SurveyPoints, without_outliers
 from geoscene.clouds.roofs import FEWEST, block_of, fit_roof, roof_points
-from geoscene.clouds.spool import SIDE, Spool, Square, SurveyPoints, without_outliers
 from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import Terrain, base_heights
 from geoscene.support.processes import run_tasks
@@ -30,6 +28,15 @@ _INSET = 0.5  # metres from a wall within which points are not taken for the roo
 _HIGH = 2.5  # metres above the ground that buildings are told by when the shift is sought
 _LOWEST_ROOF = 1.0  # metres above the building's base
 _NO_ROOF = (2, 3, 4, 5, 7, 9, 11, 17, 18)  # classes of ground, vegetation, noise, water, roads, bridges
+
+SHIFT_CELL = 0.5
+"""Metres of the rasters that are compared."""
+
+SHIFT_REACH = 10
+"""Cells by which they are shifted against each other, to each side."""
+
+SHIFT_MARGIN = SHIFT_CELL * SHIFT_REACH
+"""Metres around a square that the comparison needs."""
 
 
 class Work(NamedTuple):
@@ -157,14 +164,14 @@ def _ground_of(work: Work, square: Square) -> GroundOf:
     grid = grid_of(square, work.cell, margin=MARGIN)
     around = int(np.ceil(MARGIN / work.cell))
     own = slice(around, -around)
-    none = np.zeros((2 * shifts.REACH + 1, 2 * shifts.REACH + 1))
+    none = np.zeros((2 * SHIFT_REACH + 1, 2 * SHIFT_REACH + 1))
     if not len(points):
         return GroundOf(square, np.full((grid.rows - 2 * around,) * 2, np.nan), none, 0)
     built = burnt(work.footprints, grid, buffer=0.5)
     heights = ground_heights(points, grid, classified=is_classified(work.spool), built=built)
     score = none
     if np.isfinite(heights).any() and built.any():
-        fine = grid_of(square, shifts.CELL, margin=shifts.MARGIN)
+        fine = grid_of(square, SHIFT_CELL, margin=SHIFT_MARGIN)
         low = _nearest(heights)
         xy = points.xyz[:, :2]
         above = points.xyz[:, 2] - low.ravel()[grid.cells(xy)]
@@ -173,7 +180,7 @@ def _ground_of(work: Work, square: Square) -> GroundOf:
         high = np.zeros(fine.shape, np.bool_)
         tall = inside & (above > _HIGH) & ~np.isin(points.klass, VEGETATION)
         high.ravel()[fine.cells(xy[tall])] = True
-        score = shifts.agreement(high, burnt(work.footprints, fine))
+        score = agreement(high, burnt(work.footprints, fine))
     return GroundOf(square, heights[own, own], score, outliers)
 
 
@@ -323,3 +330,63 @@ def _trees_of(work: Work, square: Square, *, points: SurveyPoints, terrain: Terr
     xmin, ymin, xmax, ymax = box_of(square)
     x, y = found.xy.T
     return found.take((x >= xmin) & (x < xmax) & (y >= ymin) & (y < ymax))
+
+
+def agreement(high: Bools, built: Bools) -> Float:
+    """Cells (2 n + 1, 2 n + 1) of a mapped building's inside at a high place minus those around it.
+
+    The value at [n + r, n + c], n = `SHIFT_REACH`, is for the cloud moved by r rows and c columns.
+
+    high  : (rows, columns) bool, cells with points high above the ground, with `SHIFT_REACH` cells around
+    built : (rows, columns) bool, cells in mapped buildings, of the same raster
+    """
+    inner = built[SHIFT_REACH:-SHIFT_REACH, SHIFT_REACH:-SHIFT_REACH]
+    weight = (
+        np.where(inner, 1.0, -1.0) * _near_edge(built)[SHIFT_REACH:-SHIFT_REACH, SHIFT_REACH:-SHIFT_REACH]
+    )
+    rows, columns = inner.shape
+    out = np.zeros((2 * SHIFT_REACH + 1, 2 * SHIFT_REACH + 1))
+    for r in range(-SHIFT_REACH, SHIFT_REACH + 1):
+        for c in range(-SHIFT_REACH, SHIFT_REACH + 1):
+            moved = high[
+                SHIFT_REACH - r : SHIFT_REACH - r + rows, SHIFT_REACH - c : SHIFT_REACH - c + columns
+            ]
+            out[SHIFT_REACH + r, SHIFT_REACH + c] = weight[moved].sum()
+    return out
+
+
+def _near_edge(built: Bools) -> Bools:
+    """Mask of the cells within 3 m of the outline of a mapped building, which determine the shift."""
+    from scipy.ndimage import binary_dilation, binary_erosion  # noqa: PLC0415 - slow to import
+
+    steps = int(3.0 / SHIFT_CELL)
+    return np.asarray(binary_dilation(built, iterations=steps) & ~binary_erosion(built, iterations=steps))
+
+
+def best_shift(score: Float) -> tuple[float, float, float]:
+    """Metres east and north by which to move the cloud, and the gain over no shift as a share of the best.
+
+    score : sum of `agreement` over all squares
+
+    The peak between cells is that of a parabola through the best cell and its neighbours; zero without a
+    clear peak, as where there are no buildings or the best lies at the rim.
+    """
+    best = score.max()
+    if best <= 0:
+        return 0.0, 0.0, 0.0
+    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+    if not (0 < row < 2 * SHIFT_REACH and 0 < column < 2 * SHIFT_REACH):
+        return 0.0, 0.0, 0.0
+    north = row - SHIFT_REACH + _vertex(score[row - 1 : row + 2, column])
+    east = column - SHIFT_REACH + _vertex(score[row, column - 1 : column + 2])
+    return (
+        float(east * SHIFT_CELL),
+        float(north * SHIFT_CELL),
+        float((best - score[SHIFT_REACH, SHIFT_REACH]) / best),
+    )
+
+
+def _vertex(three: Float) -> float:
+    """Place of the extremum of a parabola through values at -1, 0 and 1."""
+    bend = three[0] - 2 * three[1] + three[2]
+    return float(0.5 * (three[0] - three[2]) / bend) if bend < 0 else 0.0

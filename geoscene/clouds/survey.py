@@ -12,10 +12,8 @@ import numpy as np
 from geoscene.buildings import read_buildings
 from geoscene.clouds.apply import with_measurements
 from geoscene.clouds.ground import MARGIN, CloudGrid, bridged_by_blocks
-from geoscene.clouds.measure import GroundOf, Work, burnt, grounds_of, is_classified, measure
-from geoscene.clouds.read import SurveyFile, open_cloud
-from geoscene.clouds.shift import best_shift
-from geoscene.clouds.spool import SIDE, Spool, spool_clouds
+from geoscene.clouds.measure import GroundOf, Work, best_shift, burnt, grounds_of, is_classified, measure
+from geoscene.clouds.read import SIDE, Spool, SurveyFile, open_cloud, spool_clouds
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground.terrain import open_terrain

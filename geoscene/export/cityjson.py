@@ -13,7 +13,7 @@ from pyproj import CRS
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, compact_json
+from geoscene.export.kinds import Summary, compact_json
 from geoscene.export.objects import (
     FeatureAttributes,
     Part,
@@ -24,9 +24,8 @@ from geoscene.export.objects import (
     pieces,
     read_features,
 )
-from geoscene.export.shells import bodies, manifold_patches, shell_numbers
-from geoscene.export.tables import target_crs
-from geoscene.export.vertices import Vertices
+from geoscene.export.shells import Vertices, bodies, manifold_patches, shell_numbers
+from geoscene.export.vector import target_crs
 from geoscene.geometry.frames import Frame, utm_crs
 from geoscene.geometry.mesh import DOOR, FLOOR, OTHER, ROOF, WALL, WINDOW, Mesh, ShapeInstances
 from geoscene.scene import Scene

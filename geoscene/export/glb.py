@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.export.files import Summary
 from geoscene.export.gltf import GlbWriter, PropertyTables, add_instances, y_up
+from geoscene.export.kinds import Summary
 from geoscene.export.objects import (
     FeatureAttributes,
     Part,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.errors import InputError
-from geoscene.export.files import compact_json
+from geoscene.export.kinds import compact_json
 from geoscene.export.objects import FeatureAttributes, table_columns
 from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.support.files import append, spool

@@ -1,13 +1,16 @@
-"""Registry of export formats, and the function that exports a scene."""
+"""Registry of export formats, the function that exports a scene, and the summary that all return."""
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from geoscene.errors import InputError
-from geoscene.export.files import Summary
 from geoscene.options import ExportOptions
 from geoscene.scene import Scene
 from geoscene.support.files import exclusive
@@ -68,7 +71,7 @@ KINDS: Registry[ExportFormat] = Registry(
             "GeoTIFF", "raster:write_geotiff", suffixes=".tif .tiff", options="layers model resolution"
         ),
         "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", suffixes=".xodr"),
-        "sumo": _kind("SUMO network", "sumo:write_sumo", suffixes=".net.xml"),
+        "sumo": _kind("SUMO network", "opendrive:write_sumo", suffixes=".net.xml"),
     },
     error=InputError,
 )
@@ -140,3 +143,54 @@ def _relief_note(scene: Scene) -> str:
     return (
         f"openings of {counts.get('walls', 0)} walls are geometry; planes are walls that {', '.join(planes)}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """Summary of an export.
+
+    path    : the file, or the folder
+    kind    : name of the format
+    files   : number of files
+    bytes   : of all files together
+    objects : objects, features, roads or pixels, whichever the format counts in
+    solids  : closed solids among them
+    faces   : triangles
+    crs     : name of the coordinate reference system of the coordinates in it
+    notes   : what a user must know of it, one line each
+    """
+
+    path: Path
+    kind: str
+    files: int
+    bytes: int
+    objects: int
+    solids: int = 0
+    faces: int = 0
+    crs: str = ""
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, path: Path, kind: str, **fields: Any) -> Summary:
+        """Summary of an export to a path, with the number and size of its files."""
+        return cls(path, kind, *size_of(path), **fields)
+
+
+def size_of(path: Path) -> tuple[int, int]:
+    """Number of files and of bytes at a path."""
+    files = [path] if path.is_file() else [p for p in path.rglob("*") if p.is_file()]
+    return len(files), sum(p.stat().st_size for p in files)
+
+
+def plain(value: Any) -> Any:
+    """A value of a column as JSON has it; None for NaN, infinity and empty text."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or value == "" or (isinstance(value, float) and not np.isfinite(value)):
+        return None
+    return value
+
+
+def compact_json(value: Any) -> bytes:
+    """A value as JSON without spaces."""
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()

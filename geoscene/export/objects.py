@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.errors import InputError
-from geoscene.export.files import plain
+from geoscene.export.kinds import plain
 from geoscene.geometry.mesh import Mesh, ShapeInstances, concatenate
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent

@@ -1,7 +1,9 @@
-"""OpenDRIVE 1.7: the road graph as reference lines, lanes, junctions, signals, bridges and tunnels."""
+"""OpenDRIVE 1.7: the road graph as reference lines, lanes, junctions, signals; and SUMO networks from it."""
 
 from __future__ import annotations
 
+import re
+import subprocess
 import warnings
 from collections import defaultdict
 from collections.abc import Iterator
@@ -10,12 +12,13 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from geoscene.export.files import Summary
+from geoscene.errors import GeosceneError, need
+from geoscene.export.kinds import Summary
 from geoscene.export.objects import attribution
 from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
-from geoscene.support.files import atomic_file
+from geoscene.support.files import atomic_file, temporary_folder
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
 
@@ -39,6 +42,9 @@ _SIGNALS = {
     "give_way": ("no", "DE", "205"),
 }
 """Dynamic, country, type: OpenDRIVE's own code of a three-light signal, the numbers of the StVO's signs."""
+
+_STAMP = re.compile(rb"<!--.*?-->\s*", re.DOTALL)
+_VALUES = re.compile(r"'[^']*'|\b(start|end)\b|-?\d+(\.\d+)?")  # what differs between warnings of a kind
 
 
 def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
@@ -315,3 +321,43 @@ def _junctions(net: RoadNet, junctions: dict[int, int], *, first: int, left_hand
                 yield f'<laneLink from="{before}" to="{sign * (lane + 1)}"/>'
             yield "</connection>\n"
         yield "</junction>\n"
+
+
+def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
+    """Write the road graph as a SUMO network (``.net.xml``).
+
+    The network is converted by ``netconvert`` of the package eclipse-sumo from the file of `write_opendrive`;
+    its comments contain the time of day and are removed. Its warnings are notes of the summary, one for each
+    kind. Edge -7 is the right side of road 7 of `write_opendrive`.
+
+    Raises MissingExtraError without eclipse-sumo, SceneFormatError for a scene without roads, GeosceneError
+    with the last line of netconvert's output if that fails.
+    """
+    home = Path(need("sumo", "sumo").SUMO_HOME)
+    with temporary_folder(path, "roads") as folder:
+        roads, net = folder / "roads.xodr", folder / "roads.net.xml"
+        roads_summary = write_opendrive(scene, roads, progress=progress)
+        files = ("--opendrive-files", roads, "--output-file", net)
+        command = (home / "bin" / "netconvert", *files, "--aggregate-warnings", "-1")  # `_warnings` does so
+        # no shell; only the folder's name comes from the user
+        run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+        if run.returncode or not net.exists():
+            lines = [line for line in run.stderr.splitlines() if line.strip()] or ["no message"]
+            raise GeosceneError(f"netconvert failed: {lines[-1]}")
+        with atomic_file(path) as out:
+            out.write(_STAMP.sub(b"", net.read_bytes()))
+    notes = (*roads_summary.notes, *_warnings(run.stderr))
+    return Summary.of(path, "sumo", objects=roads_summary.objects, crs=scene.frame.name, notes=notes)
+
+
+def _warnings(text: str) -> list[str]:
+    """One line for each kind of warning of netconvert: their number and the first one."""
+    found: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        if line.startswith("Warning: "):
+            warning = line.removeprefix("Warning: ").strip()
+            found.setdefault(_VALUES.sub("%", warning), []).append(warning)
+    return [
+        f"netconvert: {same[0]}" + (f" ({len(same)} warnings of this kind)" if len(same) > 1 else "")
+        for same in found.values()
+    ]

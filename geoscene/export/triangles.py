@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import materials
 from geoscene.errors import InputError
-from geoscene.export.files import Summary, size_of
+from geoscene.export.kinds import Summary, size_of
 from geoscene.export.objects import attribution, expand, klass_name, parts, pieces, read_features
 from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.geometry.watertight import degenerate_faces, validate_mesh

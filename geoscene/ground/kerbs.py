@@ -10,7 +10,6 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.ground.camber import Kerbs
 from geoscene.ground.layers import (
     COVERS,
     FLUSH,
@@ -25,8 +24,8 @@ from geoscene.ground.layers import (
     SIDEWALKS,
     Layers,
 )
-from geoscene.ground.nearby import points_in_boxes, shapes_near
 from geoscene.ground.partition import GroundPlan, Partition, rows_at, tile_box, values_at
+from geoscene.ground.relief import Kerbs, points_in_boxes, shapes_near
 from geoscene.ground.triangulate import PlaneTriangles
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.errors import InputError
-from geoscene.ground.camber import Kerbs, Raised
-from geoscene.ground.faces import GroundFaces, faces
+from geoscene.ground.faces import GroundFaces, distinct_places, faces, snap_rounded
 from geoscene.ground.layers import Layers
-from geoscene.ground.snapping import distinct_places, snap_rounded
+from geoscene.ground.relief import Kerbs, Raised
 from geoscene.ground.terrain_lattice import Lattice, TerrainHeights, lattice
 from geoscene.support.columns import row_blocks
 from geoscene.typing import Bools, Float, Ints
@@ -150,7 +149,7 @@ def plan_ground(
     terrain : heights that tiles follow, instead of lines, that `geoscene.ground.join_tiles` makes of several
     base   : class and material where no polygon lies
     kerbs  : by which sidewalks of carriageways are raised above them (`geoscene.ground.kerbs`)
-    raised : what stands above; its parts must be layers of their own (`geoscene.roadgraph.camber`)
+    raised : what stands above; its parts must be layers of their own (`geoscene.roadgraph.relief`)
 
     Raises InputError for an extent without area or non-finite, or sizes off the grid.
     """

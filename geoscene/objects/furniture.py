@@ -118,7 +118,7 @@ def read_furniture(
     With relief, bicycle parkings are rows of stands, and signs have the plates of their codes and faces.
 
     left_hand : traffic keeps left
-    relief    : of `geoscene.relief.RELIEFS`; with ``plain`` and ``full`` there are more kinds
+    relief    : of `geoscene.uses.RELIEFS`; with ``plain`` and ``full`` there are more kinds
     """
     chosen, mapped = mapped_furniture(osm, frame, extent=plan.extent, relief=relief)
     roads, sites = _Roads.of(osm, frame), Sites.of(plan)

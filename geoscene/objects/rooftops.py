@@ -15,8 +15,7 @@ from geoscene.buildings import Buildings
 from geoscene.buildings.footprints import groups
 from geoscene.buildings.guesses import guess_looks, region_at, seeds
 from geoscene.geometry.mesh import FLOOR, ROOF, Mesh, ShapeInstances
-from geoscene.objects.roof_shapes import DORMER_DEPTH
-from geoscene.objects.shapes import place
+from geoscene.objects.shapes import DORMER_DEPTH, place
 from geoscene.support.columns import Columns
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints

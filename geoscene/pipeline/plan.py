@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings, read_buildings
 from geoscene.buildings.facades import FacadeSetting, read_setting
-from geoscene.buildings.tops import with_measured_tops
+from geoscene.buildings.heights import with_measured_tops
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground import (
@@ -26,13 +26,12 @@ from geoscene.ground import (
     tile_span,
     water_levels,
 )
-from geoscene.ground.camber import Kerbs, Raised
-from geoscene.ground.foundations import foundation_heights
 from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
-from geoscene.ground.standing import standing_height
+from geoscene.ground.landcover import paved_fabric
+from geoscene.ground.relief import Kerbs, Raised
+from geoscene.ground.standing import foundation_heights, standing_height
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.terrain_lattice import TerrainHeights
-from geoscene.ground.urban import paved_fabric
 from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
 from geoscene.objects.forests import Forests
 from geoscene.objects.furniture import (
@@ -61,13 +60,18 @@ from geoscene.pipeline.features import (
 )
 from geoscene.pipeline.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
-from geoscene.roadgraph.ballast import read_beds
-from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
-from geoscene.roadgraph.driving_side import Side
-from geoscene.roadgraph.driving_side import driving_side as found_side
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.kerbs import mapped_kerbs, sidewalk_ends
+from geoscene.roadgraph.lanes import Side
+from geoscene.roadgraph.lanes import driving_side as found_side
+from geoscene.roadgraph.relief import (
+    camber_of,
+    crown_rows,
+    find_crowns,
+    mapped_kerbs,
+    read_beds,
+    sidewalk_ends,
+)
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.scene.geopackage import Layer
@@ -130,7 +134,7 @@ class BuildPlan:
     structures : bridges and tunnels
     openings  : area of each structure where the ground is left out, None for most
     use       : what of the scene is written
-    relief    : of surfaces, of `geoscene.relief.RELIEFS`
+    relief    : of surfaces, of `geoscene.uses.RELIEFS`
     facades   : what the openings of walls depend on; None without relief
     rooftops  : what stands on roofs; None without full relief
     wires     : overhead wires; none without relief

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.route_line import route_line
+from geoscene.roadgraph.routing import route_line
 from geoscene.typing import Float, Ints
 
 if TYPE_CHECKING:

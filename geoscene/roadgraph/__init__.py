@@ -9,11 +9,11 @@ from geoscene.support.lazy import lazily
 if TYPE_CHECKING:
     from geoscene.roadgraph.build import RoadOptions as RoadOptions
     from geoscene.roadgraph.build import build_road_graph as build_road_graph
-    from geoscene.roadgraph.components import find_components as find_components
-    from geoscene.roadgraph.components import main_network as main_network
     from geoscene.roadgraph.grading import find_obstacles as find_obstacles
     from geoscene.roadgraph.grading import graded_ground as graded_ground
     from geoscene.roadgraph.graph import RoadGraph as RoadGraph
+    from geoscene.roadgraph.graph import find_components as find_components
+    from geoscene.roadgraph.graph import main_network as main_network
     from geoscene.roadgraph.graphml import read_graphml as read_graphml
     from geoscene.roadgraph.graphml import write_graphml as write_graphml
     from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
@@ -26,10 +26,10 @@ __getattr__ = lazily(
         "RoadGraph": "graph",
         "RoadOptions": "build",
         "build_road_graph": "build",
-        "find_components": "components",
+        "find_components": "graph",
         "find_obstacles": "grading",
         "graded_ground": "grading",
-        "main_network": "components",
+        "main_network": "graph",
         "profile": "longitudinal_profile",
         "read_graphml": "graphml",
         "write_graphml": "graphml",

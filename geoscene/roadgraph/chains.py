@@ -1,15 +1,21 @@
-"""Chains of nodes that become edges: ways cut at junctions and changes, and joined in between."""
+"""Chains of nodes that become edges: ways cut at junctions and changes, and joined; controls on them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
 
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.tags import CLASSES
+from geoscene.sources.data import TaggedNode, Tags, Way
 from geoscene.typing import Bools, Ints
+
+# Metres before a node within which a signal or a sign is the node's own.
+_REACH = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,3 +135,111 @@ def _turn(piece: RoadChain) -> RoadChain:
 def _join(pieces: Sequence[RoadChain]) -> RoadChain:
     nodes = [pieces[0].node, *(piece.node[1:] for piece in pieces[1:])]
     return RoadChain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))
+
+
+def add_controls(
+    graph: RoadGraph,
+    points: Iterable[TaggedNode],
+    *,
+    sides: tuple[Ints, Bools],
+    lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
+) -> RoadGraph:
+    """The graph with its traffic controls.
+
+    ``direction`` tags are respected. Without one, signals and crossings control both directions, and a sign
+    controls the traffic towards the nearer end of its road (OSM wiki, Key:direction). At a junction, signals
+    and ``stop=all`` control every arm, other signs the arms of lesser class, or all if they are equal.
+
+    sides : the chain of each edge (m,) and whether the edge runs against it (m,)
+    lines : the chains, the ways they are made of, and the ids of the nodes that they count
+    """
+    one_each = ~sides[1] | (graph.twin < 0)
+    ends = np.concatenate([graph.tail[one_each], graph.head[one_each]])
+    arms = np.bincount(ends, minlength=len(graph.node_id))
+    arm_metres = np.bincount(ends, np.tile(graph.length[one_each], 2), minlength=len(graph.node_id))
+    ranks = {name: CLASSES.index(name.removesuffix("_link")) for name in CLASSES}
+    rank = np.array([ranks.get(name, len(CLASSES)) for name in graph.highway.tolist()], np.int64)
+    best = np.full(len(graph.node_id), len(CLASSES), np.int64)
+    worst = np.zeros(len(graph.node_id), np.int64)
+    np.minimum.at(best, ends, np.tile(rank[one_each], 2))
+    np.maximum.at(worst, ends, np.tile(rank[one_each], 2))
+
+    flags = {name: np.zeros(len(graph.node_id), np.bool_) for name in ("traffic_signals", "stop", "give_way")}
+    rows = []
+    for edge, vertex, with_way, tags in _controls_on_edges(graph, points, sides=sides, lines=lines):
+        plan = np.linalg.norm(np.diff(graph.geometry[edge][:, :2], axis=0), axis=1)
+        length = float(graph.length[edge])
+        offset = length * float(plan[:vertex].sum() / max(plan.sum(), 1e-9))
+        node = int(graph.head[edge])
+        at_end = vertex == len(plan)
+        for kind in _kinds(tags):
+            side = _direction(tags, kind)
+            if side:
+                applies = side == (1 if with_way else -1)
+            elif kind not in ("stop", "give_way"):
+                applies = True
+            elif at_end and arms[node] > 2:
+                applies = tags.get("stop") == "all" or bool(
+                    rank[edge] > best[node] or best[node] == worst[node]
+                )
+            else:
+                ahead = float(arm_metres[node]) - length if at_end else length - offset
+                applies = ahead <= offset
+            if applies:
+                rows.append((edge, offset, kind))
+                if kind in flags and length - offset <= _REACH:
+                    flags[kind][node] = True
+    rows.sort()
+    return replace(
+        graph,
+        signals=flags["traffic_signals"],
+        stop=flags["stop"],
+        give_way=flags["give_way"],
+        control_edge=np.array([row[0] for row in rows], np.int32),
+        control_offset=np.array([row[1] for row in rows], float),
+        control_kind=np.array([row[2] for row in rows], np.str_),
+    )
+
+
+def _controls_on_edges(
+    graph: RoadGraph,
+    points: Iterable[TaggedNode],
+    *,
+    sides: tuple[Ints, Bools],
+    lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
+) -> Iterator[tuple[int, int, bool, Tags]]:
+    """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, tags)."""
+    chain_of, against = sides
+    chains, ways, node_id = lines
+    signed = {int(p.osm_id.removeprefix("node/")): p.tags for p in points if _kinds(p.tags)}
+    if not signed or not len(graph):
+        return
+    has_sign = np.isin(node_id, np.fromiter(signed, np.int64, len(signed)))
+    here = [chain for chain, c in enumerate(chains) if has_sign[c.node].any()]
+    for edge in np.flatnonzero(np.isin(chain_of, here)).tolist():
+        chain = chains[chain_of[edge]]
+        node, way = (chain.node[::-1], chain.way[::-1]) if against[edge] else (chain.node, chain.way)
+        for vertex in (1 + np.flatnonzero(has_sign[node[1:]])).tolist():
+            a, b = node_id[node[vertex - 1]], node_id[node[vertex]]
+            nodes = ways[way[vertex - 1]].nodes
+            with_way = bool(((nodes[:-1] == a) & (nodes[1:] == b)).any())
+            yield edge, vertex, with_way, signed[int(b)]
+
+
+def _kinds(tags: Tags) -> list[str]:
+    """Kinds of control at a point; a signalled crossing is also a signal."""
+    kind = tags.get("highway", "")
+    if kind not in ("traffic_signals", "stop", "give_way", "crossing"):
+        return []
+    crossing = tags.get("crossing", "no" if kind != "crossing" else "unknown")
+    kinds = [kind] if kind != "crossing" or crossing != "no" else []
+    if kind == "traffic_signals" and crossing != "no":
+        return [*kinds, "crossing"]
+    lit = crossing == "traffic_signals" or tags.get("crossing:signals") == "yes"
+    return [*kinds, "traffic_signals"] if kind == "crossing" and lit else kinds
+
+
+def _direction(tags: Tags, kind: str) -> int:
+    """1 for traffic along the way, -1 for traffic against it, 0 if not tagged."""
+    value = tags.get(f"{kind}:direction", tags.get("direction", ""))
+    return {"forward": 1, "backward": -1}.get(value, 0)

@@ -1,4 +1,4 @@
-"""Lateral position of lanes: how a carriageway is divided between its two directions.
+"""Side of the road that traffic keeps to, and lateral position of lanes on carriageways.
 
 Routes, traffic, paint and OpenDRIVE all take the number, width and place of lanes from here. Lanes of an edge
 are counted from the kerb: lane 0 is the outermost one. Offsets are measured from the carriageway's centre
@@ -7,17 +7,48 @@ line, positive towards the side that traffic keeps to.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from geoscene.geometry.frames import wrap_longitude
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.sources.data import OsmData
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
 WIDEST_LANE = 4.5
 """Metres: the lanes of a carriageway with several are not wider; the rest is for parking and bicycles."""
+
+Side = Literal["left", "right"]
+
+LEFT_HAND = frozenset({
+    "Europe/London", "Europe/Dublin", "Europe/Belfast", "Europe/Isle_of_Man", "Europe/Jersey",
+    "Europe/Guernsey", "Europe/Malta", "Asia/Nicosia", "Asia/Famagusta", "Europe/Nicosia", "Asia/Tokyo",
+    "Asia/Hong_Kong", "Asia/Macau", "Asia/Bangkok", "Asia/Singapore", "Asia/Kuala_Lumpur", "Asia/Kuching",
+    "Asia/Brunei", "Asia/Jakarta", "Asia/Pontianak", "Asia/Makassar", "Asia/Jayapura", "Asia/Dili",
+    "Asia/Kolkata", "Asia/Karachi", "Asia/Dhaka", "Asia/Kathmandu", "Asia/Thimphu", "Asia/Colombo",
+    "Indian/Maldives", "Australia/Sydney", "Australia/Melbourne", "Australia/Hobart", "Australia/Brisbane",
+    "Australia/Lindeman", "Australia/Adelaide", "Australia/Broken_Hill", "Australia/Darwin",
+    "Australia/Perth", "Australia/Eucla", "Australia/Lord_Howe", "Antarctica/Macquarie", "Indian/Christmas",
+    "Indian/Cocos", "Pacific/Norfolk", "Pacific/Auckland", "Pacific/Chatham", "Pacific/Rarotonga",
+    "Pacific/Niue", "Pacific/Fakaofo", "Pacific/Pitcairn", "Pacific/Fiji", "Pacific/Tongatapu",
+    "Pacific/Apia", "Pacific/Tarawa", "Pacific/Kanton", "Pacific/Kiritimati", "Pacific/Nauru",
+    "Pacific/Funafuti", "Pacific/Guadalcanal", "Pacific/Port_Moresby", "Pacific/Bougainville",
+    "Africa/Johannesburg", "Africa/Maseru", "Africa/Mbabane", "Africa/Windhoek", "Africa/Gaborone",
+    "Africa/Harare", "Africa/Lusaka", "Africa/Blantyre", "Africa/Maputo", "Africa/Dar_es_Salaam",
+    "Africa/Nairobi", "Africa/Kampala", "Indian/Mauritius", "Indian/Mahe", "Atlantic/St_Helena",
+    "America/Guyana", "America/Paramaribo", "Atlantic/Stanley", "Atlantic/Bermuda", "America/Nassau",
+    "America/Jamaica", "America/Cayman", "America/Grand_Turk", "America/St_Thomas", "America/Tortola",
+    "America/Anguilla", "America/St_Kitts", "America/Antigua", "America/Montserrat", "America/Dominica",
+    "America/St_Lucia", "America/St_Vincent", "America/Grenada", "America/Barbados", "America/Port_of_Spain",
+})  # fmt: skip
+"""Time zones (IANA) of the countries and territories that keep left, by the Geneva and Vienna conventions'
+registers and Kincaid, The Rule of the Road (1986), with Samoa's change of 2009. No zone reaches into a
+country of the other side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,3 +125,23 @@ def graph_lanes(graph: RoadGraph) -> LaneLayout:
     two_way = graph.twin >= 0
     against = np.where(two_way, graph.lanes[graph.twin], 0.0)
     return lane_layout(graph.lanes, against, two_way=two_way, width=graph.width)
+
+
+def side_at(lon: float, lat: float) -> Side:
+    """The driving side of the country at a place; right at sea and in Antarctica."""
+    from tzfpy import get_tz  # noqa: PLC0415  (reads the zones' outlines)
+
+    return "left" if get_tz(lon, lat) in LEFT_HAND else "right"
+
+
+def driving_side(osm: OsmData) -> tuple[Side, str]:
+    """Driving side of a map extract and its source: ``tag`` or ``place``.
+
+    The tag ``driving_side`` counts if half of the streets or more have it: single streets are exceptions.
+    """
+    tags = [way.tags for way in osm.ways if "highway" in way.tags]
+    tagged = Counter(side for tag in tags if (side := tag.get("driving_side")) in ("left", "right"))
+    if tagged and 2 * tagged.total() >= len(tags):
+        return cast("Side", max(sorted(tagged), key=tagged.__getitem__)), "tag"
+    west, south, east, north = osm.bounds
+    return side_at(wrap_longitude((west + east) / 2), (south + north) / 2), "place"

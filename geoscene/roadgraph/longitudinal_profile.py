@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.overlaps import find_overlaps
 from geoscene.roadgraph.quadratic import Bounds, interior_point
-from geoscene.roadgraph.stations import Stations, find_crossings, place_stations
+from geoscene.roadgraph.stations import Stations, find_crossings, find_overlaps, place_stations
 from geoscene.typing import Bools, Float, Height, Ints
 
 

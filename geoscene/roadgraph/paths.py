@@ -1,8 +1,9 @@
-"""Surfaces of footways, cycleways, squares and rails."""
+"""Surfaces of footways, cycleways, squares, rails and pedestrian crossings."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,15 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
-from geoscene.roadgraph.carriageways import PAVED, place_of, surface_material
+from geoscene.geometry.polylines import directions
+from geoscene.roadgraph.carriageways import PAVED, Carriageways, place_of, surface_material
+from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
-from geoscene.sources.data import Area, OsmData, Tags, Way
+from geoscene.sources.data import Area, OsmData, TaggedNode, Tags, Way
+from geoscene.support.columns import Columns
 from geoscene.tags import parse_length, parse_number
+from geoscene.typing import Float, Ints
 
 # Default width (metres) and material. Assumed: minimum widths of design guides.
 _PATHS = {
@@ -37,6 +42,16 @@ _GAUGE, _RAIL_HEAD = 1.435, 0.072
 
 PRIORITY = {"square": 105.0, "yard": 106.0, "path": 110.0, "footway": 114.0, "cycleway": 116.0, "rail": 175.0}
 """Priorities of surfaces, higher on top: land cover is below 100, carriageways are between 130 and 150."""
+
+_AREA, _PAINT = 160.0, 165.0
+# Metres: default width of a crossing, of a zebra's stripes and the gaps between, and of the
+# two lines of a signalled crossing (Vienna Convention: 2.5 and more; MUTCD 3B.18: lines 6 to 24 inches,
+# stripes 12 to 24, gaps not over 2.5 times that).
+_WIDTH = 3.0
+_STRIPE, _STRIPE_GAP = 0.5, 0.5
+_BORDER = 0.3
+
+_STRIPES = frozenset({"zebra", "marked", "uncontrolled", "yes", "island", "pelican", "toucan", "puffin"})
 
 
 def way_lines(ways: Sequence[Way], frame: Frame) -> tuple[list[Way], NDArray[np.object_]]:
@@ -149,3 +164,152 @@ def rail_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
         source=np.tile(np.where(mapped, "gauge/default", "default/default"), 2),
         **where,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Crossings(Columns):
+    """Crossings as lines from kerb to kerb.
+
+    line  : (c,) shapely LineString
+    width : (c,) float64 metres along the road
+    paint : (c,) str, ``stripes``, ``lines`` or "" (asphalt alone)
+    source : (c,) str
+    osm_id : (c,) str
+    """
+
+    line: NDArray[np.object_]
+    width: Float
+    paint: NDArray[np.str_]
+    source: NDArray[np.str_]
+    osm_id: NDArray[np.str_]
+
+
+def crossing_rows(osm: OsmData, roads: Carriageways, *, frame: Frame) -> SurfaceRows:
+    """Surfaces of crossings: the strip of road that pedestrians use, and its zebra stripes or border lines.
+
+    They are read from crossing ways and, where no such way passes, from crossing nodes. A crossing tagged
+    ``unmarked`` has neither paint nor a strip of its own.
+    """
+    ground = roads.take(roads.place == 0)
+    ways = [way for way in osm.ways if _is_crossing(way.tags)]
+    found = _Crossings.concatenate(
+        [
+            _from_ways([w for w in ways if _paint(w.tags)[0] != "none"], ground, frame=frame),
+            _from_nodes(osm, ways, roads=ground, frame=frame),
+        ]
+    )
+    line, width, paint, source, osm_id = found.line, found.width, found.paint, found.source, found.osm_id
+    out = [
+        SurfaceRows.of(
+            carriageway(line, width / 2),
+            klass=Class.CROSSING,
+            material="asphalt",
+            priority=_AREA,
+            osm_id=osm_id,
+            source=np.char.add(source, "/default"),
+        )
+    ]
+    striped, lined = np.flatnonzero(paint == "stripes"), np.flatnonzero(paint == "lines")
+    stripes, of = _stripes(line[striped], width[striped])
+    aside = width[lined] / 2 - _BORDER / 2
+    borders = shapely.offset_curve(np.tile(line[lined], 2), np.concatenate([aside, -aside]))
+    for shapes, row in (
+        (stripes, striped[of]),
+        (shapely.buffer(borders, _BORDER / 2, cap_style="flat"), np.tile(lined, 2)),
+    ):
+        out.append(
+            SurfaceRows.of(
+                shapes,
+                klass=Class.CROSSING,
+                material="lane_paint",
+                priority=_PAINT,
+                osm_id=osm_id[row],
+                source=np.char.add(source[row], "/default"),
+            )
+        )
+    return SurfaceRows.concatenate(out)
+
+
+def _is_crossing(tags: Tags) -> bool:
+    return tags.get("highway") in ("footway", "cycleway", "path") and "crossing" in (
+        tags.get("footway"),
+        tags.get("cycleway"),
+        tags.get("path"),
+    )
+
+
+def _paint(tags: Tags) -> tuple[str, str]:
+    """``stripes``, ``lines`` or ``none``, and its source: the tag ``crossing`` or ``default``."""
+    markings, kind = tags.get("crossing:markings", ""), tags.get("crossing", "")
+    if markings in ("no", "none") or (not markings and kind in ("unmarked", "no", "informal")):
+        return "none", "crossing"
+    if markings and markings != "yes":
+        return ("lines" if "lines" in markings or markings in ("dashes", "dots") else "stripes"), "crossing"
+    if tags.get("crossing_ref") == "zebra" or kind in _STRIPES - {"yes", "island"}:
+        return "stripes", "crossing"
+    if kind == "traffic_signals":
+        return "lines", "crossing"
+    return "stripes", "default"
+
+
+def _from_ways(ways: list[Way], roads: Carriageways, *, frame: Frame) -> _Crossings:
+    """Crossing ways, cut to the carriageways that they cross."""
+    ways, lines = way_lines(ways, frame)
+    bands = carriageway(roads.line, roads.width / 2)
+    way, band = shapely.STRtree(bands).query(lines, predicate="intersects")
+    pieces = shapely.intersection(lines[way], bands[band])
+    cut = [shapely.line_merge(shapely.union_all(pieces[way == k])) for k in range(len(ways))]
+    parts, index = shapely.get_parts(np.array(cut, object), return_index=True)
+    long = (shapely.get_type_id(parts) == shapely.GeometryType.LINESTRING) & (shapely.length(parts) > 2.0)
+    of = [ways[k] for k in index[long].tolist()]
+    return _crossings(parts[long], of)
+
+
+def _from_nodes(osm: OsmData, ways: list[Way], *, roads: Carriageways, frame: Frame) -> _Crossings:
+    """Crossing nodes without a crossing way, as lines straight across their road."""
+    passed = set(np.concatenate([way.nodes for way in ways]).tolist()) if ways else set()
+    points = [
+        p
+        for p in osm.points
+        if p.tags.get("highway") == "crossing"
+        and _paint(p.tags)[0] != "none"
+        and int(p.osm_id.removeprefix("node/")) not in passed
+    ]
+    x, y = frame.from_geographic([p.lon for p in points], [p.lat for p in points])
+    at = shapely.points(np.stack([x, y], axis=1)) if points else np.empty(0, object)
+    which, road = shapely.STRtree(roads.line).query_nearest(at, max_distance=0.5, all_matches=False)
+    line = roads.line[road]
+    along = shapely.line_locate_point(line, at[which])
+    ahead = directions(line, along, reach=1.0)
+    across = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1) * (roads.width[road] / 2)[:, None]
+    centre = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+    ends = np.stack([centre - across, centre + across], axis=1)
+    shapes = shapely.linestrings(ends) if len(ends) else np.empty(0, object)
+    return _crossings(shapes, [points[k] for k in which.tolist()])
+
+
+def _crossings(lines: NDArray[np.object_], of: Sequence[Way | TaggedNode]) -> _Crossings:
+    given = [parse_length(feature.tags.get("width")) for feature in of]
+    paint = [_paint(feature.tags) for feature in of]
+    return _Crossings(
+        lines,
+        np.array([g if g is not None and 1.5 <= g <= 15 else _WIDTH for g in given], float),
+        np.array([kind for kind, _ in paint], "<U8"),
+        np.array([source for _, source in paint], "<U8"),
+        np.array([feature.osm_id for feature in of], np.str_),
+    )
+
+
+def _stripes(lines: NDArray[np.object_], width: Float) -> tuple[NDArray[np.object_], Ints]:
+    """Zebra stripes along the road, side by side along crossing lines, and the line of each."""
+    length = shapely.length(lines)
+    pitch = _STRIPE + _STRIPE_GAP
+    count = np.floor((length - 0.2 + _STRIPE_GAP) / pitch).astype(np.int64)
+    of = np.repeat(np.arange(len(lines)), count)
+    if not len(of):
+        return np.empty(0, object), of
+    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    start = (length - count * pitch + _STRIPE_GAP)[of] / 2 + number * pitch
+    ends = shapely.line_interpolate_point(lines[of][:, None], start[:, None] + np.array([0.0, _STRIPE]))
+    bits = shapely.linestrings(shapely.get_coordinates(ends).reshape(-1, 2, 2))
+    return shapely.buffer(bits, width[of] / 2, cap_style="flat"), of

@@ -14,14 +14,13 @@ from geoscene.geometry.frames import Frame
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, read_carriageways
 from geoscene.roadgraph.covers import cover_rows
-from geoscene.roadgraph.crossings import crossing_rows
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import JOINT, build_junctions, carriageway
-from geoscene.roadgraph.lane_symbols import symbol_rows
 from geoscene.roadgraph.markings import marking_rows, painted_stretches, stop_rows
-from geoscene.roadgraph.paths import path_surfaces, rail_surfaces, square_surfaces
+from geoscene.roadgraph.paths import crossing_rows, path_surfaces, rail_surfaces, square_surfaces
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
+from geoscene.roadgraph.symbols import symbol_rows
 from geoscene.sources.data import OsmData
 from geoscene.typing import Float, Ints
 

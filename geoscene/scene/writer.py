@@ -22,7 +22,7 @@ from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
 from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
 from geoscene.scene.tile_files import write_shapes
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.digests import file_digest
 from geoscene.support.files import exclusive, write_json
 from geoscene.support.problems import Problem

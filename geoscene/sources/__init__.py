@@ -17,10 +17,10 @@ from geoscene.sources.registry import read_source as read_source
 from geoscene.support.lazy import lazily
 
 if TYPE_CHECKING:
-    from geoscene.sources.demo import demo_path as demo_path
     from geoscene.sources.elevation import TileServer as TileServer
     from geoscene.sources.elevation import fetch_elevation as fetch_elevation
     from geoscene.sources.elevation import with_elevation as with_elevation
+    from geoscene.sources.files import demo_path as demo_path
     from geoscene.sources.files import read_osm as read_osm
     from geoscene.sources.network import Servers as Servers
     from geoscene.sources.network import fetch_bbox as fetch_bbox
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from geoscene.sources.network import locate as locate
 
 _LATE = {
-    "demo_path": "demo",
+    "demo_path": "files",
     "read_osm": "files",
     "Servers": "network",
     "TileServer": "elevation",

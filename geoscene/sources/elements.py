@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
+import math
 from array import array
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.sources.data import Tags
+from geoscene.errors import InputError
+from geoscene.sources.data import Bounds, Progress, Tags
 from geoscene.typing import Bools, Float, Ints
 
 Members = tuple[tuple[str, int, str], ...]
@@ -19,6 +26,12 @@ UNITS = 10_000_000
 
 UNKNOWN = 2**31 - 1
 """Value of a missing coordinate."""
+
+OPEN: dict[str, Callable[..., Any]] = {"": open, ".gz": gzip.open, ".bz2": bz2.open}
+"""How to open a file by the suffix of its compression."""
+
+RELATIONS = "building|bridge|multipolygon|restriction|site|tunnel"
+"""Types of relations that are fetched; routes and boundaries extend far beyond the area and are not used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,3 +218,97 @@ class Collector:
             timestamp=self.timestamp,
             misplaced=misplaced,
         )
+
+
+def whole_units(degrees: Any) -> int:
+    """A coordinate in 1e-7 degrees; `UNKNOWN` if it is not a number or far out of range."""
+    try:
+        value = float(degrees)
+    except (TypeError, ValueError):
+        return UNKNOWN
+    return round(value * UNITS) if math.isfinite(value) and abs(value) <= 200 else UNKNOWN
+
+
+def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progress) -> None:
+    """Add the objects of an XML file to ``collector``, also nodes without a position; slower than libosmium.
+
+    form : ``osm``, ``osm.gz`` or ``osm.bz2``
+
+    Raises ValueError or OSError for a damaged file.
+    """
+    try:
+        with OPEN[form.removeprefix("osm")](path, "rb") as file:
+            for _, item in progress(ET.iterparse(file)):  # noqa: S314 - expat limits the expansion of entities
+                if item.tag not in {"node", "way", "relation"}:
+                    continue
+                tags = {tag.get("k", ""): tag.get("v", "") for tag in item.iter("tag")}
+                osm_id = int(item.get("id", ""))
+                if item.tag == "node":
+                    x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
+                    collector.node(osm_id, x, y=y, tags=tags or None)
+                elif item.tag == "way":
+                    collector.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
+                else:
+                    members = tuple(
+                        (m.get("type", ""), int(m.get("ref", "")), m.get("role", ""))
+                        for m in item.iter("member")
+                    )
+                    collector.relation(osm_id, tags, members=members)
+                if not collector.timestamp or item.get("timestamp", "") > collector.timestamp:
+                    collector.timestamp = item.get("timestamp", "")
+                item.clear()
+    except ET.ParseError as error:
+        raise ValueError(str(error)) from error
+
+
+def query_for(box: Bounds, *, timeout: int = 180) -> str:
+    """The Overpass QL query for all features of a scene in a box (west, south, east, north, degrees).
+
+    It returns ways that intersect the box, and multipolygons with all their ways, with all their nodes.
+    """
+    west, south, east, north = box
+    area = f"({south:.7f},{west:.7f},{north:.7f},{east:.7f})"
+    return (
+        f"[out:json][timeout:{timeout}];"
+        f"way{area}->.w;"
+        f'rel{area}["type"~"^({RELATIONS})$"]->.r;'
+        'rel.r["type"="multipolygon"]->.m;'
+        "(.w;way(r.m););out body qt;"
+        f"(node(w);node{area}(if:count_tags()>0););out body qt;"
+        ".r out body qt;"
+    )
+
+
+def collect_answer(answer: Any, collector: Collector) -> None:
+    """Add the objects of one answer to ``collector``.
+
+    Raises InputError if it is not Overpass JSON.
+    """
+    if not isinstance(answer, dict) or not isinstance(answer.get("elements"), list):
+        raise InputError("JSON, but not as Overpass answers with [out:json]: no list of elements")
+    stamp = answer.get("osm3s", {}).get("timestamp_osm_base", "")
+    collector.timestamp = max(collector.timestamp, str(stamp))
+    try:
+        for item in answer["elements"]:
+            tags, kind, osm_id = _tags(item), item["type"], int(item["id"])
+            if kind == "node":
+                collector.node(
+                    osm_id, whole_units(item.get("lon")), y=whole_units(item.get("lat")), tags=tags or None
+                )
+            elif kind == "way":
+                collector.way(osm_id, [int(ref) for ref in item.get("nodes", ())], tags=tags)
+            elif kind == "relation":
+                members = tuple(
+                    (str(m["type"]), int(m["ref"]), str(m["role"])) for m in item.get("members", ())
+                )
+                collector.relation(osm_id, tags, members=members)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"JSON, but not as Overpass answers with [out:json]: {error!r}") from error
+
+
+def _tags(item: dict[str, Any]) -> Tags:
+    """The tags of an object; raises TypeError for values that are not text."""
+    tags: Tags = item.get("tags") or {}
+    if not all(isinstance(value, str) for value in tags.values()):
+        raise TypeError("tags that are not text")
+    return tags

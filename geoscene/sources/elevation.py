@@ -19,7 +19,7 @@ from geoscene.errors import InputError, NetworkError
 from geoscene.geometry.frames import Frame, beside, rim_of, wrap_longitude
 from geoscene.options import BuildOptions
 from geoscene.sources.data import Bounds, OsmData
-from geoscene.sources.http import BUSY, RefusedError, cause, open_session
+from geoscene.sources.network import BUSY, RefusedError, cause, open_session
 from geoscene.sources.registry import SOURCES
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import features
 from geoscene.sources.data import Bounds, OsmData, Progress, Tags
-from geoscene.sources.elements import Collector
+from geoscene.sources.elements import OPEN, Collector, collect_answer, collect_xml
 from geoscene.sources.extent import checked_bounds
-from geoscene.sources.overpass import collect_answer
-from geoscene.sources.plain_xml import OPEN, collect_xml
 
 _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf) or Overpass JSON"
 
@@ -193,3 +191,14 @@ def read_osm(
             raise InputError(f"{one}: its {clash} is another in a file before; negative ids must be unique")
         collector = collector.joined(read) if number else read
     return features(collector.finish(), bounds=bounds, source=", ".join(p.name for p in paths))
+
+
+def demo_path() -> Path:
+    """Path of the demo map in the package.
+
+    Raises SourceNotFoundError if it is missing.
+    """
+    path = Path(__file__).resolve().parents[1] / "demo" / "helsinki.osm.pbf"
+    if not path.is_file():
+        raise SourceNotFoundError(f"the demo map {path} is missing: install the package again")
+    return path

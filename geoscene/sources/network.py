@@ -9,7 +9,8 @@ import json
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,15 +22,16 @@ from geoscene import __version__
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.sources.assemble import features
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds, OsmData, Progress
-from geoscene.sources.elements import Collector
+from geoscene.sources.elements import Collector, collect_answer, query_for
 from geoscene.sources.extent import checked_bounds
-from geoscene.sources.http import BUSY, RefusedError, cause, open_session
-from geoscene.sources.overpass import collect_answer, query_for
 from geoscene.support.files import write_atomically
 
 _SMALLEST = 400.0  # metres: smallest side of the box of a place
 _NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one per second
 _CACHE_VERSION = 1
+
+BUSY = frozenset({429, 502, 503, 504})
+"""HTTP statuses of a server that may answer the same request later."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,3 +287,42 @@ def fetch_place(
     return _fetch(
         bounds, f"OpenStreetMap, {full_name}", cache_dir=cache_dir, servers=servers, progress=progress
     )
+
+
+class RefusedError(Exception):
+    """An answer that is not the data.
+
+    status      : HTTP status
+    retry_after : seconds to wait before a retry (header ``Retry-After``), infinite if not stated
+    """
+
+    def __init__(self, status: int, reason: str, *, retry_after: float = math.inf) -> None:
+        super().__init__(f"HTTP {status}, {reason}" if reason else f"HTTP {status}")
+        self.status = status
+        self.retry_after = retry_after
+
+
+@contextmanager
+def open_session(user_agent: str) -> Iterator[Any]:
+    """A `requests.Session` that raises RefusedError for every HTTP error."""
+    import requests  # noqa: PLC0415 - heavy
+
+    with requests.Session() as session:
+        session.headers.update({"User-Agent": user_agent, "Accept-Language": "en"})
+        session.hooks["response"].append(_raise_refusal)
+        yield session
+
+
+def _raise_refusal(response: Any, *_: Any, **__: Any) -> None:
+    if response.status_code >= 400:
+        stated = response.headers.get("Retry-After", "")
+        wait = float(stated) if stated.isdigit() else math.inf
+        raise RefusedError(response.status_code, response.reason or "", retry_after=wait)
+
+
+def cause(error: BaseException) -> str:
+    """The innermost reason of a failed request, at most 120 characters."""
+    while (inner := error.__cause__ or error.__context__) is not None:
+        error = inner
+    text = " ".join(str(getattr(error, "strerror", None) or error).split())
+    return text[:120] or type(error).__name__

@@ -1,9 +1,9 @@
 """Bridges and tunnels: solids, piers, linings, equipment and passages."""
 
-from geoscene.structures.ground_contact import find_openings as find_openings
-from geoscene.structures.ground_contact import ground_below as ground_below
-from geoscene.structures.ground_contact import opening_layers as opening_layers
-from geoscene.structures.passages import buildings_over as buildings_over
+from geoscene.structures.contact import buildings_over as buildings_over
+from geoscene.structures.contact import find_openings as find_openings
+from geoscene.structures.contact import ground_below as ground_below
+from geoscene.structures.contact import opening_layers as opening_layers
 from geoscene.structures.pieces import within_extent as within_extent
 from geoscene.structures.read import read_structures as read_structures
 from geoscene.structures.solids import built_structures as built_structures

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.ground.snapping import distinct_places
+from geoscene.ground.faces import distinct_places
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9

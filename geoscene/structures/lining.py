@@ -12,17 +12,18 @@ import numpy as np
 import shapely
 
 from geoscene.geometry import polylines
-from geoscene.structures.bodies import Bodies, between_rings, uprights
-from geoscene.structures.heights import slopes_across, surface_heights
-from geoscene.structures.table import Structures
+from geoscene.structures.table import Structures, slopes_across, surface_heights
 from geoscene.structures.tubes import (
+    Bodies,
     TubeWalls,
     between,
+    between_rings,
     carriageway,
     has_walkway,
     mouths,
     random_shares,
     stations_every,
+    uprights,
 )
 from geoscene.typing import Float, Ints
 

@@ -19,9 +19,8 @@ from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import is_tunnel, read_layer
 from geoscene.sources.data import OsmData, Way
-from geoscene.structures.heights import nearest_on_line
-from geoscene.structures.members import Members
-from geoscene.structures.table import StructureOptions
+from geoscene.structures.pieces import Members
+from geoscene.structures.table import StructureOptions, nearest_on_line
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Height, Ints
 

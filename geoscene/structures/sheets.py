@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
-from geoscene.structures.heights import PARTED, SHEET, nearest_on_line
+from geoscene.structures.table import PARTED, SHEET, nearest_on_line
 from geoscene.typing import Bools, Float
 
 Pair = tuple[int, int]

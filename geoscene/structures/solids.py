@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.geometry import polylines
 from geoscene.geometry.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
+from geoscene.structures.contact import tunnel_roof
 from geoscene.structures.fittings import tunnel_fittings
-from geoscene.structures.ground_contact import tunnel_roof
-from geoscene.structures.heights import slopes_across, surface_heights
 from geoscene.structures.layered import SIDE, LayerTriangulation, Shell, cut_plan, raise_shell
 from geoscene.structures.lining import NICHE, WALKWAY, Lining, read_lining
-from geoscene.structures.table import StructureOptions, Structures
+from geoscene.structures.table import StructureOptions, Structures, slopes_across, surface_heights
 from geoscene.typing import Bools, Float, Height, Ints
 
 _STANDING = 0.5

@@ -1,14 +1,21 @@
-"""Tables: frozen dataclasses whose arrays are columns of one length."""
+"""Tables: frozen dataclasses whose arrays are columns of one length, and tables as CSV, block by block."""
 
 from __future__ import annotations
 
+import csv
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from geoscene.support.files import atomic_path
+
+BLOCK_ROWS = 1 << 16
+"""Rows of a table that are formatted at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,3 +63,28 @@ def row_blocks(count: int, size: int, *, overlap: int = 0) -> Iterator[slice]:
     """Slices of ``size`` rows, and ``overlap`` of the next, that cover ``count``; an empty one for none."""
     for first in range(0, max(count, 1), size):
         yield slice(first, min(first + size + overlap, count))
+
+
+def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> None:
+    """Write columns as CSV with a header; floats as the shortest text that reads back the same value."""
+    arrays = {name: np.asarray(column) for name, column in columns.items()}
+    most = max((len(array) for array in arrays.values()), default=0)
+    write_blocks(
+        path,
+        ({name: array[rows] for name, array in arrays.items()} for rows in table_blocks(most)),
+    )
+
+
+def table_blocks(count: int) -> Iterator[slice]:
+    """Slices of the rows of a table, of which one at a time is in memory; see `write_blocks`."""
+    return row_blocks(count, BLOCK_ROWS)
+
+
+def write_blocks(path: Path, blocks: Iterable[Mapping[str, Sequence[Any] | NDArray[Any]]]) -> None:
+    """Write a table that comes in blocks of rows as CSV, as `write_columns` does; memory holds one block."""
+    with atomic_path(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        for number, columns in enumerate(blocks):
+            if not number:
+                writer.writerow(columns)
+            writer.writerows(zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True))

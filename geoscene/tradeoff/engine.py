@@ -23,7 +23,7 @@ from geoscene.geometry.watertight import volumes
 from geoscene.options import BuildOptions
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import OsmData
-from geoscene.support.memory import peak_memory
+from geoscene.support.processes import peak_memory
 from geoscene.support.progress import Progress, silent
 from geoscene.tradeoff.variants import BuildVariant, coarse_elevation, full, variants
 

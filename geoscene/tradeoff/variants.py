@@ -8,9 +8,8 @@ from pathlib import Path
 
 from geoscene.errors import InputError
 from geoscene.options import KINDS, BuildOptions
-from geoscene.relief import RELIEFS
 from geoscene.support.registry import unknown_name
-from geoscene.uses import USES
+from geoscene.uses import RELIEFS, USES
 
 SETTINGS = ("lod", "relief", "only", "terrain", "for")
 """Names of the settings that are compared."""

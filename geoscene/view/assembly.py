@@ -13,7 +13,7 @@ from string import Template
 from typing import IO, Any
 
 from geoscene.errors import InputError
-from geoscene.export.files import compact_json
+from geoscene.export.kinds import compact_json
 from geoscene.support.files import append
 
 _COPYRIGHT = "https://www.openstreetmap.org/copyright"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.export.files import plain
+from geoscene.export.kinds import plain
 from geoscene.export.objects import FeatureAttributes
 from geoscene.typing import Bools, Ints
 

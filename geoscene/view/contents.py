@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
-from geoscene.export.files import compact_json
+from geoscene.export.kinds import compact_json
 from geoscene.export.objects import read_features
 from geoscene.geometry.mesh import Mesh
 from geoscene.options import Degrees

@@ -9,7 +9,7 @@ from typing import IO, Any
 import numpy as np
 
 from geoscene.errors import InputError
-from geoscene.export.files import Summary
+from geoscene.export.kinds import Summary
 from geoscene.export.objects import attribution
 from geoscene.options import ViewOptions
 from geoscene.scene import Scene

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.export.files import compact_json
+from geoscene.export.kinds import compact_json
 from geoscene.geometry.mesh import ShapeInstances, concatenate
 from geoscene.scene.tile_files import Tile
 from geoscene.support.files import write_atomically

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.columns import Columns
-from geoscene.support.csv_tables import table_blocks, write_blocks
+from geoscene.support.columns import Columns, table_blocks, write_blocks
 from geoscene.support.digests import digest
 from geoscene.support.files import naming
 from geoscene.typing import Ints

@@ -14,7 +14,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import write_atomically
 from geoscene.typing import Float
 from lidar.errors import DatasetError, FormatError, InputError

@@ -22,7 +22,7 @@ import numpy as np
 
 from geoscene.scene import Scene
 from geoscene.support.cluster import DaskCluster
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
 from geoscene.scene import Scene
-from geoscene.support.csv_tables import table_blocks, write_blocks, write_columns
+from geoscene.support.columns import table_blocks, write_blocks, write_columns
 from geoscene.support.files import atomic_path, write_json
 from lidar.dataset.layout import Paths, reading_file
 from lidar.dataset.layouts.kitti_drive import write_sequence

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from lidar.dataset.png import depth_to_counts, feature_to_image, flow_to_image, write_png
 from lidar.geometry.poses import Poses
 from lidar.geometry.random_streams import generator

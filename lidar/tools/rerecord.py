@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from lidar.dataset.foreign import foreign_truth
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.kitti import read_labels

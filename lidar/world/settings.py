@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from geoscene.pipeline.limits import Limit
-from geoscene.relief import USED_RELIEFS, sufficient_reliefs
 from geoscene.typing import Float
+from geoscene.uses import USED_RELIEFS, sufficient_reliefs
 from lidar.errors import InputError
 from lidar.parameters import check_parameters, parameter
 from lidar.raycast.device import CPU, name_fault

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.shapes import LEAF_AREA_DENSITY
-from geoscene.relief import MESH
 from geoscene.scene import Scene
 from geoscene.scene.layout import OVERHANG
 from geoscene.typing import Float
+from geoscene.uses import MESH
 from lidar.errors import InputError
 from lidar.raycast import Caster, Hits, MeshInstances
 from lidar.raycast.refine import Refiner

@@ -12,7 +12,7 @@ import pytest
 from helpers.clouds import write_las
 from helpers.programs import ENVIRONMENT, SMALL_FILES, command, run_process, run_program
 
-from geoscene.cli import scene_text
+from geoscene.cli import program
 from geoscene.sources import demo_path
 
 BOX = "24.9405,60.1655,24.9475,60.1690"
@@ -209,9 +209,9 @@ def test_help_does_not_import_large_libraries(program, also):
 
 def test_steep_roads_are_told_only_of_terrain_that_has_some():
     none, some = {"road_km": 0.0, "road_km_steep": 0.0}, {"road_km": 2.0, "road_km_steep": 0.1}
-    assert scene_text._steep_roads(none, terrain=True) == ""
-    assert scene_text._steep_roads(some, terrain=False) == ""
-    assert "0.1 km steeper" in scene_text._steep_roads(some, terrain=True)
+    assert program._steep_roads(none, terrain=True) == ""
+    assert program._steep_roads(some, terrain=False) == ""
+    assert "0.1 km steeper" in program._steep_roads(some, terrain=True)
 
 
 def test_a_cloud_that_is_cut_off_is_refused_in_one_line(tmp_path):

@@ -12,9 +12,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings.facades.fit import OUT, Sheet, obstacles
-from geoscene.buildings.facades.grids import Elevations
-from geoscene.buildings.facades.kinds import SHOP, WINDOW
+from geoscene.buildings.facades.description import SHOP, WINDOW
+from geoscene.buildings.facades.doors import OUT, Sheet, obstacles
+from geoscene.buildings.facades.walls import Elevations
 from geoscene.classes import Class, materials
 from geoscene.geometry.mesh import Mesh, concatenate
 from geoscene.geometry.watertight import validate_mesh

@@ -8,14 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.buildings.facades.attached import Attached, attach, without_touching
-from geoscene.buildings.facades.description import FacadeTable, WallRelief
-from geoscene.buildings.facades.doors import facing_street, put_guessed_doors, put_mapped_doors
-from geoscene.buildings.facades.fit import Sheet
-from geoscene.buildings.facades.grids import Elevations, nth
-from geoscene.buildings.facades.kinds import NAMES, SHOP, WINDOW, Chosen, make_openings
+from geoscene.buildings.facades.description import (
+    NAMES,
+    SHOP,
+    WINDOW,
+    Chosen,
+    FacadeTable,
+    WallRelief,
+    make_openings,
+)
+from geoscene.buildings.facades.doors import Sheet, facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.solids import are_simple
-from geoscene.buildings.facades.walls import find_walls
+from geoscene.buildings.facades.walls import Elevations, find_walls, nth
 from geoscene.geometry.mesh import Mesh
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Height, Ints

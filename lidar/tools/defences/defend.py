@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from geoscene.drawing.report import Column, ReportTable, table_of
 from geoscene.scene import Scene, open_scene
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float

@@ -12,7 +12,7 @@ import numpy as np
 
 from geoscene import __version__
 from geoscene.drawing.report import Column, Page, ReportTable, table_of
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from lidar.errors import InputError
 from lidar.tools.evaluation.figures import figures_of

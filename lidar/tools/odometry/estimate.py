@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import write_json
 from geoscene.typing import Float, Ints
 from lidar.dataset.layout import Dataset

@@ -11,7 +11,7 @@ from geoscene import __version__
 from geoscene.drawing.charts import Axes, Span, curves, spans
 from geoscene.drawing.figures import share
 from geoscene.drawing.report import Column, Page, ReportTable, table_of
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import write_atomically, write_json
 from lidar.tools.redteam.matrix import (
     AttackDetection,

@@ -18,7 +18,7 @@ from geoscene.errors import GeosceneError, WorkersLostError
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import using
 from geoscene.support.cluster import DaskCluster, connect
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.digests import digest, file_digest
 from geoscene.support.files import exclusive, write_json
 from geoscene.support.processes import run_tasks

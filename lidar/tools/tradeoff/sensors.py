@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.support.memory import peak_memory
+from geoscene.support.processes import peak_memory
 from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.formats.table import cloud_table, records

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from geoscene.relief import RELIEFS
 from lidar.parameters import value_text
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera.settings import CameraSettings
@@ -120,7 +119,7 @@ class Basis:
     used  : the user's, without random effects
     exact : the reference's
     world : the user's settings of the world
-    built : relief of the scene, of `geoscene.relief.RELIEFS`
+    built : relief of the scene, of `geoscene.uses.RELIEFS`
     """
 
     used: Settings

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.export.files import compact_json
+from geoscene.export.kinds import compact_json
 from geoscene.typing import Float, Ints
 from geoscene.view.assembly import gzip
 from lidar.dataset.formats.table import Table

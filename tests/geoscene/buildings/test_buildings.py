@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from shapely import affinity
 from shapely.errors import GEOSException
 
-from geoscene.buildings import BuildingOptions, build_solids, parts, read_buildings
+from geoscene.buildings import BuildingOptions, build_solids, footprints, read_buildings
 from geoscene.buildings.appearance import read_walls
 from geoscene.buildings.footprints import subtract
 from geoscene.buildings.heights import infer_heights
@@ -375,7 +375,7 @@ def test_an_overlap_of_less_than_the_grid_is_no_negative_loss():
     for angle in np.linspace(1, 40, 30).tolist():
         wide, narrow = affinity.rotate(box(0, 0, 40, 20), angle), box(39.999985, 2, 20, 15)
         narrow = affinity.rotate(narrow, angle, origin=(20, 10))
-        _, problems = parts.cut_overlaps(
+        _, problems = footprints.cut_overlaps(
             ["way/1", "way/2"],
             np.array([wide, narrow]),
             owner=np.arange(2),
@@ -392,7 +392,7 @@ def test_an_overlap_that_cannot_be_cut_drops_only_the_larger_building(monkeypatc
     def failing(*_):
         raise GEOSException("TopologyException")
 
-    monkeypatch.setattr("geoscene.buildings.parts.subtract", failing)
+    monkeypatch.setattr("geoscene.buildings.footprints.subtract", failing)
     table, _, _, problems = built(
         house(1, box(0, 0, 10, 10), height="9"),
         house(2, box(8, 0, 20, 10), height="9"),
@@ -469,18 +469,18 @@ def test_of_overlapping_buildings_the_one_with_a_known_height_keeps_its_shape():
 
 def test_thousands_of_equal_outlines_are_compared_once(monkeypatch):
     compared = []
-    query = parts.overlapping_pairs
+    query = footprints.overlapping_pairs
 
     def counted(polygons):
         compared.append(len(polygons))
         return query(polygons)
 
-    monkeypatch.setattr(parts, "overlapping_pairs", counted)
+    monkeypatch.setattr(footprints, "overlapping_pairs", counted)
     square = shapely.box(0, 0, 10, 20)
     outlines = np.array([square, square.reverse()] * 1000 + [shapely.box(50, 0, 60, 10)], object)
     score = np.zeros(2001)
     score[77] = 3
-    repeated, problems = parts.duplicates([f"way/{k}" for k in range(2001)], outlines, score=score)
+    repeated, problems = footprints.duplicates([f"way/{k}" for k in range(2001)], outlines, score=score)
     assert np.flatnonzero(~repeated).tolist() == [77, 2000]
     assert compared == [2]
     assert len(problems) == 1999
@@ -490,9 +490,9 @@ def test_pairs_that_overlap_are_found_once():
     rng = np.random.default_rng(3)
     low = rng.uniform(0, 50, (200, 2))
     boxes = shapely.box(*low.T, *(low + rng.uniform(2, 8, (200, 2))).T)
-    a, b, shared = parts.overlapping(boxes, boxes)
+    a, b, shared = footprints.overlapping(boxes, boxes)
     once = a < b
-    for mine, theirs in zip(parts.overlapping_pairs(boxes), (a, b, shared), strict=True):
+    for mine, theirs in zip(footprints.overlapping_pairs(boxes), (a, b, shared), strict=True):
         np.testing.assert_array_equal(mine, theirs[once])
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from geoscene.buildings import read_buildings
-from geoscene.buildings.tops import with_measured_tops
+from geoscene.buildings.heights import with_measured_tops
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData
 

@@ -12,7 +12,7 @@ from geoscene.clouds.ground import (
     ground_heights,
     ground_returns,
 )
-from geoscene.clouds.spool import SurveyPoints
+from geoscene.clouds.read import SurveyPoints
 
 
 def sloping(gradient, *, azimuth, seed, wave=0.0, noise=0.03):

@@ -6,8 +6,7 @@ from helpers.clouds import write_las
 from pyproj import CRS
 from scipy.spatial import cKDTree
 
-from geoscene.clouds.read import open_cloud
-from geoscene.clouds.spool import SurveyPoints, spool_clouds, without_outliers
+from geoscene.clouds.read import SurveyPoints, open_cloud, spool_clouds, without_outliers
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame
 

@@ -1,5 +1,7 @@
 """Rasters and tables of a scene: positions, heights, classes, attributes and CRS."""
 
+from __future__ import annotations
+
 import json
 import re
 import sqlite3
@@ -23,7 +25,7 @@ from pyarrow import parquet
 from geoscene.classes import Class
 from geoscene.errors import InputError, MissingExtraError
 from geoscene.export import KINDS, export_scene, kind_of
-from geoscene.export.zbuffer import draw_triangles
+from geoscene.export.raster import RasterGrid, _cells_on_disk, draw_triangles
 from geoscene.options import ExportOptions
 from geoscene.support import files
 
@@ -282,8 +284,8 @@ def test_warnings_of_netconvert_are_notes_one_of_each_kind(monkeypatch, scene, t
         Path(command[command.index("--output-file") + 1]).write_text("<net/>")
         return subprocess.CompletedProcess(command, 0, "", "\n".join(warnings))
 
-    monkeypatch.setattr("geoscene.export.sumo.need", lambda *_: SimpleNamespace(SUMO_HOME="/none"))
-    monkeypatch.setattr("geoscene.export.sumo.subprocess.run", convert)
+    monkeypatch.setattr("geoscene.export.opendrive.need", lambda *_: SimpleNamespace(SUMO_HOME="/none"))
+    monkeypatch.setattr("geoscene.export.opendrive.subprocess.run", convert)
     summary = export_scene(scene, tmp_path / "a.net.xml")
     assert summary.notes[-2:] == (
         "netconvert: Edge '-1' has a grade of 16.77%. (2 warnings of this kind)",
@@ -310,3 +312,12 @@ def test_the_time_in_a_geopackage_has_milliseconds(scene, tmp_path):
     with closing(sqlite3.connect(path)) as db:
         times = [row[0] for row in db.execute("SELECT last_change FROM gpkg_contents")]
     assert set(times) == {"2000-01-01T00:00:00.000Z"}
+
+
+def test_cells_on_disk_have_their_space_before_they_are_mapped(tmp_path):
+    grid = RasterGrid(0.0, 0.0, 1.0, 700, 1300)
+    cells = _cells_on_disk(tmp_path / "cells", grid, value=np.float32(np.nan))
+    assert cells.shape == (1300, 700)
+    assert np.isnan(cells).all()
+    stat = (tmp_path / "cells").stat()
+    assert stat.st_blocks * 512 >= stat.st_size == 4 * 700 * 1300

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from geoscene.errors import InputError
 from geoscene.export import export_scene
-from geoscene.export.planview import connecting_curve, plan_view
+from geoscene.export.roadnet import connecting_curve, plan_view
 from geoscene.options import ExportOptions
 from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.routing import turn_table

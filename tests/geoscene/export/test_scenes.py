@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from geoscene.errors import InputError
 from geoscene.export import export_scene
 from geoscene.export.cityjson import LOD
-from geoscene.export.shells import manifold_patches
-from geoscene.export.vertices import Vertices
+from geoscene.export.shells import Vertices, manifold_patches
 from geoscene.geometry.mesh import Mesh
 from geoscene.geometry.watertight import validate_mesh
 from geoscene.objects.shapes import shapes

@@ -8,10 +8,9 @@ from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import concatenate
 from geoscene.ground import Layers, ground_tile, landcover, plan_ground
-from geoscene.ground.ballast import HEIGHT, SLOPE
-from geoscene.ground.camber import Camber, Raised
+from geoscene.ground.relief import HEIGHT, SLOPE, Camber, Raised
 from geoscene.roadgraph import build_road_graph
-from geoscene.roadgraph.ballast import read_beds
+from geoscene.roadgraph.relief import read_beds
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources.data import OsmData, Way
 

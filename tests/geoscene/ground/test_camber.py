@@ -9,12 +9,11 @@ from hypothesis import strategies as st
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.ground import Layers, ground_tile, plan_ground
-from geoscene.ground.ballast import Beds
-from geoscene.ground.camber import CAMBER, Kerbs, Raised
 from geoscene.ground.kerbs import lowered_kerbs
+from geoscene.ground.relief import CAMBER, Beds, Kerbs, Raised
 from geoscene.roadgraph import build_road_graph
-from geoscene.roadgraph.camber import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.carriageways import read_carriageways
+from geoscene.roadgraph.relief import camber_of, crown_rows, find_crowns
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources.data import OsmData, Way
 

@@ -16,7 +16,7 @@ from geoscene.ground import (
     plan_ground,
     water_levels,
 )
-from geoscene.ground.coast import sea
+from geoscene.ground.landcover import sea
 from geoscene.ground.terrain import open_terrain
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Way

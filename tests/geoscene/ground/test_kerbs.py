@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class, materials
 from geoscene.ground import ground_tile, plan_ground
-from geoscene.ground.camber import Kerbs
 from geoscene.ground.kerbs import KERB, KERB_LOWERED, MappedKerbs, kerb_ends, lowered_kerbs
 from geoscene.ground.layers import KERBS, SIDEWALKS, Layers
+from geoscene.ground.relief import Kerbs
 
 EXTENT = (0.0, 0.0, 120.0, 60.0)
 STREET = shapely.LineString([(-10, 31.3), (70, 28.1), (130, 33.7)])

@@ -7,7 +7,7 @@ import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from geoscene.ground.snapping import snap_rounded
+from geoscene.ground.faces import snap_rounded
 
 corner = st.tuples(st.integers(-9, 9), st.integers(-9, 9))
 segments = st.lists(st.tuples(corner, corner).filter(lambda s: s[0] != s[1]), min_size=1, max_size=14)

@@ -10,7 +10,7 @@ import shapely
 
 from geoscene.classes import Class
 from geoscene.export import export_scene
-from geoscene.export.tables import solids
+from geoscene.export.vector import solids
 from geoscene.geometry.mesh import Mesh
 from geoscene.ground import Layers, building_pads, ground_tile, plan_ground, tile_box
 from geoscene.objects.forests import Forests, forest_instances, forest_tree_count, forest_trees

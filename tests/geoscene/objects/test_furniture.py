@@ -16,7 +16,7 @@ from geoscene.objects.furniture import furniture_instances, read_furniture, shap
 from geoscene.objects.shapes import shapes
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, TaggedNode, Way
-from geoscene.structures.ground_contact import OPENING
+from geoscene.structures.contact import OPENING
 
 FRAME = Frame.at(9.0, 50.0)
 EXTENT = (-100.0, -100.0, 100.0, 100.0)

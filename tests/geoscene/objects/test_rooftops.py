@@ -12,9 +12,8 @@ from geoscene.buildings.shells import PARAPET
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import ROOF
 from geoscene.geometry.watertight import validate_mesh
-from geoscene.objects.roof_shapes import DORMER_DEPTH, roof_shapes
 from geoscene.objects.rooftops import plan_rooftops, roof_objects
-from geoscene.objects.shapes import shapes
+from geoscene.objects.shapes import DORMER_DEPTH, roof_shapes, shapes
 from geoscene.pipeline.plan import take_buildings
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData

@@ -28,8 +28,7 @@ from geoscene.roadgraph.routing import (
     turn_states,
     turn_table,
 )
-from geoscene.roadgraph.speeds import speed_limit
-from geoscene.roadgraph.tags import drivable, read_street
+from geoscene.roadgraph.tags import drivable, read_street, speed_limit
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Relation, TaggedNode, Way
 

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array
 
 from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
-from geoscene.pipeline.manifest import road_metres
+from geoscene.pipeline.build import road_metres
 from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import find_crossings, place_stations

@@ -17,8 +17,8 @@ from helpers.programs import run_program
 
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
 from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, read_osm
+from geoscene.sources.elements import RELATIONS
 from geoscene.sources.network import _parts, locate
-from geoscene.sources.overpass import RELATIONS
 
 BOX = (24.9420, 60.1658, 24.9495, 60.1696)
 """A part of the demo extract."""

@@ -7,7 +7,6 @@ import pytest
 
 from geoscene.classes import Class
 from geoscene.geometry.watertight import validate_mesh
-from geoscene.relief import RELIEFS
 from geoscene.roadgraph import build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.structures import (
@@ -18,6 +17,7 @@ from geoscene.structures import (
     read_structures,
 )
 from geoscene.structures.lining import NICHE, WALKWAY
+from geoscene.uses import RELIEFS
 from tests.geoscene.structures.test_structures import (
     FRAME,
     PLACES,

@@ -1,6 +1,9 @@
-"""Machine code of compiled functions is kept as long as what it was made from, and no longer."""
+"""Machine code of compiled functions is kept as long as what it was made from; lists name real functions."""
+
+from __future__ import annotations
 
 import importlib.util
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -8,19 +11,21 @@ from pathlib import Path
 import pytest
 from numba.core import config
 
-from geoscene.export import zbuffer
-from geoscene.support import compiled
+from geoscene.export import raster
+from geoscene.support import compiled, kernels
 
 COUNTED = """
 import numpy as np
 from numba.core.event import install_recorder
-from geoscene.export.zbuffer import draw_triangles
+from geoscene.export.raster import draw_triangles
 
 with install_recorder("numba:compile") as events:
     height, labels = np.full((3, 3), np.nan, np.float32), np.zeros((3, 3), np.uint8)
     draw_triangles(np.zeros((1, 3, 3)), np.ones(1, np.uint8), height, labels)
 print(len(events.buffer) // 2)
 """
+
+LISTED = kernels.read_kernels()
 
 
 def compilations(folder):
@@ -101,7 +106,7 @@ def test_a_read_only_installation_brings_its_code_to_the_users_cache(tmp_path, m
     for name in (*brought, "other.f-1.py311.nbi"):
         (tmp_path / "__pycache__" / name).write_bytes(b"code")
     source.write_text("def f():\n    pass\n")
-    locator = compiled._OfUser(zbuffer.draw_triangles.py_func, str(source))
+    locator = compiled._OfUser(raster.draw_triangles.py_func, str(source))
     locator.ensure_cache_path()
     assert sorted(path.name for path in Path(locator.get_cache_path()).iterdir()) == sorted(brought)
 
@@ -164,3 +169,32 @@ def test_functions_are_compiled_for_calls_from_python_only_where_it_calls_them()
     assert not twice.signatures
     assert twice(3.5) == 7.0
     assert len(twice.signatures) == 1
+
+
+def test_each_use_of_a_program_is_listed():
+    assert all(kernels.read_kernels([use]) for use in ("build", "drive", "cameras", "traffic"))
+
+
+@pytest.mark.parametrize("kernel", LISTED, ids=lambda kernel: kernel.name)
+def test_types_are_read_as_they_are_described(kernel):
+    assert kernel.function.py_func.__name__ == kernel.name.rpartition(".")[2]
+    described = [kernels.describe_type(kind) for kind in kernel.signature]
+    assert json.loads(json.dumps(described)) == list(kernel.arguments)
+
+
+def test_nothing_is_started_or_said_where_nothing_is_missing(monkeypatch, capsys):
+    monkeypatch.setattr(kernels.Kernel, "is_missing", lambda _: False)
+    monkeypatch.setattr(kernels.subprocess, "Popen", None)
+    kernels.compile_ahead("build")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_what_is_missing_is_compiled_and_said(monkeypatch, capsys):
+    (smallest,) = kernels.read_kernels(["traffic"])[-1:]
+    monkeypatch.setattr(kernels, "read_kernels", lambda _: [smallest])
+    monkeypatch.setattr(kernels.Kernel, "is_missing", lambda _: True)
+    monkeypatch.setattr(kernels.sys, "argv", ["kernels"])
+    kernels.main()
+    assert capsys.readouterr().err.startswith("compiling, once; functions: 1\ncompiled in ")
+    monkeypatch.undo()
+    assert not smallest.is_missing()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.errors import InputError as FolderError
 from geoscene.geometry.frames import Frame
-from geoscene.support.csv_tables import write_columns
+from geoscene.support.columns import write_columns
 from geoscene.support.files import write_json
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import FORMATS

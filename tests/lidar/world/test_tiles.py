@@ -11,9 +11,9 @@ import pytest
 from geoscene.classes import Class
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
-from geoscene.relief import RELIEFS
 from geoscene.sources import demo_path, read_osm
 from geoscene.sources.data import OsmData, TaggedNode, Way
+from geoscene.uses import RELIEFS
 from lidar.errors import InputError
 from lidar.options import DriveOptions
 from lidar.simulation.plan import plan_drive
