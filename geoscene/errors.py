@@ -48,10 +48,6 @@ BUILD_AGAIN = "build the scene again with `overwrite`"
 """What to do about a damaged file of a scene."""
 
 
-class SolidError(GeosceneError):
-    """A solid that is not closed, oriented and of positive volume."""
-
-
 class MissingExtraError(InputError, ImportError):
     """An optional dependency that is not installed."""
 

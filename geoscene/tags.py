@@ -134,11 +134,7 @@ class Quantities:
     refused: list[str] = field(default_factory=list)
 
     def first(
-        self,
-        *keys: str,
-        parse: Callable[[str], float | None],
-        low: float = -math.inf,
-        high: float = math.inf,
+        self, *keys: str, parse: Callable[[str], float | None], low: float = -math.inf, high: float = math.inf
     ) -> float:
         """The first value of the keys that ``parse`` can read and that lies from low to high; NaN if none."""
         for key in keys:

@@ -76,10 +76,7 @@ class Use:
 USES: Mapping[str, Use] = {
     "all": Use("everything"),
     "lidar": Use(
-        "what laser scanners, GNSS, IMU and traffic need",
-        colors=False,
-        tables=_DRIVEN,
-        indexed=False,
+        "what laser scanners, GNSS, IMU and traffic need", colors=False, tables=_DRIVEN, indexed=False
     ),
     "camera": Use(
         "what cameras, laser scanners, GNSS, IMU and traffic need",
@@ -91,8 +88,7 @@ USES: Mapping[str, Use] = {
         "road graph and tables in plan only",
         tiles=False,
         tables=dict.fromkeys(
-            ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"),
-            Needed(),
+            ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"), Needed()
         ),
     ),
 }

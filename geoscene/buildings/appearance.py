@@ -81,8 +81,7 @@ def read_walls(tags: Tags) -> Appearance:
     colors = [key.format(word) for key in _FACES for word in ("colour", "color")]
     substances = [key.format("material") for key in _FACES]
     return Appearance(
-        parse_color(_first(tags, *colors)),
-        _material(_first(tags, "building:cladding", *substances)),
+        parse_color(_first(tags, *colors)), _material(_first(tags, "building:cladding", *substances))
     )
 
 

@@ -247,7 +247,13 @@ def _table(
         roof_shape=texts([r.roof.shape for r in rows]),
         roof_direction=np.pi / 2 - azimuth,
         roof_across=np.array([r.roof.across for r in rows], np.bool_),
-        top=np.array([_measured_top(r, s) for r, s in zip(rows, heights.source, strict=True)], float),
+        top=np.array(
+            [
+                float(r.tags.get(CLOUD_TOP, "nan")) if source == "cloud" else np.nan
+                for r, source in zip(rows, heights.source, strict=True)
+            ],
+            float,
+        ),
         height_source=heights.source,
         height_sigma=heights.sigma,
         min_height_source=heights.low_source,
@@ -262,11 +268,6 @@ def _table(
         wall_source=texts([w.source for w in walls]),
         roof_look_source=texts([t.source for t in tops]),
     )
-
-
-def _measured_top(row: BuildingRow, source: str) -> float:
-    """Height z of the top of a row where a point cloud gave its height, else NaN."""
-    return float(row.tags.get(CLOUD_TOP, "nan")) if source == "cloud" else np.nan
 
 
 def _ranks(rows: Sequence[BuildingRow], heights: BuildingHeights) -> Ints:

@@ -244,13 +244,7 @@ def remainder(outline: Any, parts: Polygons, *, strip: float) -> tuple[Any, floa
 
 
 def cut_overlaps(
-    osm_id: Sequence[str] | Texts,
-    footprint: Polygons,
-    *,
-    owner: Rows,
-    rank: Ints,
-    low: Float,
-    high: Float,
+    osm_id: Sequence[str] | Texts, footprint: Polygons, *, owner: Rows, rank: Ints, low: Float, high: Float
 ) -> tuple[Polygons, list[Problem]]:
     """Footprints (n,) without the overlaps between buildings, and the problems.
 

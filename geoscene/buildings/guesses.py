@@ -112,14 +112,7 @@ def region_at(lon: float, lat: float) -> str:
 
 
 def guess_looks(
-    osm_id: Names,
-    use: Names,
-    *,
-    area: Float,
-    walls: Float,
-    levels: Float,
-    roof_height: Float,
-    region: str,
+    osm_id: Names, use: Names, *, area: Float, walls: Float, levels: Float, roof_height: Float, region: str
 ) -> AppearanceGuesses:
     """A plausible look for each building (n,).
 
@@ -128,7 +121,7 @@ def guess_looks(
     levels      : (n,) tagged storeys, NaN if not tagged
     roof_height : (n,) metres, 0 for a flat roof, NaN for one of unknown shape
     """
-    draw = _draws(osm_id)
+    draw = uniform_at(seeds(osm_id), np.zeros(len(osm_id), np.int64), count=7)
     kind = _kinds(use, area=area, walls=walls)
     tables = palettes()
     of_region, of_kind = tables["regions"][region], tables["kinds"]
@@ -165,11 +158,6 @@ def seeds(osm_id: Names) -> Ints:
     """Seed (n,) of each OSM id, from which inferred values of the feature are drawn."""
     digests = [hashlib.blake2b(str(name).encode(), digest_size=8).digest() for name in osm_id]
     return np.array([int.from_bytes(some, "little", signed=True) for some in digests], np.int64)
-
-
-def _draws(osm_id: Names) -> Float:
-    """Seven random numbers (7, n) in [0, 1) of each OSM id."""
-    return uniform_at(seeds(osm_id), np.zeros(len(osm_id), np.int64), count=7)
 
 
 def _kinds(use: Names, *, area: Float, walls: Float) -> Names:

@@ -24,6 +24,7 @@ from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.shells import ShellTriangles, close, distinct_corners, lift, prisms
 from geoscene.buildings.skeleton import straight_skeleton
 from geoscene.geometry.mesh import FLOOR, ROOF
+from geoscene.geometry.polylines import cross
 from geoscene.typing import Float
 
 Profile = tuple[tuple[float, float], ...]
@@ -158,7 +159,7 @@ def _is_star_shaped(polygon: Any) -> bool:
         return False
     ring = shapely.get_coordinates(polygon)
     a, b = ring[:-1] - _centroid(polygon), ring[1:] - _centroid(polygon)
-    return bool((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 1e-3).all())
+    return bool((cross(a, b) > 1e-3).all())
 
 
 def _centroid(polygon: Any) -> Float:

@@ -13,6 +13,7 @@ from shapely.errors import GEOSException
 from geoscene.buildings.footprints import Polygons, to_grid
 from geoscene.buildings.table import GRID
 from geoscene.geometry.mesh import FLOOR, ROOF, WALL
+from geoscene.geometry.polylines import cross
 from geoscene.geometry.watertight import edge_uses, weld
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
@@ -47,7 +48,7 @@ def triangulate(polygons: Polygons) -> tuple[Float, Ints]:
         collections = np.array([_triangles_or_none(p) for p in polygons], dtype=object)
     triangles, owner = shapely.get_parts(collections, return_index=True)
     xy = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    double = _double_area(xy)
+    double = cross(xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0])
     xy[double < 0] = xy[double < 0, ::-1]
     covered = np.bincount(owner, weights=np.abs(double) / 2, minlength=len(polygons))
     fine = np.abs(covered - shapely.area(polygons)) < 1e-6 * np.maximum(covered, 1.0)
@@ -60,12 +61,6 @@ def _triangles_or_none(polygon: Any) -> Any:
         return shapely.constrained_delaunay_triangles(polygon)
     except GEOSException:
         return shapely.GeometryCollection()
-
-
-def _double_area(xy: Float) -> Float:
-    """Twice the signed areas of triangles (m, 3, 2)."""
-    a, b = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def lift(xy: Float, z: Float) -> Float:

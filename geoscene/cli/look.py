@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter, validators
 
@@ -13,10 +13,7 @@ from geoscene.support.console import FAILURE, Report, note_new_folder, print_jso
 
 
 def info(
-    scene: Annotated[Path, Parameter(validator=validators.Path(exists=False))],
-    /,
-    *,
-    json: bool = False,
+    scene: Annotated[Path, Parameter(validator=validators.Path(exists=False))], /, *, json: bool = False
 ) -> int:
     """Describe a scene: frame, extent, counts, sources of heights, repaired and dropped features.
 
@@ -31,7 +28,10 @@ def info(
     from geoscene.support.storage import shown  # noqa: PLC0415
 
     opened = open_scene(scene)
-    report = opened.manifest | {"path": shown(scene), "extent": _extent(opened.manifest)}
+    xmin, ymin, xmax, ymax = opened.manifest["bounds"]
+    size = {"width_m": xmax - xmin, "height_m": ymax - ymin}
+    extent = size | {"geographic": opened.manifest["geographic_bounds"]}
+    report = opened.manifest | {"path": shown(scene), "extent": extent}
     if json:
         print_json(report)
     else:
@@ -75,12 +75,7 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
 
 
 def export(
-    scene: Path,
-    /,
-    *,
-    out: Out,
-    options: ExportOptions = ExportOptions(),
-    report: Reporting = Report(),
+    scene: Path, /, *, out: Out, options: ExportOptions = ExportOptions(), report: Reporting = Report()
 ) -> int:
     """Write a scene in another format.
 
@@ -119,12 +114,7 @@ def export(
 
 
 def view(
-    scene: Path,
-    /,
-    *,
-    out: Out,
-    options: ViewOptions = ViewOptions(),
-    report: Reporting = Report(),
+    scene: Path, /, *, out: Out, options: ViewOptions = ViewOptions(), report: Reporting = Report()
 ) -> int:
     """Write a scene as one web page: rotate it, click an object, read its attributes and their sources.
 
@@ -153,12 +143,3 @@ def view(
         summary = view_scene(opened, out, options=options, overwrite=report.overwrite, progress=progress)
     print_file(summary, f"{summary.faces} faces, {summary.objects} objects", json=report.json)
     return 0
-
-
-def _extent(manifest: dict[str, Any]) -> dict[str, Any]:
-    xmin, ymin, xmax, ymax = manifest["bounds"]
-    return {
-        "width_m": xmax - xmin,
-        "height_m": ymax - ymin,
-        "geographic": manifest["geographic_bounds"],
-    }

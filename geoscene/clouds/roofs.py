@@ -13,6 +13,7 @@ from shapely.errors import GEOSException
 
 from geoscene.buildings.roofs import SECTIONS, RoofSpec, roof_shell
 from geoscene.geometry.mesh import ROOF
+from geoscene.geometry.polylines import cross
 from geoscene.typing import Bools, Float
 
 FEWEST = 15
@@ -195,7 +196,7 @@ def _interpolate(corners: Float, xy: Float) -> Float:
     """Heights (n,) of triangles (m, 3, 3) at places (n, 2); NaN outside."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     u, v = (b - a)[:, :2], (c - a)[:, :2]
-    area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    area = cross(u, v)
     keep = np.abs(area) > 1e-9
     a, b, c, u, v, area = a[keep], b[keep], c[keep], u[keep], v[keep], area[keep]
     out = np.full(len(xy), np.nan)

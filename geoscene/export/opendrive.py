@@ -188,7 +188,11 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
     """The lanes of a road, from left to right; at a joint each continues as the lane in the same place."""
     road = net.roads[k]
     sign = 1 if left_hand else -1  # of the lanes along the reference line
-    flip = {end: -1 if net.joints[k, end][1] == end else 1 for end in (START, END) if (k, end) in net.joints}
+    flip = {
+        word: -1 if net.joints[k, end][1] == end else 1
+        for end, word in ((START, "predecessor"), (END, "successor"))
+        if (k, end) in net.joints
+    }  # sign of the connected lane at each joint
     sides: dict[int, list[str]] = {}
     for side, edge, count in ((sign, road.edge, road.ahead + road.shared), (-sign, road.twin, road.back)):
         lanes = []
@@ -196,9 +200,11 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
             kind = "bidirectional" if road.shared and side == sign and number == 1 else "driving"
             mark = "broken" if number < count else "none"
             speed = float(graph.speed[edge])
-            lanes.append(_lane(side * number, kind, width=road.width, mark=mark, flip=flip, speed=speed))
+            links = {word: by * side * number for word, by in flip.items()}
+            lanes.append(_lane(side * number, kind, width=road.width, mark=mark, links=links, speed=speed))
         if road.shoulder > 0:
-            lanes.append(_lane(side * (count + 1), "shoulder", width=road.shoulder, mark="none", flip=flip))
+            links = {word: by * side * (count + 1) for word, by in flip.items()}
+            lanes.append(_lane(side * (count + 1), "shoulder", width=road.shoulder, links=links))
         sides[side] = lanes
     middle = "solid" if road.twin >= 0 and not road.shared else "none"
     if sides[1]:
@@ -209,18 +215,21 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
 
 
 def _lane(
-    number: int, kind: str, *, width: float, mark: str, flip: dict[int, int], speed: float | None = None
+    number: int,
+    kind: str,
+    *,
+    width: float,
+    links: dict[str, int],
+    growth: float = 0.0,
+    mark: str = "none",
+    speed: float | None = None,
 ) -> str:
-    """A lane of constant width; ``flip`` is the sign of the connected lane at each joint."""
-    links = "".join(
-        f'<{word} id="{flip[end] * number}"/>'
-        for end, word in ((START, "predecessor"), (END, "successor"))
-        if end in flip
-    )
+    """A lane whose width grows evenly; ``links`` are the lanes before and after it."""
+    linked = "".join(f'<{word} id="{other}"/>' for word, other in links.items())
     limit = "" if speed is None else f'<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
     return (
-        f'<lane id="{number}" type="{kind}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{_n(width)}" b="0" c="0" d="0"/>{_road_mark(mark)}{limit}</lane>\n'
+        f'<lane id="{number}" type="{kind}" level="false"><link>{linked}</link>'
+        f'<width sOffset="0" a="{_n(width)}" b="{_n(growth)}" c="0" d="0"/>{_road_mark(mark)}{limit}</lane>\n'
     )
 
 
@@ -290,12 +299,9 @@ def _connecting_road(
     lanes = []
     growth = (c.widths[1] - c.widths[0]) / max(curve.length, 1e-3)
     for k, (before, after) in enumerate(c.lanes.tolist()):
-        lanes.append(
-            f'<lane id="{sign * (k + 1)}" type="driving" level="false"><link><predecessor id="{before}"/>'
-            f'<successor id="{after}"/></link><width sOffset="0" a="{_n(c.widths[0])}" b="{_n(growth)}" '
-            f'c="0" d="0"/>{_road_mark("none")}<speed sOffset="0" max="{_n(round(speed, 4))}" unit="m/s"/>'
-            "</lane>\n"
-        )
+        links = {"predecessor": before, "successor": after}
+        number = sign * (k + 1)
+        lanes.append(_lane(number, "driving", width=c.widths[0], growth=growth, links=links, speed=speed))
     if left_hand:
         yield f"<{side}>\n{''.join(reversed(lanes))}</{side}>\n{middle}"
     else:

@@ -161,13 +161,18 @@ def headings(line: Float) -> Float:
     return heading
 
 
+def cross(u: Float, v: Float) -> Float:
+    """Cross products (n,) of vectors (n, 2 or more) in plan: twice the signed areas of triangles."""
+    product: Float = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    return product
+
+
 def curvatures(line: Float) -> Float:
     """Curvature (n,) at each point, 1 / unit of length, positive to the left."""
     xy = line[:, :2]
     a, b = xy[1:-1] - xy[:-2], xy[2:] - xy[1:-1]
-    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     dot = (a * b).sum(axis=1)
-    inner = 2.0 * np.arctan2(cross, dot) / np.maximum(np.hypot(*a.T) + np.hypot(*b.T), 1e-9)
+    inner = 2.0 * np.arctan2(cross(a, b), dot) / np.maximum(np.hypot(*a.T) + np.hypot(*b.T), 1e-9)
     return np.concatenate([inner[:1], inner, inner[-1:]])
 
 

@@ -15,6 +15,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.ground.kinds import SEA, SURFACES, GroundKind, area_kind, line_kind
 from geoscene.ground.layers import Layers
 from geoscene.sources.data import Area, OsmData, Tags, Way
+from geoscene.support.columns import nth
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
 from geoscene.typing import Float
@@ -215,8 +216,7 @@ def _shores(faces: NDArray[np.object_], coastlines: Sequence[Float]) -> tuple[Fl
     # Long segments may cross the border of the extent: they are sampled at several points.
     pieces = np.maximum(np.ceil(length / 5.0).astype(int), 1)
     segment = np.repeat(np.arange(len(length)), pieces)
-    nth = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    middle = start[segment] + step[segment] * ((nth + 0.5) / pieces[segment])[:, None]
+    middle = start[segment] + step[segment] * ((nth(pieces) + 0.5) / pieces[segment])[:, None]
     weight = length[segment] / pieces[segment]
     for side in (1.0, -1.0):
         point, face = tree.query(shapely.points(middle + side * right[segment]), predicate="within")

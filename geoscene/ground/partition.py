@@ -10,7 +10,7 @@ same whole segments there, they find the same vertices on it, whichever other ti
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from geoscene.ground.faces import GroundFaces, distinct_places, faces, snap_roun
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import Kerbs, Raised
 from geoscene.ground.terrain_lattice import Lattice, TerrainHeights, lattice
-from geoscene.support.columns import row_blocks
+from geoscene.support.columns import row_blocks, squares_between
 from geoscene.typing import Bools, Float, Ints
 
 PRECISION = 2.0**-9
@@ -215,24 +215,6 @@ def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
     return Partition(polygon, row.astype(np.int32), klass, material, feature, tile, slivers)
 
 
-def partition(
-    extent: Sequence[float],
-    layers: Layers,
-    *,
-    tile_size: float = 250.0,
-    lines: float = 0.0,
-    base: tuple[int, str] = (Class.TERRAIN, "soil"),
-    tiles: Iterable[tuple[int, int]] | None = None,
-) -> Partition:
-    """The cells of the whole extent, or of the chosen tiles, in one table; options as in `plan_ground`."""
-    plan = plan_ground(extent, layers, tile_size=tile_size, lines=lines, base=base)
-    chosen = [(int(i), int(j)) for i, j in plan.tiles] if tiles is None else list(tiles)
-    parts = [partition_tile(plan, i, j=j) for i, j in chosen]
-    names = [f.name for f in fields(Partition) if f.name != "slivers"]
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Partition(**columns, slivers=sum(part.slivers for part in parts))
-
-
 def tile_box(plan: GroundPlan, i: int, *, j: int) -> tuple[float, float, float, float]:
     """(xmin, ymin, xmax, ymax) of a tile's part of the extent, scene metres."""
     size, (xmin, ymin, xmax, ymax), n = plan.tile_size, plan.extent, tile_span(plan, i, j=j)
@@ -365,13 +347,9 @@ def _by_tile(
         first = np.floor((np.minimum(a, b) - _REACH) / tile_size).astype(np.int64) - low
         last = np.floor((np.maximum(a, b) + _REACH) / tile_size).astype(np.int64) - low
         first, last = np.clip(first, 0, count - 1), np.clip(last, 0, count - 1)
-        span = last - first + 1
-        copies = span[:, 0] * span[:, 1]
-        own = np.repeat(np.arange(len(a)), copies)
-        nth = np.arange(len(own)) - np.repeat(np.cumsum(copies) - copies, copies)
-        down, across = np.divmod(nth, span[own, 0])
+        square, own = squares_between(first, last)
         segments.append((block.start + own).astype(np.int32))
-        tiles.append((first[own, 1] + down) * count[0] + first[own, 0] + across)
+        tiles.append(square[:, 1] * count[0] + square[:, 0])
     tile = np.concatenate(tiles)
     order = np.argsort(tile, kind="stable")
     offset = np.searchsorted(tile[order], np.arange(count[0] * count[1] + 1))

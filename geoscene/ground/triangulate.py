@@ -9,6 +9,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.errors import GeosceneError
+from geoscene.geometry.polylines import cross
 from geoscene.ground.partition import Partition, distinct
 from geoscene.ground.terrain_lattice import Lattice, lattice_corners
 from geoscene.typing import Float, Ints
@@ -59,7 +60,8 @@ def _check(partition: Partition, corners: Float, *, cell: Ints) -> PlaneTriangle
     """Triangles with these corners (m, 3, 2), if they add up to the area of their cells (m,)."""
     points, number = distinct(corners.reshape(-1, 2))
     faces = number.reshape(-1, 3)
-    area = _signed_area(points, faces)
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    area = 0.5 * cross(b - a, c - a)  # differences of points on the grid are exact
     faces = np.where((area < 0)[:, None], faces[:, ::-1], faces)
     covered = np.bincount(cell, np.abs(area), minlength=len(partition))
     amiss = np.abs(covered - shapely.area(partition.polygon)) > 1e-6
@@ -70,11 +72,3 @@ def _check(partition: Partition, corners: Float, *, cell: Ints) -> PlaneTriangle
             f"have no area; look at ({where.x:z.3f}, {where.y:z.3f})"
         )
     return PlaneTriangles(points, faces.astype(np.int32), cell.astype(np.int32))
-
-
-def _signed_area(points: Float, faces: NDArray[np.integer]) -> Float:
-    """Areas (m,), positive for counter-clockwise faces; exact enough for the sign of slivers on the grid."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    u, v = b - a, c - a  # differences of grid points are exact
-    area: Float = 0.5 * (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
-    return area

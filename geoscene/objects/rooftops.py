@@ -15,6 +15,7 @@ from geoscene.buildings import Buildings
 from geoscene.buildings.footprints import groups
 from geoscene.buildings.guesses import guess_looks, region_at, seeds
 from geoscene.geometry.mesh import FLOOR, ROOF, Mesh, ShapeInstances
+from geoscene.geometry.polylines import cross
 from geoscene.objects.shapes import DORMER_DEPTH, place
 from geoscene.support.columns import Columns
 from geoscene.support.splitmix import uniform_at
@@ -300,17 +301,12 @@ def _facets(corners: Float, normals: Float, *, under: Float) -> Iterator[_Facet]
     keys = np.column_stack([np.round(normals, 2), np.round(offset, 1)])
     for key in np.unique(keys, axis=0):
         rows = np.flatnonzero((keys == key).all(axis=1))
-        largest = rows[np.argmax(np.abs(_plan_areas(corners[rows])))]
+        a, b, c = corners[rows].transpose(1, 0, 2)
+        largest = rows[np.argmax(np.abs(cross(b - a, c - a)))]
         area = _clear(corners[rows], under, above=float(corners[rows, :, 2].min()))
         for polygon in shapely.get_parts(area):
             if polygon.area > 4.0:
                 yield _Facet(polygon, corners[largest, 0], normals[largest])
-
-
-def _plan_areas(corners: Float) -> Float:
-    a, b = corners[:, 1, :2] - corners[:, 0, :2], corners[:, 2, :2] - corners[:, 0, :2]
-    area: Float = (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
-    return area
 
 
 def _dormers(facet: _Facet, *, width: float) -> Iterator[tuple[_Item, Any]]:

@@ -23,151 +23,121 @@ def street_shapes() -> dict[str, Mesh]:
     Sizes are usual ones, assumed.
     """
     bicycles = [_bicycle(side) for side in (0.29, -0.29)]
-    return {
-        "waste_basket": concatenate(
-            [
-                _metal(prism(circle(0.42), 0.12, top=0.9)),
-                _metal(prism(circle(0.2), _UNDER, top=0.12)),
-                _metal(prism(circle(0.48), 0.9, top=0.96, taper=0.8)),
-            ]
-        ),
-        "recycling_container": concatenate(
-            [
-                _metal(box((1.3, 1.2), (_UNDER, 1.25))),
-                _metal(prism(rectangle(1.29, 1.19), 1.23, top=1.65, taper=0.6)),
-            ]
-        ),
-        "waste_container": concatenate(
-            [
-                _plastic(box((0.95, 1.25), (0.14, 1.05))),
-                _plastic(box((1.05, 1.35), (1.05, 1.18))),
-                *(
-                    _metal(box((0.16, 0.08), (-0.02, 0.14), at=(x, y)))
-                    for x in (-0.35, 0.35)
-                    for y in (-0.5, 0.5)
-                ),
-            ]
-        ),
-        "bicycle_stand": _stand(),
-        "bicycle_stand_1": concatenate([_stand(), bicycles[0]]),
-        "bicycle_stand_2": concatenate([_stand(), *bicycles]),
-        "bus_shelter": _bus_shelter(),
-        "bus_stop": concatenate(
-            [
-                _metal(prism(circle(0.07), -0.3, top=2.9), klass=Class.POLE),
-                _sheet((0.03, 0.45), (2.35, 2.85), y=0.2),
-            ]
-        ),
-        "bench_plain": concatenate(
-            [
-                _wood(box((0.45, 1.8), (0.41, 0.46))),
-                *(
-                    _metal(box((0.4, 0.08), (_UNDER, 0.41), at=(0.0, y)), klass=Class.BENCH)
-                    for y in (-0.7, 0.7)
-                ),
-            ]
-        ),
-        "post_box": concatenate(
-            [
-                _metal(box((0.06, 0.06), (_UNDER, 0.6))),
-                _metal(box((0.35, 0.45), (0.6, 1.2))),
-                _metal(prism(rectangle(0.34, 0.44), 1.18, top=1.3, taper=0.75)),
-            ]
-        ),
-        "vending_machine": concatenate(
-            [
-                _metal(box((0.75, 0.95), (_UNDER, 1.83))),
-                _glass(box((0.03, 0.6), (0.75, 1.65), at=(0.39, -0.1))),
-            ]
-        ),
-        "parking_meter": concatenate(
-            [
-                _metal(prism(circle(0.07), -0.3, top=1.1), klass=Class.POLE),
-                _metal(box((0.16, 0.22), (1.1, 1.5)), klass=Class.POLE),
-            ]
-        ),
-        "street_cabinet": concatenate(
-            [_plastic(box((0.35, 0.95), (_UNDER, 1.15))), _plastic(box((0.4, 1.0), (1.15, 1.2)))]
-        ),
-        "planter": concatenate(
-            [
-                solid(box((0.5, 1.1), (_UNDER, 0.5)), klass=_OTHER, material="concrete"),
-                *(
-                    solid(
-                        _lump((0.45, 0.45, 0.6), at=(0.0, y, 0.45 - 0.05 * k)),
-                        klass=Class.HEDGE,
-                        material="foliage",
-                    )
-                    for k, y in enumerate((-0.32, 0.0, 0.32))
-                ),
-            ]
-        ),
-        "telephone": concatenate(
-            [
-                _metal(box((0.9, 0.9), (2.2, 2.4))),
-                _metal(box((0.9, 0.9), (_UNDER, 0.12))),
-                *(
-                    _metal(box((0.06, 0.06), (0.12, 2.2), at=(x, y)))
-                    for x in (-0.42, 0.42)
-                    for y in (-0.42, 0.42)
-                ),
-                _glass(box((0.02, 0.78), (0.2, 2.15), at=(-0.42, 0.0))),
-                *(_glass(box((0.78, 0.02), (0.2, 2.15), at=(0.0, y))) for y in (-0.42, 0.42)),
-                _metal(box((0.2, 0.4), (1.0, 1.6), at=(-0.28, 0.0))),
-            ]
-        ),
-        "drinking_fountain": concatenate(
-            [
-                solid(prism(circle(0.3), _UNDER, top=0.85), klass=_OTHER, material="stone"),
-                solid(prism(circle(0.5), 0.85, top=0.95), klass=_OTHER, material="stone"),
-            ]
-        ),
-        "information_board": concatenate(
-            [
-                *(_metal(prism(circle(0.08), -0.3, top=2.0), y=y, klass=Class.POLE) for y in (-0.75, 0.75)),
-                _sheet((0.06, 1.42), (0.9, 1.9)),
-            ]
-        ),
-        "advertising_column": concatenate(
-            [
-                solid(prism(circle(1.25, 12), _UNDER, top=2.9), klass=_OTHER, material="concrete"),
-                _metal(prism(circle(1.5, 12), 2.9, top=3.3, taper=0.3)),
-            ]
-        ),
-        "poster_box": concatenate(
-            [
-                _metal(box((0.2, 0.5), (_UNDER, 0.55))),
-                _metal(box((0.2, 1.35), (0.55, 2.5))),
-                *(_glass(box((0.02, 1.2), (0.65, 2.4), at=(x, 0.0))) for x in (-0.11, 0.11)),
-            ]
-        ),
-        "charging_station": concatenate(
-            [_plastic(box((0.3, 0.45), (_UNDER, 1.6))), _glass(box((0.02, 0.3), (1.15, 1.4), at=(0.16, 0.0)))]
-        ),
-        "block": solid(
-            prism(rectangle(0.6, 0.6), _UNDER, top=0.55, taper=0.9), klass=Class.BOLLARD, material="concrete"
-        ),
-        "clock": concatenate(
-            [
-                _metal(prism(circle(0.14), -0.3, top=3.2, taper=0.8), klass=Class.POLE),
-                _metal(_upright_disc(0.8, 0.25, z=3.55), klass=Class.POLE),
-            ]
-        ),
-        "hydrant_pillar": concatenate(
-            [
-                _metal(prism(circle(0.3), _UNDER, top=0.08), klass=Class.BOLLARD),
-                _metal(prism(circle(0.2), 0.08, top=0.62), klass=Class.BOLLARD),
-                _metal(
-                    lathe(((0, 0.6), (0.27, 0.6), (0.25, 0.7), (0.1, 0.8), (0, 0.82))), klass=Class.BOLLARD
-                ),
-                _metal(box((0.12, 0.42), (0.42, 0.54)), klass=Class.BOLLARD),
-                _metal(box((0.3, 0.14), (0.38, 0.52), at=(0.06, 0.0)), klass=Class.BOLLARD),
-            ]
-        ),
-        "table": _table(),
-        "table_parasol": concatenate([_table(), *_parasol()]),
-        "wire": _wire(),
+    parts = {
+        "waste_basket": [
+            _metal(prism(circle(0.42), 0.12, top=0.9)),
+            _metal(prism(circle(0.2), _UNDER, top=0.12)),
+            _metal(prism(circle(0.48), 0.9, top=0.96, taper=0.8)),
+        ],
+        "recycling_container": [
+            _metal(box((1.3, 1.2), (_UNDER, 1.25))),
+            _metal(prism(rectangle(1.29, 1.19), 1.23, top=1.65, taper=0.6)),
+        ],
+        "waste_container": [
+            _plastic(box((0.95, 1.25), (0.14, 1.05))),
+            _plastic(box((1.05, 1.35), (1.05, 1.18))),
+            *(
+                _metal(box((0.16, 0.08), (-0.02, 0.14), at=(x, y)))
+                for x in (-0.35, 0.35)
+                for y in (-0.5, 0.5)
+            ),
+        ],
+        "bicycle_stand": [_stand()],
+        "bicycle_stand_1": [_stand(), bicycles[0]],
+        "bicycle_stand_2": [_stand(), *bicycles],
+        "bus_shelter": [_bus_shelter()],
+        "bus_stop": [
+            _metal(prism(circle(0.07), -0.3, top=2.9), klass=Class.POLE),
+            _sheet((0.03, 0.45), (2.35, 2.85), y=0.2),
+        ],
+        "bench_plain": [
+            _wood(box((0.45, 1.8), (0.41, 0.46))),
+            *(_metal(box((0.4, 0.08), (_UNDER, 0.41), at=(0.0, y)), klass=Class.BENCH) for y in (-0.7, 0.7)),
+        ],
+        "post_box": [
+            _metal(box((0.06, 0.06), (_UNDER, 0.6))),
+            _metal(box((0.35, 0.45), (0.6, 1.2))),
+            _metal(prism(rectangle(0.34, 0.44), 1.18, top=1.3, taper=0.75)),
+        ],
+        "vending_machine": [
+            _metal(box((0.75, 0.95), (_UNDER, 1.83))),
+            _glass(box((0.03, 0.6), (0.75, 1.65), at=(0.39, -0.1))),
+        ],
+        "parking_meter": [
+            _metal(prism(circle(0.07), -0.3, top=1.1), klass=Class.POLE),
+            _metal(box((0.16, 0.22), (1.1, 1.5)), klass=Class.POLE),
+        ],
+        "street_cabinet": [
+            _plastic(box((0.35, 0.95), (_UNDER, 1.15))),
+            _plastic(box((0.4, 1.0), (1.15, 1.2))),
+        ],
+        "planter": [
+            solid(box((0.5, 1.1), (_UNDER, 0.5)), klass=_OTHER, material="concrete"),
+            *(
+                solid(
+                    _lump((0.45, 0.45, 0.6), at=(0.0, y, 0.45 - 0.05 * k)),
+                    klass=Class.HEDGE,
+                    material="foliage",
+                )
+                for k, y in enumerate((-0.32, 0.0, 0.32))
+            ),
+        ],
+        "telephone": [
+            _metal(box((0.9, 0.9), (2.2, 2.4))),
+            _metal(box((0.9, 0.9), (_UNDER, 0.12))),
+            *(
+                _metal(box((0.06, 0.06), (0.12, 2.2), at=(x, y)))
+                for x in (-0.42, 0.42)
+                for y in (-0.42, 0.42)
+            ),
+            _glass(box((0.02, 0.78), (0.2, 2.15), at=(-0.42, 0.0))),
+            *(_glass(box((0.78, 0.02), (0.2, 2.15), at=(0.0, y))) for y in (-0.42, 0.42)),
+            _metal(box((0.2, 0.4), (1.0, 1.6), at=(-0.28, 0.0))),
+        ],
+        "drinking_fountain": [
+            solid(prism(circle(0.3), _UNDER, top=0.85), klass=_OTHER, material="stone"),
+            solid(prism(circle(0.5), 0.85, top=0.95), klass=_OTHER, material="stone"),
+        ],
+        "information_board": [
+            *(_metal(prism(circle(0.08), -0.3, top=2.0), y=y, klass=Class.POLE) for y in (-0.75, 0.75)),
+            _sheet((0.06, 1.42), (0.9, 1.9)),
+        ],
+        "advertising_column": [
+            solid(prism(circle(1.25, 12), _UNDER, top=2.9), klass=_OTHER, material="concrete"),
+            _metal(prism(circle(1.5, 12), 2.9, top=3.3, taper=0.3)),
+        ],
+        "poster_box": [
+            _metal(box((0.2, 0.5), (_UNDER, 0.55))),
+            _metal(box((0.2, 1.35), (0.55, 2.5))),
+            *(_glass(box((0.02, 1.2), (0.65, 2.4), at=(x, 0.0))) for x in (-0.11, 0.11)),
+        ],
+        "charging_station": [
+            _plastic(box((0.3, 0.45), (_UNDER, 1.6))),
+            _glass(box((0.02, 0.3), (1.15, 1.4), at=(0.16, 0.0))),
+        ],
+        "block": [
+            solid(
+                prism(rectangle(0.6, 0.6), _UNDER, top=0.55, taper=0.9),
+                klass=Class.BOLLARD,
+                material="concrete",
+            )
+        ],
+        "clock": [
+            _metal(prism(circle(0.14), -0.3, top=3.2, taper=0.8), klass=Class.POLE),
+            _metal(_upright_disc(0.8, 0.25, z=3.55), klass=Class.POLE),
+        ],
+        "hydrant_pillar": [
+            _metal(prism(circle(0.3), _UNDER, top=0.08), klass=Class.BOLLARD),
+            _metal(prism(circle(0.2), 0.08, top=0.62), klass=Class.BOLLARD),
+            _metal(lathe(((0, 0.6), (0.27, 0.6), (0.25, 0.7), (0.1, 0.8), (0, 0.82))), klass=Class.BOLLARD),
+            _metal(box((0.12, 0.42), (0.42, 0.54)), klass=Class.BOLLARD),
+            _metal(box((0.3, 0.14), (0.38, 0.52), at=(0.06, 0.0)), klass=Class.BOLLARD),
+        ],
+        "table": [_table()],
+        "table_parasol": [_table(), *_parasol()],
+        "wire": [_wire()],
     }
+    return {name: concatenate(some) for name, some in parts.items()}
 
 
 def _metal(body: Body, *, y: float = 0.0, klass: Class = _OTHER) -> Mesh:

@@ -93,7 +93,7 @@ def build(
         ):
             reports.append(report)
             progress("tiles", len(reports), total=len(tiles))
-        problems += _tile_problems(reports)
+        problems += [p for r in sorted(reports, key=lambda r: (r.i, r.j)) for p in r.problems]
         writer.finish(
             frame=plan.frame,
             layers=plan.layers,
@@ -117,10 +117,6 @@ def build(
     return open_scene(out)
 
 
-def _tile_problems(reports: Sequence[TileReport]) -> list[Problem]:
-    return [problem for report in sorted(reports, key=lambda r: (r.i, r.j)) for problem in report.problems]
-
-
 def _keys(osm: OsmData, options: BuildOptions, *, digest: str) -> Keys:
     """Digests of all inputs of the ground and of the solids of tiles: program, format, map and options.
 
@@ -142,13 +138,12 @@ def _keys(osm: OsmData, options: BuildOptions, *, digest: str) -> Keys:
 
 
 def elevation_digests(dem: Sequence[str]) -> list[str]:
-    """Digests of the contents of elevation files and of the files beside them."""
-    return [file_digest(path) for name in dem for path in _with_companions(Path(name))]
-
-
-def _with_companions(path: Path) -> list[Path]:
-    """A raster, and the files beside it from which GDAL may read its georeference."""
-    return [path, *sorted(set(path.parent.glob(f"{glob.escape(path.stem)}.*")) - {path})]
+    """Digests of elevation files and of the files beside them, which may hold their georeference."""
+    found = []
+    for path in map(Path, dem):
+        beside = set(path.parent.glob(f"{glob.escape(path.stem)}.*")) - {path}
+        found += [file_digest(file) for file in (path, *sorted(beside))]
+    return found
 
 
 def scene_manifest(
@@ -297,7 +292,7 @@ def _counts(plan: BuildPlan, reports: Sequence[TileReport], *, problems: Sequenc
 
 def _relief(plan: BuildPlan, reports: Sequence[TileReport]) -> dict[str, Any]:
     """Relief of the scene, by kind and source."""
-    furniture = plan.furniture
+    furniture, raised = plan.furniture, plan.ground.raised
     parts, roofs, facades = Counter[str](), Counter[str](), Counter[str]()
     for report in reports:
         facades.update(report.facades)
@@ -310,8 +305,8 @@ def _relief(plan: BuildPlan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "habit_source": _tally(plan.trees.habit_source),
         "furniture": _tally(furniture.shape[furniture.source == "mapped"]),
         "furniture_guessed": _tally(furniture.shape[furniture.source != "mapped"]),
-        "camber_km": _camber_km(plan),
-        "ballast_m2": _ballast_m2(plan),
+        "camber_km": 0.0 if raised is None else round(raised.camber.metres(plan.extent) / 1000, 3),
+        "ballast_m2": 0.0 if raised is None else round(raised.beds.square_metres(plan.extent), 1),
         **count_kerbs(plan.ground.layers),
         **count_covers(plan.ground.layers),
         "parts_guessed": dict(sorted(parts.items())),
@@ -320,18 +315,6 @@ def _relief(plan: BuildPlan, reports: Sequence[TileReport]) -> dict[str, Any]:
         "facades": dict(sorted(facades.items())),
         **_facade_tallies(plan),
     }
-
-
-def _camber_km(plan: BuildPlan) -> float:
-    """Kilometres of carriageway in the extent that have a camber."""
-    raised = plan.ground.raised
-    return 0.0 if raised is None else round(raised.camber.metres(plan.extent) / 1000, 3)
-
-
-def _ballast_m2(plan: BuildPlan) -> float:
-    """Square metres of raised ballast in the extent."""
-    raised = plan.ground.raised
-    return 0.0 if raised is None else round(raised.beds.square_metres(plan.extent), 1)
 
 
 def _facade_tallies(plan: BuildPlan) -> dict[str, dict[str, int]]:

@@ -34,13 +34,7 @@ from geoscene.ground.terrain import Terrain, base_heights, open_terrain
 from geoscene.ground.terrain_lattice import TerrainHeights
 from geoscene.objects.barriers import Barriers, open_barriers, read_barriers
 from geoscene.objects.forests import Forests
-from geoscene.objects.furniture import (
-    POSTS,
-    STANDS,
-    Furniture,
-    mapped_furniture,
-    read_furniture,
-)
+from geoscene.objects.furniture import POSTS, STANDS, Furniture, mapped_furniture, read_furniture
 from geoscene.objects.rooftops import Rooftops, plan_rooftops
 from geoscene.objects.sidewalks import with_details, with_guesses
 from geoscene.objects.siting import Sites
@@ -87,6 +81,7 @@ from geoscene.structures import (
     read_structures,
     within_extent,
 )
+from geoscene.support.columns import squares_between
 from geoscene.support.problems import Problem
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Height, Ints
@@ -657,16 +652,13 @@ def _objects(
     wanted = {"trees": problems, "furniture": [], "barriers": more}
     return (
         {
-            kind: row if kind in options.only else (_no_rows(row[0]), row[1][:0], 0)
+            kind: row
+            if kind in options.only
+            else (None if row[0] is None else row[0].take(slice(0)), row[1][:0], 0)
             for kind, row in found.items()
         },
         [problem for kind, some in wanted.items() if kind in options.only for problem in some],
     )
-
-
-def _no_rows(table: Any) -> Any:
-    """A table without its rows; None stays None."""
-    return None if table is None else table.take(np.empty(0, np.int64))
 
 
 def _site(
@@ -714,12 +706,7 @@ def _graded_tiles(graph: RoadGraph, tile_size: float, *, level: bool) -> set[tup
 def _squares(boxes: Float, tile_size: float) -> set[tuple[int, int]]:
     """Squares of the grid of tiles that boxes (n, 4) touch."""
     low, high = (np.floor(corner / tile_size).astype(np.int64) for corner in (boxes[:, :2], boxes[:, 2:]))
-    span = high - low + 1
-    copies = span[:, 0] * span[:, 1]
-    box = np.repeat(np.arange(len(boxes)), copies)
-    nth = np.arange(len(box)) - np.repeat(np.cumsum(copies) - copies, copies)
-    down, across = np.divmod(nth, span[box, 0])
-    return _distinct(low[box] + np.stack([across, down], axis=1))
+    return _distinct(squares_between(low, high)[0])
 
 
 def _distinct(tiles: Ints) -> set[tuple[int, int]]:

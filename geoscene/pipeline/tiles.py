@@ -21,6 +21,7 @@ from geoscene.buildings import build_solids
 from geoscene.buildings.facades import FacadeSetting, Layout, wall_relief
 from geoscene.classes import Class
 from geoscene.geometry.mesh import Mesh, ShapeInstances, concatenate
+from geoscene.geometry.polylines import cross
 from geoscene.geometry.watertight import validate_mesh
 from geoscene.ground import ground_tile, tile_box, tile_place
 from geoscene.ground.standing import standing_height
@@ -197,12 +198,7 @@ def make_ground(plan: BuildPlan, tile: tuple[int, int]) -> TileSurroundings:
 
 
 def build_tile(
-    plan: BuildPlan,
-    folder: Path,
-    *,
-    tile: tuple[int, int],
-    lod: int,
-    former: tuple[Path, TileReport] | None,
+    plan: BuildPlan, folder: Path, *, tile: tuple[int, int], lod: int, former: tuple[Path, TileReport] | None
 ) -> TileReport:
     """Build tile (i, j), write it into ``folder`` and return a report of its contents.
 
@@ -314,8 +310,7 @@ def _roof_objects(
 
 def _plan_area(mesh: Mesh) -> float:
     a, b, c = (mesh.vertices[mesh.faces[:, k], :2] for k in range(3))
-    u, v = b - a, c - a
-    return float((u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / 2)
+    return float(cross(b - a, c - a).sum() / 2)
 
 
 def build_tiles(

@@ -14,7 +14,7 @@ from geoscene.ground.kinds import SURFACES
 from geoscene.roadgraph.build import read_runs
 from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
-from geoscene.roadgraph.tags import CLASSES, Street, drivable, read_street
+from geoscene.roadgraph.tags import CLASSES, Street, drivable, place_of, read_street
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
@@ -108,17 +108,6 @@ class Carriageways:
     def layer(self) -> NDArray[np.int8]:
         """OSM layer of each stretch."""
         return np.array([s.layer for s in self.street], np.int8)
-
-
-def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> int:
-    """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
-
-    ``layer`` alone is not enough: a road of layer -1 without a tunnel tag runs in a cutting, on the ground.
-    """
-    storey = layer if layer_source == "level" else 0
-    if bridge or storey > 0:
-        return 1
-    return 2 if tunnel or storey < 0 else 0
 
 
 @dataclass(frozen=True, slots=True)

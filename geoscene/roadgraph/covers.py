@@ -14,6 +14,7 @@ from geoscene.roadgraph.carriageways import PAVED, Carriageways
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.sources.data import OsmData, Tags
+from geoscene.support.columns import nth
 from geoscene.support.splitmix import number_of, uniform_at
 from geoscene.typing import Float, Ints
 
@@ -84,12 +85,12 @@ def _guess_rows(roads: Carriageways, kind: str) -> SurfaceRows:
     street &= (roads.place == 0) & np.isin(roads.material, list(PAVED)) & (roads.width >= 2 * _EDGE + 2.0)
     count = np.where(street, (length / every).astype(np.int64), 0)
     road = np.repeat(np.arange(len(roads)), count)
-    nth = np.arange(len(road)) - np.repeat(np.cumsum(count) - count, count)
+    place = nth(count)
     way = np.array([number_of(name) for name in roads.osm_id], np.int64)
     column = (way * 1_000_003 + roads.node_id[roads.ends[:, 0]])[road] if len(roads) else road
     salt = list(_EVERY).index(kind)
-    draw = uniform_at(column, 8 * nth + salt, count=4)
-    along, half = (nth + 0.1 + 0.8 * draw[0]) * every, roads.width[road] / 2
+    draw = uniform_at(column, 8 * place + salt, count=4)
+    along, half = (place + 0.1 + 0.8 * draw[0]) * every, roads.width[road] / 2
     side = np.where(draw[1] < 0.5, 0, 1)
     kept = np.ones(len(road), np.bool_)
     if kind == "gully":

@@ -11,12 +11,12 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.roadgraph.carriageways import place_of
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
-from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
+from geoscene.roadgraph.tags import place_and_layer
 from geoscene.sources.data import OsmData, Tags
+from geoscene.support.columns import squares_between
 from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Height, Ints
 
@@ -43,8 +43,7 @@ def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
 
 
 def _required_clearance(tags: Tags) -> float | None:
-    layer, source = read_layer(tags, [])
-    if place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags)) != 0:
+    if place_and_layer(tags)[0] != 0:
         return None
     for key, heights in _CLEAR.items():
         if tags.get(key) in heights:
@@ -139,16 +138,11 @@ class _Pieces:
         side = 2 * reach
         ends = np.stack([start[:, :2], end[:, :2]])
         low = np.floor((ends.min(axis=0) - reach) / side).astype(np.int64)
-        span = np.floor((ends.max(axis=0) + reach) / side).astype(np.int64) - low + 1
+        high = np.floor((ends.max(axis=0) + reach) / side).astype(np.int64)
         corner = low.min(axis=0, initial=0)
-        shape = (low + span).max(axis=0, initial=0) - corner
-        copies = span.prod(axis=1)
-        piece = np.repeat(np.arange(len(start)), copies)
-        column, row = np.divmod(
-            np.arange(len(piece)) - np.repeat(np.cumsum(copies) - copies, copies), span[piece, 1]
-        )
-        column, row = column + low[piece, 0] - corner[0], row + low[piece, 1] - corner[1]
-        number = column * shape[1] + row
+        shape = (high + 1).max(axis=0, initial=0) - corner
+        found, piece = squares_between(low - corner, high - corner)
+        number = found[:, 0] * shape[1] + found[:, 1]
         order = np.argsort(number, kind="stable")
         square, first = np.unique(number[order], return_index=True)
         first = np.append(first, len(order))

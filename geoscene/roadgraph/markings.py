@@ -17,7 +17,7 @@ from geoscene.roadgraph.lane_uses import LaneUses
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes, lane_layout
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.support.columns import Columns
+from geoscene.support.columns import Columns, nth
 from geoscene.typing import Bools, Float, Ints
 
 PRIORITY = 170.0
@@ -188,7 +188,7 @@ def _dashes(lines: NDArray[np.object_], *, dash: float, gap: float) -> tuple[NDA
     length = shapely.length(lines)
     count = np.maximum(np.floor((length + gap) / (dash + gap)), 0).astype(np.int64)
     of = np.repeat(np.arange(len(lines)), count)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    number = nth(count)
     spare = (length - count * (dash + gap) + gap)[of] / 2
     start = spare + number * (dash + gap)
     at = start[:, None] + dash * np.array([0.0, 0.5, 1.0])

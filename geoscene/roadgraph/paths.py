@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.polylines import directions
-from geoscene.roadgraph.carriageways import PAVED, Carriageways, place_of, surface_material
+from geoscene.roadgraph.carriageways import PAVED, Carriageways, surface_material
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
+from geoscene.roadgraph.tags import place_and_layer
 from geoscene.sources.data import Area, OsmData, TaggedNode, Tags, Way
-from geoscene.support.columns import Columns
+from geoscene.support.columns import Columns, nth
 from geoscene.tags import parse_length, parse_number
 from geoscene.typing import Float, Ints
 
@@ -107,14 +107,8 @@ def _is_path(tags: Tags) -> bool:
 
 def _place_and_level(tags: Sequence[Tags]) -> dict[str, Any]:
     """Columns ``place`` and ``level`` of tagged features."""
-    layers = [read_layer(t, []) for t in tags]
-    return {
-        "place": [
-            place_of(layer, source, bridge=is_bridge(t), tunnel=is_tunnel(t))
-            for t, (layer, source) in zip(tags, layers, strict=True)
-        ],
-        "level": [layer for layer, _ in layers],
-    }
+    found = [place_and_layer(t) for t in tags]
+    return {"place": [place for place, _ in found], "level": [layer for _, layer in found]}
 
 
 def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
@@ -308,7 +302,7 @@ def _stripes(lines: NDArray[np.object_], width: Float) -> tuple[NDArray[np.objec
     of = np.repeat(np.arange(len(lines)), count)
     if not len(of):
         return np.empty(0, object), of
-    number = np.arange(len(of)) - np.repeat(np.cumsum(count) - count, count)
+    number = nth(count)
     start = (length - count * pitch + _STRIPE_GAP)[of] / 2 + number * pitch
     ends = shapely.line_interpolate_point(lines[of][:, None], start[:, None] + np.array([0.0, _STRIPE]))
     bits = shapely.linestrings(shapely.get_coordinates(ends).reshape(-1, 2, 2))

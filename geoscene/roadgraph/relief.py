@@ -15,11 +15,11 @@ from geoscene.geometry.frames import Frame
 from geoscene.ground.kerbs import MappedKerbs
 from geoscene.ground.layers import Layers
 from geoscene.ground.relief import CAMBER, FADE, SLOPE, Beds, Camber
-from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, place_of, surface_material
+from geoscene.roadgraph.carriageways import KERB, PAVED, Carriageways, surface_material
 from geoscene.roadgraph.junctions import carriageway, junction_reach
 from geoscene.roadgraph.paths import way_lines
-from geoscene.roadgraph.tags import is_bridge, is_tunnel, read_layer
-from geoscene.sources.data import OsmData, Tags
+from geoscene.roadgraph.tags import place_and_layer
+from geoscene.sources.data import OsmData
 from geoscene.typing import Bools, Float, Ints
 
 _NARROW = 3.5
@@ -35,6 +35,7 @@ _ABOVE = 0.75
 """Priority of a half with camber above its carriageway: over joints (0.5), below the next class of road."""
 
 _TRACKS = frozenset({"rail", "light_rail", "subway", "narrow_gauge", "preserved"})
+_BALLAST = ("ballast", "gravel")
 _TOP = 1.8
 """Metres from the middle of a track to the edge of the top: half a sleeper of 2.6 m and a shoulder."""
 
@@ -174,9 +175,9 @@ def read_beds(osm: OsmData, frame: Frame, *, cover: Layers, others: Layers) -> t
     others : surfaces of roads and paths, and building pads
     """
     ways, lines = way_lines([way for way in osm.ways if way.tags.get("railway") in _TRACKS], frame)
-    on_ground = np.array([_place(way.tags) == 0 for way in ways], np.bool_)
+    on_ground = np.array([place_and_layer(way.tags)[0] == 0 for way in ways], np.bool_)
     ends = shapely.get_parts(shapely.boundary(lines[~on_ground]))
-    bedded = on_ground & np.array([_embed(way.tags) for way in ways], np.bool_)
+    bedded = on_ground & np.isin([surface_material(way.tags, "ballast")[0] for way in ways], _BALLAST)
     lines, ids = lines[bedded], [way.osm_id for way, b in zip(ways, bedded, strict=True) if b]
     obstacle = _obstacles(cover, others, lines=lines)
     wide = shapely.union_all(shapely.buffer(lines, _TOP + _GAP, cap_style="flat", join_style="mitre"))
@@ -188,15 +189,6 @@ def read_beds(osm: OsmData, frame: Frame, *, cover: Layers, others: Layers) -> t
     crossed = shapely.intersection(lines[line], obstacle[other])
     ends = np.concatenate([crossed[~shapely.is_empty(crossed)], ends])
     return Beds.of(tops, ends), _rows(lines, ids, tops=tops, ends=ends, keep_off=keep_off, cover=cover)
-
-
-def _place(tags: Tags) -> int:
-    layer, source = read_layer(tags, [])
-    return place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags))
-
-
-def _embed(tags: Tags) -> bool:
-    return surface_material(tags, "ballast")[0] in {"ballast", "gravel"}
 
 
 def _obstacles(cover: Layers, others: Layers, *, lines: NDArray[np.object_]) -> NDArray[np.object_]:

@@ -18,6 +18,7 @@ from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.sources.tracks import read_track
+from geoscene.support.columns import nth
 from geoscene.typing import Bools, Float
 
 HEADING_REACH = 5.0
@@ -93,7 +94,7 @@ def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.i
     start = np.searchsorted(graph.tail[order], np.arange(len(graph.node_id) + 1))
     count = (start[1:] - start[:-1])[graph.head]
     before = np.repeat(np.arange(len(graph), dtype=np.int32), count)
-    rank = np.arange(len(before)) - np.repeat(np.cumsum(count) - count, count)
+    rank = nth(count)
     after = order[start[graph.head[before]] + rank]
 
     only = _is_mandatory(graph.turn_kind)

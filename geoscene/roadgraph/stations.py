@@ -9,9 +9,9 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
-from geoscene.geometry.polylines import directions, unit
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.support.columns import nth
 from geoscene.typing import Bools, Float, Ints
 
 # Arms of a node that deviate from a straight line by less than this (radians) are one continuous road.
@@ -95,7 +95,7 @@ def _pairs(group: Ints) -> tuple[Ints, Ints]:
     start = np.searchsorted(group[order], group[order])
     ahead = size - 1 - (np.arange(len(order)) - start)
     i = np.repeat(np.arange(len(order)), ahead)
-    j = i + 1 + np.arange(len(i)) - np.repeat(np.cumsum(ahead) - ahead, ahead)
+    j = i + 1 + nth(ahead)
     return order[i], order[j]
 
 
@@ -114,7 +114,7 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     corner = polylines.add_up(np.concatenate([[0.0], metres[:-1]]), first[of])
     pieces = np.maximum(np.ceil(metres / spacing), 1).astype(np.int64)
     vertex = np.repeat(np.arange(len(xy)), pieces)
-    part = np.arange(len(vertex)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    part = nth(pieces)
     share = part / pieces[vertex]
     is_first, is_last = np.zeros((2, len(xy)), np.bool_)
     is_first[first], is_last[last] = True, True
@@ -157,7 +157,8 @@ def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, I
             at_node |= same & near
     points, one, two = points[~at_node], one[~at_node], two[~at_node]
     upper, lower = (shapely.line_locate_point(lines[k], points) for k in (one, two))
-    sine = np.clip(np.abs(_cross(_heading(lines[one], upper), _heading(lines[two], lower))), 0.2, 1.0)
+    across = polylines.cross(_heading(lines[one], upper), _heading(lines[two], lower))
+    sine = np.clip(np.abs(across), 0.2, 1.0)
     return once[one], upper, once[two], lower, graph.width[once[two]] / 2 / sine
 
 
@@ -165,10 +166,6 @@ def _heading(lines: NDArray[np.object_], along: Float) -> Float:
     step = np.minimum(1.0, shapely.length(lines) / 4)
     at = np.clip(along, step, shapely.length(lines) - step)
     return polylines.directions(lines, at, reach=step)
-
-
-def _cross(a: Float, b: Float) -> Float:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +220,8 @@ def find_overlaps(
     keep = (edge != other) & (lap > _LAP) & (along > 0.01) & (along < length - 0.01)
     keep &= both | (graph.bridge[edge] & deep)
     way = _edge_heading(stations, row)
-    theirs = directions(lines[found], along, reach=0.5)
-    keep &= np.abs(way[:, 0] * theirs[:, 1] - way[:, 1] * theirs[:, 0]) < _PARALLEL
+    theirs = polylines.directions(lines[found], along, reach=0.5)
+    keep &= np.abs(polylines.cross(way, theirs)) < _PARALLEL
     row, edge, other, along, metres, length, both = (
         column[keep] for column in (row, edge, other, along, metres, length, both)
     )
@@ -251,7 +248,7 @@ def _edge_heading(stations: Stations, row: Ints) -> Float:
     ends = np.append(stations.edge[1:] != stations.edge[:-1], True)[row]
     a, b = np.where(ends, row - 1, row), np.where(ends, row, row + 1)
     step = stations.xy[stations.row[b]] - stations.xy[stations.row[a]]
-    return unit(step)
+    return polylines.unit(step)
 
 
 def _from_fork(

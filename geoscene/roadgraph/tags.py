@@ -237,6 +237,23 @@ def read_layer(tags: Tags, unread: list[str]) -> tuple[int, str]:
     return (-1, "tunnel") if is_tunnel(tags) else (0, "default")
 
 
+def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> int:
+    """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
+
+    ``layer`` alone is not enough: a road of layer -1 without a tunnel tag runs in a cutting, on the ground.
+    """
+    storey = layer if layer_source == "level" else 0
+    if bridge or storey > 0:
+        return 1
+    return 2 if tunnel or storey < 0 else 0
+
+
+def place_and_layer(tags: Tags) -> tuple[int, int]:
+    """Place of a way, as of `place_of`, and its layer."""
+    layer, source = read_layer(tags, [])
+    return place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags)), layer
+
+
 def _direction(tags: Tags) -> int:
     """1, -1 or 0. Lanes that change their direction (``reversible``, ``alternating``) serve both."""
     value = tags.get("oneway:motor_vehicle", tags.get("oneway", ""))
@@ -317,8 +334,9 @@ def _width(tags: Tags, direction: int, *, counted: tuple[float, str], unread: li
 def _cycle_and_parking_width(tags: Tags) -> float:
     """Metres of the carriageway that mapped cycle lanes and rows of parked cars take up."""
     extra = 0.0
+    one = is_plain(tags, "cycleway") and bool(_direction(tags))  # plain on a one-way street: on one side
     for side in ("left", "right"):
-        lane = tag_of_side(tags, "cycleway", side=side) == "lane" and side in _sides(tags, "cycleway")
+        lane = tag_of_side(tags, "cycleway", side=side) == "lane" and (side == "right" or not one)
         extra += (CYCLE_LANE if lane else 0.0) + parking_width(tags, side)
     return extra
 
@@ -339,11 +357,6 @@ def parking_width(tags: Tags, side: str) -> float:
     stand = tags.get(f"parking:{side}:orientation", tags.get("parking:both:orientation", ""))
     older = tags.get(f"parking:lane:{side}", tags.get("parking:lane:both", ""))
     return _PARKED.get(stand or older, 0.0) if where == "lane" else 0.0
-
-
-def _sides(tags: Tags, key: str) -> tuple[str, ...]:
-    """Sides that a tag applies to: on one-way streets a plain ``cycleway=lane`` means one side."""
-    return ("right",) if is_plain(tags, key) and _direction(tags) else ("left", "right")
 
 
 @functools.lru_cache(maxsize=1024)

@@ -28,11 +28,7 @@ from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
 
-_PARTS = {
-    "tiles": "tiles",
-    "colors": "colours for cameras",
-    "tables": "attributes of features",
-}
+_PARTS = {"tiles": "tiles", "colors": "colours for cameras", "tables": "attributes of features"}
 """Parts that scenes for some uses lack, in words."""
 
 SCHEMA = 3

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from geoscene.support.digests import digest
 from geoscene.support.files import write_atomically
 from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Bools, Float
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,16 +85,26 @@ def _header(kind: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
     return out.getvalue()
 
 
-def _mesh_arrays(mesh: Mesh) -> dict[str, NDArray[Any]]:
-    return {f.name: getattr(mesh, f.name) for f in fields(Mesh)}
+def _arrays_of(table: Any, prefix: str = "") -> dict[str, NDArray[Any]]:
+    """The columns of a table, by their names after a prefix."""
+    return {prefix + f.name: getattr(table, f.name) for f in fields(table)}
+
+
+def _table_of(kind: type[T], arrays: Mapping[str, NDArray[Any]], *, prefix: str = "") -> T:
+    """The table of a kind that `_arrays_of` took apart."""
+    names = [f.name for f in fields(cast("Any", kind))]
+    return kind(**{name: _column(arrays, prefix + name) for name in names})
 
 
 def write_tile(path: Path, tile: Tile) -> str:
     """Write one tile as .npz and return the digest of the file."""
-    instances = {f"instance_{f.name}": getattr(tile.instances, f.name) for f in fields(ShapeInstances)}
-    relief = {} if tile.relief is None else _relief_arrays(tile.relief)
-    full_parts = {} if tile.full_parts is None else _full_part_arrays(tile.full_parts)
-    data = pack({"origin": tile.origin, **_mesh_arrays(tile.mesh), **instances, **relief, **full_parts})
+    arrays = {"origin": tile.origin, **_arrays_of(tile.mesh), **_arrays_of(tile.instances, "instance_")}
+    if (relief := tile.relief) is not None:
+        arrays |= _arrays_of(relief.facades, "facade_") | _arrays_of(relief.openings, "opening_")
+        arrays |= {"relief_cells": relief.cells, "relief_wall": relief.wall}
+    if tile.full_parts is not None:
+        arrays |= _arrays_of(tile.full_parts, "extra_")
+    data = pack(arrays)
     write_atomically(path, data)
     return digest(data)
 
@@ -104,29 +116,17 @@ def read_tile(path: Path) -> Tile:
     """
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = read_arrays(path)
-        instances = {f.name: _column(arrays, f"instance_{f.name}") for f in fields(ShapeInstances)}
-        mesh = _mesh(arrays)
+        mesh, copies = _table_of(Mesh, arrays), _table_of(ShapeInstances, arrays, prefix="instance_")
         relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
-        copies = ShapeInstances(**instances)
         full_parts = (
             _full_parts(arrays, faces=len(mesh), copies=len(copies)) if "extra_faces" in arrays else None
         )
         return Tile(arrays["origin"], mesh, copies, relief, full_parts)
 
 
-def _relief_arrays(relief: WallRelief) -> dict[str, NDArray[Any]]:
-    facades = {f"facade_{f.name}": getattr(relief.facades, f.name) for f in fields(FacadeTable)}
-    openings = {f"opening_{f.name}": getattr(relief.openings, f.name) for f in fields(Openings)}
-    return {**facades, **openings, "relief_cells": relief.cells, "relief_wall": relief.wall}
-
-
-def _full_part_arrays(full_parts: FullParts) -> dict[str, NDArray[Any]]:
-    return {"extra_faces": full_parts.faces, "extra_instances": full_parts.instances}
-
-
 def _full_parts(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) -> FullParts:
     """The parts of full relief in a tile's arrays; raises ValueError if they do not fit the tile."""
-    full_parts = FullParts(_column(arrays, "extra_faces"), _column(arrays, "extra_instances"))
+    full_parts = _table_of(FullParts, arrays, prefix="extra_")
     if len(full_parts.faces) != faces or len(full_parts.instances) != copies:
         raise ValueError("the parts of full relief do not fit the faces or the instances")
     return full_parts
@@ -134,8 +134,8 @@ def _full_parts(arrays: Mapping[str, NDArray[Any]], *, faces: int, copies: int) 
 
 def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:
     """The relief in a tile's arrays; raises ValueError if its tables do not fit each other."""
-    facades = FacadeTable(**{f.name: _column(arrays, f"facade_{f.name}") for f in fields(FacadeTable)})
-    openings = Openings(**{f.name: _column(arrays, f"opening_{f.name}") for f in fields(Openings)})
+    facades = _table_of(FacadeTable, arrays, prefix="facade_")
+    openings = _table_of(Openings, arrays, prefix="opening_")
     cells, wall = _column(arrays, "relief_cells"), _column(arrays, "relief_wall")
     for table in (facades, openings):
         if {len(column) for column in table.columns().values()} - {len(table)}:
@@ -146,10 +146,6 @@ def _relief(arrays: Mapping[str, NDArray[Any]], *, faces: int) -> WallRelief:
     if cells.max(initial=-1) >= len(openings) or wall.max(initial=-1) >= len(facades):
         raise ValueError("rows of the relief are beyond its tables")
     return WallRelief(facades, cells, openings, wall)
-
-
-def _mesh(arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> Mesh:
-    return Mesh(**{f.name: _column(arrays, prefix + f.name) for f in fields(Mesh)})
 
 
 _ROWS = {
@@ -175,7 +171,7 @@ def write_shapes(path: Path, shapes: Mapping[str, Mesh]) -> None:
     """Write the shapes that instances copy, as one .npz."""
     arrays: dict[str, NDArray[Any]] = {"names": np.array(list(shapes), dtype=np.str_)}
     for name, mesh in shapes.items():
-        arrays |= {f"{name}/{key}": value for key, value in _mesh_arrays(mesh).items()}
+        arrays |= _arrays_of(mesh, f"{name}/")
     write_atomically(path, pack(arrays))
 
 
@@ -185,4 +181,4 @@ def read_shapes(path: Path) -> dict[str, Mesh]:
         return {}
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
         arrays = read_arrays(path)
-        return {str(name): _mesh(arrays, f"{name}/") for name in arrays["names"]}
+        return {str(name): _table_of(Mesh, arrays, prefix=f"{name}/") for name in arrays["names"]}

@@ -160,7 +160,7 @@ class SceneWriter:
             "frame": frame.to_json(),
             "layers": {name: list(ends) for name, ends in ranges.items()},
             "rows": {layer.name: len(layer) for layer in numbered},
-            "left_out": _totals(manifest.get("left_out", {}), left_out),
+            "left_out": manifest.get("left_out", {}) | left_out,
             **({"cut": cut} if cut else {}),
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
@@ -226,11 +226,6 @@ def _bytes(layer: Layer) -> int:
         texts = values.dtype.kind in "USO"
         size += sum(len(str(value).encode()) for value in values.tolist()) if texts else values.nbytes
     return size
-
-
-def _totals(*counts: Mapping[str, int]) -> dict[str, int]:
-    """Sums by name."""
-    return {name: sum(part.get(name, 0) for part in counts) for name in {k: None for c in counts for k in c}}
 
 
 def _only_kept(

@@ -50,26 +50,13 @@ _SOURCES = (
     MapSourceKind(
         name="osm",
         gives="map",
-        suffixes=(
-            ".osm",
-            ".osm.gz",
-            ".osm.bz2",
-            ".osm.pbf",
-            ".o5m",
-            ".json",
-            ".json.gz",
-            ".json.bz2",
-        ),
+        suffixes=(".osm", ".osm.gz", ".osm.bz2", ".osm.pbf", ".o5m", ".json", ".json.gz", ".json.bz2"),
         reader="files:read_osm",
         licence="ODbL-1.0",
         attribution=_OSM,
     ),
     MapSourceKind(
-        name="overpass",
-        gives="map",
-        reader="network:fetch_bbox",
-        licence="ODbL-1.0",
-        attribution=_OSM,
+        name="overpass", gives="map", reader="network:fetch_bbox", licence="ODbL-1.0", attribution=_OSM
     ),
     MapSourceKind(
         name="terrain-tiles",
@@ -88,11 +75,7 @@ _SOURCES = (
     ),
 )
 
-SOURCES: Registry[MapSourceKind] = Registry(
-    "source",
-    {row.name: row for row in _SOURCES},
-    error=InputError,
-)
+SOURCES: Registry[MapSourceKind] = Registry("source", {row.name: row for row in _SOURCES}, error=InputError)
 """All sources by name."""
 
 _LAYERS: dict[str, tuple[Callable[[Tags], bool], frozenset[str]]] = {

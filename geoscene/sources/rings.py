@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from geoscene.geometry.polylines import cross
 from geoscene.sources.data import METRES_PER_DEGREE, Bounds
 from geoscene.typing import Bools, Float, Ints
 
@@ -53,17 +54,13 @@ def is_tangled(ring: Float) -> bool:
         p, q = a[k], b[k]
         across = _side(p, q, points=a) * _side(p, q, points=b) < 0
         c, d = a[across], b[across]
-        crossings += int((_cross(d - c, p - c) * _cross(d - c, q - c) < 0).sum())
+        crossings += int((cross(d - c, p - c) * cross(d - c, q - c) < 0).sum())
     return crossings / len(some) * len(a) / 2 > _CROSSINGS
-
-
-def _cross(u: Float, v: Float) -> Float:
-    return u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
 
 
 def _side(p: Float, q: Float, *, points: Float) -> Float:
     """Positive (n,) for points left of the line from p to q, negative for those right of it."""
-    return _cross(np.broadcast_to(q - p, points.shape), points - p)
+    return cross(np.broadcast_to(q - p, points.shape), points - p)
 
 
 def segments_of(nodes: Ints) -> Ints:

@@ -60,22 +60,21 @@ the least number of its bends and ends."""
 
 
 @dataclass(frozen=True, slots=True)
-class Fittings:
-    """Bodies in a tunnel piece.
+class Built:
+    """A piece, or bodies in it, as a mesh.
 
-    mesh      : of all bodies
-    equipment : (m,) bool, faces of lamps, signs, jet fans and cable trays
-    counts    : how many there are of each kind
+    equipment : (m,) bool, faces of a tunnel's equipment: lamps, signs, jet fans and cable trays
+    guessed   : how many guessed parts of each kind it has
     """
 
     mesh: Mesh
     equipment: Bools
-    counts: dict[str, int]
+    guessed: dict[str, int]
 
 
 def tunnel_fittings(
     table: Structures, k: int, *, tube: Mesh, driven: shapely.Geometry, equipment: bool
-) -> Fittings:
+) -> Built:
     """Ribs and portals of tunnel piece ``k``, with ``equipment`` also lamps, signs, jet fans and cable trays.
 
     tube   : the piece's own solid; what would cross it, or something before it in this order, is left out
@@ -91,10 +90,8 @@ def tunnel_fittings(
     clear = _clear(tube, bodies)
     bodies, kind = bodies.take(clear), kind[clear]
     counts = zip(made, np.bincount(kind, minlength=len(made)).tolist(), strict=True)
-    return Fittings(
-        bodies.mesh,
-        np.repeat(kind >= lining, bodies.size),
-        {name: count for name, count in counts if count},
+    return Built(
+        bodies.mesh, np.repeat(kind >= lining, bodies.size), {name: count for name, count in counts if count}
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.geometry.polylines import cross
 from geoscene.ground.faces import distinct_places
 from geoscene.typing import Bools, Float, Ints
 
@@ -107,9 +108,7 @@ def without_slivers(plan: LayerTriangulation) -> LayerTriangulation:
 def _twice_areas(plan: LayerTriangulation) -> Float:
     """Twice the area (m,) of each triangle; negative if clockwise."""
     a, b, c = (plan.xy[plan.faces[:, k]] for k in range(3))
-    (ux, uy), (vx, vy) = (b - a).T, (c - a).T
-    twice: Float = ux * vy - uy * vx
-    return twice
+    return cross(b - a, c - a)
 
 
 def raise_shell(plan: LayerTriangulation, levels: Float, *, solid: Bools) -> Shell:

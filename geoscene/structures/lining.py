@@ -131,7 +131,8 @@ def ribs(table: Structures, k: int, *, driven: shapely.Geometry) -> Bodies:
     stations, _ = stations_every(table, k, spacing=form.spacing)
     length = polylines.length(table.line[k])
     stations = stations[(stations > form.width) & (stations < length - form.width)]
-    for others, room in ((mouths(table, k), 1.5), (_niches_along(table, k), NICHE_WIDTH / 2 + form.width)):
+    niches = niche_stations(table, k)[0] if has_walkway(table, k) else np.empty(0)
+    for others, room in ((mouths(table, k), 1.5), (niches, NICHE_WIDTH / 2 + form.width)):
         stations = stations[(np.abs(stations[:, None] - others) > room).all(axis=1)]
     return _frames(table, k, stations=stations, size=(form.width, form.depth), driven=driven)
 
@@ -142,17 +143,8 @@ def portals(table: Structures, k: int, *, driven: shapely.Geometry) -> Bodies:
     return _frames(table, k, stations=mouths(table, k), size=(PORTAL_WIDTH, depth), driven=driven)
 
 
-def _niches_along(table: Structures, k: int) -> Float:
-    return niche_stations(table, k)[0] if has_walkway(table, k) else np.empty(0)
-
-
 def _frames(
-    table: Structures,
-    k: int,
-    *,
-    stations: Float,
-    size: tuple[float, float],
-    driven: shapely.Geometry,
+    table: Structures, k: int, *, stations: Float, size: tuple[float, float], driven: shapely.Geometry
 ) -> Bodies:
     """A frame of two posts and a beam across the tunnel at each station.
 

@@ -55,11 +55,7 @@ class Sheets:
 
     def apart(self, one: int, two: int) -> bool:
         """Whether two pieces overlap in plan without sharing a carriageway anywhere."""
-        return _pair(one, two) in self.parted and two not in self.near[one]
-
-
-def _pair(one: int, two: int) -> Pair:
-    return min(one, two), max(one, two)
+        return (min(one, two), max(one, two)) in self.parted and two not in self.near[one]
 
 
 def find_sheets(polygon: NDArray[np.object_], around: NDArray[np.object_], *, tunnel: Bools) -> Sheets:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import shapely
@@ -13,7 +12,7 @@ from geoscene.classes import Class, materials
 from geoscene.geometry import polylines
 from geoscene.geometry.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
 from geoscene.structures.contact import tunnel_roof
-from geoscene.structures.fittings import tunnel_fittings
+from geoscene.structures.fittings import Built, tunnel_fittings
 from geoscene.structures.layered import SIDE, LayerTriangulation, Shell, cut_plan, raise_shell
 from geoscene.structures.lining import NICHE, WALKWAY, Lining, read_lining
 from geoscene.structures.table import StructureOptions, Structures, slopes_across, surface_heights
@@ -34,19 +33,6 @@ def structure_meshes(
     """The meshes of `built_structures`."""
     solids = built_structures(table, rows, height=height, openings=openings, options=options)
     return [built.mesh for built in solids]
-
-
-@dataclass(frozen=True, slots=True)
-class Built:
-    """A piece as a mesh.
-
-    equipment : (m,) bool, faces of a tunnel's equipment
-    guessed   : how many guessed parts of each kind it has
-    """
-
-    mesh: Mesh
-    equipment: Bools
-    guessed: dict[str, int]
 
 
 def built_structures(
@@ -114,7 +100,7 @@ def _solid(
     fittings = tunnel_fittings(table, k, tube=body, driven=lining.driven, equipment=options.equipment)
     areas = {"walkways": lining.walkway, "niches": lining.niches}
     parts = {name: 0 if area.is_empty else len(shapely.get_parts(area)) for name, area in areas.items()}
-    guessed = {name: count for name, count in (parts | fittings.counts).items() if count}
+    guessed = {name: count for name, count in (parts | fittings.guessed).items() if count}
     mesh = concatenate([body, fittings.mesh])
     return Built(mesh, np.concatenate([plain, fittings.equipment]), guessed)
 

@@ -103,9 +103,9 @@ def connect(address: str) -> Iterator[DaskCluster]:
     try:
         client = distributed.Client(address, timeout=_SECONDS, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
+        line = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"`scheduler` {address}: no Dask scheduler answers there ({_first_line(error)}); start one with:"
-            " dask scheduler"
+            f"`scheduler` {address}: no Dask scheduler answers there ({line}); start one with: dask scheduler"
         ) from error
     with client:
         try:
@@ -120,7 +120,3 @@ def connect(address: str) -> Iterator[DaskCluster]:
 def _worker_sees(paths: Sequence[Path]) -> tuple[str, str, list[str]]:
     """Version of this package, digest of its sources, and digests of files; run by workers."""
     return __version__, sources_digest("geoscene"), [file_digest(path) for path in paths]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

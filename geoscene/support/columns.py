@@ -59,6 +59,24 @@ def _fields_of(table: type[Any]) -> tuple[str, ...]:
     return tuple(field.name for field in fields(table))
 
 
+def nth(sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Position (n,) of each row in its group, given the sizes of groups."""
+    return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+
+
+def squares_between(
+    low: NDArray[np.int64], high: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns and rows (k, 2) of the squares of a grid from those at one corner of boxes (n, 2) to the other.
+
+    Returns also the box (k,) of each.
+    """
+    span = high - low + 1
+    box = np.repeat(np.arange(len(low)), span.prod(axis=1))
+    down, across = np.divmod(nth(span.prod(axis=1)), span[box, 0])
+    return low[box] + np.stack([across, down], axis=1), box
+
+
 def row_blocks(count: int, size: int, *, overlap: int = 0) -> Iterator[slice]:
     """Slices of ``size`` rows, and ``overlap`` of the next, that cover ``count``; an empty one for none."""
     for first in range(0, max(count, 1), size):
@@ -69,10 +87,7 @@ def write_columns(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]
     """Write columns as CSV with a header; floats as the shortest text that reads back the same value."""
     arrays = {name: np.asarray(column) for name, column in columns.items()}
     most = max((len(array) for array in arrays.values()), default=0)
-    write_blocks(
-        path,
-        ({name: array[rows] for name, array in arrays.items()} for rows in table_blocks(most)),
-    )
+    write_blocks(path, ({name: array[rows] for name, array in arrays.items()} for rows in table_blocks(most)))
 
 
 def table_blocks(count: int) -> Iterator[slice]:

@@ -41,10 +41,7 @@ _unliteral: Any = types.unliteral
 Function = TypeVar("Function", bound=Callable[..., Any])
 _PACKAGES = ("geoscene", "lidar")
 _V3 = ("avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
-LEVELS = {
-    "x86-64-v4": (*_V3, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
-    "x86-64-v3": _V3,
-}
+LEVELS = {"x86-64-v4": (*_V3, "avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"), "x86-64-v3": _V3}
 """Levels of x86-64 (System V ABI, AMD64 supplement, section 3.1.1) and what a processor needs for each, best
 first; a processor with less gets code of its own."""
 

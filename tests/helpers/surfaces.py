@@ -1,8 +1,23 @@
 """Checks of surfaces that are made tile by tile."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import shapely
+
+from geoscene.classes import Class
+from geoscene.ground.partition import Partition, partition_tile, plan_ground
+
+
+def partition(extent, layers, *, tile_size=250.0, lines=0.0, base=(Class.TERRAIN, "soil"), tiles=None):
+    """The cells of the whole extent, or of the chosen tiles, in one table; options as in `plan_ground`."""
+    plan = plan_ground(extent, layers, tile_size=tile_size, lines=lines, base=base)
+    chosen = [(int(i), int(j)) for i, j in plan.tiles] if tiles is None else list(tiles)
+    parts = [partition_tile(plan, i, j=j) for i, j in chosen]
+    names = [f.name for f in fields(Partition) if f.name != "slivers"]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return Partition(**columns, slivers=sum(part.slivers for part in parts))
 
 
 def edge_counts(faces):

@@ -10,8 +10,9 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.facades.description import BLANK, DOOR, GATE, depths, panels
-from geoscene.buildings.facades.walls import Elevations, FacadeCells, nth
+from geoscene.buildings.facades.walls import Elevations, FacadeCells
 from geoscene.ground.terrain import base_heights
+from geoscene.support.columns import nth
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Ints
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.buildings.facades.attached import Attached, attach, without_touching
 from geoscene.buildings.facades.description import (
@@ -20,8 +19,9 @@ from geoscene.buildings.facades.description import (
 from geoscene.buildings.facades.doors import Sheet, facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.solids import are_simple
-from geoscene.buildings.facades.walls import Elevations, find_walls, nth
+from geoscene.buildings.facades.walls import Elevations, find_walls
 from geoscene.geometry.mesh import Mesh
+from geoscene.support.columns import nth
 from geoscene.support.splitmix import uniform_at
 from geoscene.typing import Bools, Float, Height, Ints
 
@@ -107,7 +107,8 @@ def _choose(at: Elevations, *, guess: bool) -> tuple[Chosen, Attached]:
     mapped = _put_shops(sheet, at, facing=facing) | put_mapped_doors(sheet, at)
     put_guessed_doors(sheet, at, facing=facing)
     parts = attach(sheet, at, facing=facing, guess=guess)
-    place = nth(_sizes(at.walls.feature))[wall] * 65536 + cells.storey * 256 + cells.column
+    sizes = np.unique(at.walls.feature, return_counts=True)[1]
+    place = nth(sizes)[wall] * 65536 + cells.storey * 256 + cells.column
     draw = uniform_at(styles.seed[wall], place, count=2, seed=1)
     closed = (sheet.kind == WINDOW) & (draw[0] < styles.closed[wall])
     counts = {name: int((sheet.kind == code).sum()) for name, code in NAMES.items()} | mapped | parts.counts
@@ -163,9 +164,3 @@ def _fronts_of_shops(at: Elevations, room: Ints) -> list[Ints]:
             own = own[np.hypot(*(place[own] - place[nearest]).T) <= _FRONT]
         fronts.append(room[own])
     return fronts
-
-
-def _sizes(sorted_keys: NDArray[np.integer]) -> Ints:
-    """Sizes of the runs of equal keys."""
-    first = np.flatnonzero(np.diff(sorted_keys, prepend=-1))
-    return np.diff(first, append=len(sorted_keys)).astype(np.int64)

@@ -13,7 +13,7 @@ from geoscene.buildings.facades.description import Openings, WallRelief
 from geoscene.buildings.shells import triangulate
 from geoscene.geometry.mesh import DOOR, WALL, WINDOW, Mesh, concatenate
 from geoscene.geometry.watertight import edge_uses, weld
-from geoscene.support.columns import Columns
+from geoscene.support.columns import Columns, nth
 from geoscene.typing import Bools, Float, Ints
 
 _OF_WALL = 255
@@ -74,9 +74,9 @@ class _Placed(Columns):
         facades = relief.facades
         sizes = facades.grid.prod(axis=1).astype(np.int64)
         wall = np.repeat(np.arange(len(facades)), sizes)
-        nth = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-        row, column = np.divmod(nth, facades.grid[wall, 0])
-        kind = relief.cells[facades.first[wall] + nth].astype(np.int64)
+        place = nth(sizes)
+        row, column = np.divmod(place, facades.grid[wall, 0])
+        kind = relief.cells[facades.first[wall] + place].astype(np.int64)
         up = np.where(row > 0, facades.ground[wall] + (row - 1) * facades.cell[wall, 1], 0.0)
         corner = facades.start[wall] + np.column_stack([column * facades.cell[wall, 0], up])
         some = kind >= 0
@@ -225,7 +225,7 @@ def _insets(mesh: Mesh, relief: WallRelief, *, cells: _Placed, templates: list[_
     first = np.cumsum(sizes) - sizes
     count = sizes[cells.kind]
     of = np.repeat(np.arange(len(cells)), count)
-    at = first[cells.kind[of]] + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    at = first[cells.kind[of]] + nth(count)
     corners = np.concatenate([np.empty((0, 3, 3)), *(t.corners for t in templates)])[at]
     material = np.concatenate([np.empty(0, np.uint8), *(t.material for t in templates)])[at]
     color = np.concatenate([np.empty((0, 3), np.uint8), *(t.color for t in templates)])[at]

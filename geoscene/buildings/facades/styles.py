@@ -211,9 +211,7 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
     panel = np.where(ribbon, 0.0, np.round(depth[:, 0] + (depth[:, 1] - depth[:, 0]) * draw[6], 2))
     margin = np.where(ribbon, 0.01, 0.1)
     margin = np.minimum(margin, np.maximum((bay - width) / 2 - 0.01, 0.0))
-    pick = np.array(
-        [usual[t]["bars"][int(d * len(usual[t]["bars"]))] for t, d in _each(type_, draw[7])], np.int64
-    )
+    pick = np.array(_picked([usual[TYPES[t]]["bars"] for t in type_.tolist()], draw[7]), np.int64)
     light = draw[8] < 0.65
     metal = ribbon | np.isin(type_, [TYPES.index(name) for name in ("hall", "garage", "parking", "tower")])
     paint = np.where(metal, "metal", np.where(light, "white", "dark"))
@@ -244,14 +242,14 @@ def choose_styles(buildings: Buildings, tags: Mapping[str, Tags]) -> Styles:
         frame=np.where(ribbon, 0.04, 0.06),
         bars=pick.reshape(-1, 2),
         closed=one("closed", 13),
-        door=_pairs("door", type_),
-        gate=_pairs("gate", type_),
-        shop=shop_tag | (draw[14] < _shares("shop", type_)),
+        door=_usual("door", type_),
+        gate=_usual("gate", type_),
+        shop=shop_tag | (draw[14] < _usual("shop", type_)),
         shop_tagged=shop_tag,
         deep=type_ == TYPES.index("parking"),
-        balcony=np.where(balcony != "", balcony == "yes", draw[15] < _shares("balcony", type_)),
+        balcony=np.where(balcony != "", balcony == "yes", draw[15] < _usual("balcony", type_)),
         balcony_tagged=balcony != "",
-        cornice=draw[16] < _shares("cornice", type_),
+        cornice=draw[16] < _usual("cornice", type_),
         trim=np.where(panel > 0, materials()["stone"].code, 0).astype(np.uint8),
         frames=np.where(metal, materials()["metal"].code, materials()["wood"].code).astype(np.uint8),
         colors=colors,
@@ -315,15 +313,7 @@ def _round_size(value: Float) -> Float:
     return np.round(np.floor(value * 20.0 + 1e-6) / 20.0, 2)
 
 
-def _each(type_: Ints, draw: Float) -> list[tuple[str, float]]:
-    return [(TYPES[t], d) for t, d in zip(type_.tolist(), draw.tolist(), strict=True)]
-
-
-def _pairs(name: str, type_: Ints) -> Float:
-    return np.array([usual_facades()[t][name] for t in TYPES], float)[type_]
-
-
-def _shares(name: str, type_: Ints) -> Float:
+def _usual(name: str, type_: Ints) -> Float:
     return np.array([usual_facades()[t][name] for t in TYPES], float)[type_]
 
 
@@ -340,6 +330,9 @@ def _yes_or_no(text: str) -> str:
 
 def _paints(names: NDArray[np.str_], draw: Float) -> NDArray[np.uint8]:
     """A colour (n, 3) of each name."""
-    shades = [_PAINTS[name] for name in names.tolist()]
-    chosen = [some[int(d * len(some))] for some, d in zip(shades, draw.tolist(), strict=True)]
-    return np.array(chosen, np.uint8).reshape(-1, 3)
+    return np.array(_picked([_PAINTS[name] for name in names.tolist()], draw), np.uint8).reshape(-1, 3)
+
+
+def _picked(choices: list[Any], draw: Float) -> list[Any]:
+    """One of each list of choices."""
+    return [some[int(d * len(some))] for some, d in zip(choices, draw.tolist(), strict=True)]

@@ -12,7 +12,7 @@ from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.styles import Styles
 from geoscene.geometry.mesh import WALL, Mesh
 from geoscene.geometry.watertight import edge_uses, weld
-from geoscene.support.columns import Columns
+from geoscene.support.columns import Columns, nth
 from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Height, Ints
 
@@ -152,10 +152,7 @@ def _polygons(walls: FacadeWalls, corners: Float, *, wall: Ints, area: Float) ->
     of = wall[rows]
     flat = corners[rows, :, :2] - walls.foot[of, None, :2]
     uv = np.stack(
-        [
-            np.einsum("ijk,ik->ij", flat, walls.tangent[of]),
-            corners[rows, :, 2] - walls.foot[of, 2, None],
-        ],
+        [np.einsum("ijk,ik->ij", flat, walls.tangent[of]), corners[rows, :, 2] - walls.foot[of, 2, None]],
         axis=2,
     )
     pieces = shapely.polygons(np.round(uv, 4))
@@ -345,11 +342,6 @@ def _cells(walls: FacadeWalls, grids: Grids, *, styles: Styles, height: Height |
         before[wall] + column,
         _ground(walls, grids, of=of, middle=middle, height=height),
     )
-
-
-def nth(sizes: Ints) -> Ints:
-    """Position (n,) of each row in its group, given the sizes of groups."""
-    return np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
 
 
 def _ground(walls: FacadeWalls, grids: Grids, *, of: Ints, middle: Float, height: Height | None) -> Float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 import shapely.affinity
-from helpers.surfaces import assert_one_surface, welded
+from helpers.surfaces import assert_one_surface, partition, welded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
@@ -20,7 +20,6 @@ from geoscene.ground import (
     ground_tile,
     ground_tiles,
     join_tiles,
-    partition,
     partition_tile,
     plan_ground,
     triangulate,

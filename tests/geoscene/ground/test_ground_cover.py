@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import shapely
+from helpers.surfaces import partition
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
@@ -12,7 +13,6 @@ from geoscene.ground import (
     building_pads,
     ground_tile,
     landcover,
-    partition,
     plan_ground,
     water_levels,
 )
