@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geoscene.support.lazy import lazily, register_previews
+from geoscene.support.registry import lazily, register_previews
 
 if TYPE_CHECKING:
     from geoscene.export import export_scene as export_scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from geoscene import __version__ as __version__
-from geoscene.support.lazy import lazily, register_previews
+from geoscene.support.registry import lazily, register_previews
 
 if TYPE_CHECKING:
     from lidar.dataset.formats import read_cloud as read_cloud

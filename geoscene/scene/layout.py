@@ -23,7 +23,7 @@ from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.support.digests import digest, file_digest, value_digest
 from geoscene.support.files import write_atomically
-from geoscene.support.lazy import Previewed
+from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES

@@ -14,7 +14,7 @@ from geoscene.sources.registry import SOURCES as SOURCES
 from geoscene.sources.registry import credits_of as credits_of
 from geoscene.sources.registry import merge_sources as merge_sources
 from geoscene.sources.registry import read_source as read_source
-from geoscene.support.lazy import lazily
+from geoscene.support.registry import lazily
 
 if TYPE_CHECKING:
     from geoscene.sources.elevation import TileServer as TileServer

@@ -9,10 +9,19 @@ from typing import Any
 import numpy as np
 import shapely
 
-from geoscene.sources.data import Area, Bounds, Tags
+from geoscene.sources.data import (
+    NOISE,
+    Area,
+    Bounds,
+    Tags,
+    area_tags,
+    is_area,
+    is_building,
+    is_open_area,
+    kind_of,
+)
 from geoscene.sources.elements import Elements, Members
 from geoscene.sources.rings import RingMember, assemble, close_cut_ring, is_tangled, polygons_of
-from geoscene.sources.tags import NOISE, area_tags, is_area, is_building, is_open_area, kind_of
 from geoscene.support.problems import Problem
 from geoscene.typing import Float, Ints
 

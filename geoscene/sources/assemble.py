@@ -7,10 +7,19 @@ import shapely
 
 from geoscene.errors import SourceNotFoundError
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
-from geoscene.sources.data import Bounds, OsmData, Relation, TaggedNode, Way
+from geoscene.sources.data import (
+    Bounds,
+    OsmData,
+    Relation,
+    TaggedNode,
+    Way,
+    has_meaning,
+    is_area,
+    is_line,
+    kind_of,
+)
 from geoscene.sources.elements import UNITS, Elements
 from geoscene.sources.extent import checked_bounds, locate, near_extent
-from geoscene.sources.tags import has_meaning, is_area, is_line, kind_of
 from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Ints
 

@@ -1,4 +1,4 @@
-"""The data of a map: features with their tags as mapped, in longitude and latitude."""
+"""Features of a map extract as data, and what their tags say: area or line, and the kind."""
 
 from __future__ import annotations
 
@@ -20,6 +20,82 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 
 METRES_PER_DEGREE = 111_195.0
 """Of latitude, on a sphere of 6371 km, the mean radius of the Earth (IUGG)."""
+
+_ALL_VALUES: frozenset[str] = frozenset()
+
+NOISE = frozenset(
+    {"attribution", "created_by", "fixme", "FIXME", "note", "odbl", "source", "source_ref", "todo"}
+)
+"""Keys that describe the mapping, not the object; an object with only these counts as untagged."""
+
+_NATURAL_LINES = frozenset(
+    {"arch", "arete", "cliff", "coastline", "earth_bank", "gully", "ridge", "tree_row", "valley"}
+)
+
+AREA_KEYS: dict[str, tuple[bool, frozenset[str]]] = {
+    # key: (True, values that are lines) or (False, the only values that are areas)
+    "aeroway": (True, frozenset({"jet_bridge", "parking_position", "runway", "taxiway"})),
+    "amenity": (True, frozenset({"bench", "weighbridge"})),
+    "area:highway": (True, _ALL_VALUES),
+    "boundary": (False, frozenset({"forest", "hazard", "national_park", "protected_area"})),
+    "building": (True, _ALL_VALUES),
+    "building:part": (True, _ALL_VALUES),
+    "club": (True, _ALL_VALUES),
+    "craft": (True, _ALL_VALUES),
+    "emergency": (True, frozenset({"designated", "destination", "official", "private", "yes"})),
+    "golf": (True, frozenset({"cartpath", "hole", "path"})),
+    "healthcare": (True, _ALL_VALUES),
+    "highway": (False, frozenset({"elevator", "escape", "platform", "rest_area", "services"})),
+    "historic": (True, _ALL_VALUES),
+    "indoor": (True, frozenset({"corridor", "wall"})),
+    "landuse": (True, _ALL_VALUES),
+    "leisure": (True, frozenset({"slipway", "track"})),
+    "man_made": (
+        True,
+        frozenset(
+            {
+                "breakwater",
+                "crane",
+                "cutline",
+                "dyke",
+                "embankment",
+                "goods_conveyor",
+                "groyne",
+                "pier",
+                "pipeline",
+            }
+        ),
+    ),
+    "military": (True, frozenset({"trench"})),
+    "natural": (True, _NATURAL_LINES),
+    "office": (True, _ALL_VALUES),
+    "place": (True, _ALL_VALUES),
+    "power": (
+        False,
+        frozenset({"compensator", "converter", "generator", "plant", "substation", "transformer"}),
+    ),
+    "public_transport": (True, frozenset({"platform", "stop_position"})),
+    "railway": (False, frozenset({"platform", "roundhouse", "station", "traverser", "turntable", "wash"})),
+    "ruins": (True, _ALL_VALUES),
+    "shop": (True, _ALL_VALUES),
+    "tourism": (True, frozenset({"artwork", "attraction"})),
+    "water": (True, _ALL_VALUES),
+    "waterway": (False, frozenset({"boatyard", "dam", "dock", "fuel", "riverbank"})),
+}
+"""Tags that make a closed way an area if it has no ``area`` tag.
+
+After the lists that the OpenStreetMap wiki ("Overpass turbo/Polygon Features") and the id-area-keys project
+keep. Departures: piers, breakwaters, platforms and attractions are areas only with ``area=yes`` or another
+area key, because their closed ways are often lines around something; barriers never are without it.
+"""
+
+LINE_KEYS = (
+    "aerialway", "aeroway", "barrier", "golf", "highway", "leisure", "man_made", "natural", "power",
+    "railway", "waterway",
+)  # fmt: skip
+"""Keys whose values are lines unless `AREA_KEYS` makes them areas."""
+
+_NO = frozenset({"no", "false", "0"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,3 +215,69 @@ class OsmData:
         for relation in self.relations:
             digest.update(repr((relation.osm_id, sorted(relation.tags.items()), relation.members)).encode())
         return digest.hexdigest()[:20]
+
+
+def has_meaning(tags: Tags) -> bool:
+    """Whether any tag describes the object itself."""
+    return any(key not in NOISE for key in tags)
+
+
+def area_tags(tags: Tags) -> Tags:
+    """The tags that make a closed way or a multipolygon an area."""
+    out = {}
+    for key, value in tags.items():
+        rule = AREA_KEYS.get(key)
+        if rule is not None and value not in _NO and (value not in rule[1] if rule[0] else value in rule[1]):
+            out[key] = value
+    return out
+
+
+def is_building(tags: Tags) -> bool:
+    """Whether the tags are those of a building or of a part of one."""
+    return tags.get("building", "no") not in _NO or tags.get("building:part", "no") not in _NO
+
+
+def is_area(tags: Tags) -> bool:
+    """Whether a closed way with these tags is an area, by ``area``, else by `AREA_KEYS`."""
+    stated = tags.get("area")
+    if stated == "yes" or is_building(tags):
+        return True
+    return stated != "no" and bool(area_tags(tags))
+
+
+def is_line(tags: Tags) -> bool:
+    """Whether a closed way is a line too: a fenced playground is both its ground and its fence."""
+    if tags.get("area") == "yes":
+        return False
+    found = area_tags(tags)
+    return any(tags.get(key, "no") not in _NO and key not in found for key in LINE_KEYS)
+
+
+def is_open_area(tags: Tags) -> bool:
+    """Whether a way with these tags must be closed, so that an open one is a defect."""
+    if is_building(tags):
+        return True
+    found = area_tags(tags)
+    if any(tags.get(key, "no") not in _NO and key not in found for key in LINE_KEYS):
+        return False
+    return tags.get("area") == "yes" or "landuse" in tags or "natural" in found
+
+
+def kind_of(tags: Tags, *, area: bool = False) -> str:
+    """The kind under which an object's problems are counted. ``area``: the object is known to be an area."""
+    if tags.get("building", "no") not in _NO:
+        return "building"
+    if tags.get("building:part", "no") not in _NO:
+        return "building-part"
+    if tags.get("natural") == "water" or tags.get("waterway") in {"riverbank", "dock"} or "water" in tags:
+        return "water"
+    found = area_tags(tags)
+    for key, kind in (
+        ("highway", "road"),
+        ("railway", "railway"),
+        ("barrier", "barrier"),
+        ("waterway", "waterway"),
+    ):
+        if tags.get(key, "no") not in _NO and key not in found and not (area and found):
+            return kind
+    return "area" if area or is_area(tags) else "line"

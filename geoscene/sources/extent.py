@@ -10,9 +10,8 @@ import shapely
 
 from geoscene.errors import InputError
 from geoscene.geometry.frames import beside
-from geoscene.sources.data import METRES_PER_DEGREE, Area, Bounds
+from geoscene.sources.data import METRES_PER_DEGREE, Area, Bounds, is_building, kind_of
 from geoscene.sources.elements import UNITS, Elements
-from geoscene.sources.tags import is_building, kind_of
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float
 

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.errors import InputError
-from geoscene.sources.data import Bounds, Credit, OsmData, Progress, Tags
-from geoscene.sources.tags import is_building
+from geoscene.sources.data import Bounds, Credit, OsmData, Progress, Tags, is_building
 from geoscene.support.registry import Registry, load, unknown_name
 
 

@@ -1,9 +1,9 @@
-"""Registries of objects by name, imported when they are used, and one message for unknown names."""
+"""Objects by name, imported when they are used: registries, names of packages, previews in notebooks."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any, Generic, TypeVar
@@ -12,6 +12,8 @@ T = TypeVar("T")
 
 _NEAR = 0.6
 """Least similarity of a name that is offered for a misspelt one, 0 to 1."""
+
+_PREVIEWS: dict[str, str] = {}
 
 
 def nearest(name: str, known: Collection[str]) -> str:
@@ -99,3 +101,42 @@ class Registry(Mapping[str, T], Generic[T]):
         for name in names:
             if name not in self._places:
                 raise self._error(unknown_name(self.what, name, known=self._places, removed=self.removed))
+
+
+def lazily(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """The ``__getattr__`` of a package that offers names of its modules.
+
+    homes : module in the package of each name, which must not be the name of a module
+    """
+
+    def named(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+
+    return named
+
+
+def register_previews(modules: Mapping[str, str]) -> None:
+    """Register the modules whose functions ``png`` and ``html`` draw an object, by ``module.Class``."""
+    _PREVIEWS.update(modules)
+
+
+class Previewed:
+    """Base of classes that notebooks show as a picture and a table of figures."""
+
+    __slots__ = ()
+
+    def _repr_png_(self) -> bytes:
+        """A picture from above, for notebooks."""
+        return bytes(_preview_of(type(self)).png(self))
+
+    def _repr_html_(self) -> str:
+        """The picture and a table of figures, for notebooks."""
+        return str(_preview_of(type(self)).html(self))
+
+
+def _preview_of(kind: type) -> Any:
+    """The module that draws objects of a class or of the first of its bases that has one."""
+    names = (f"{base.__module__}.{base.__qualname__}" for base in kind.__mro__)
+    return importlib.import_module(next(_PREVIEWS[name] for name in names if name in _PREVIEWS))

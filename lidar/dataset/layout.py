@@ -36,7 +36,7 @@ from geoscene.errors import reading
 from geoscene.geometry.frames import Frame
 from geoscene.support.digests import digest
 from geoscene.support.files import delete_leftovers, write_json
-from geoscene.support.lazy import Previewed
+from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS

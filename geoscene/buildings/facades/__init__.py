@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from geoscene.support.lazy import lazily
+from geoscene.support.registry import lazily
 
 if TYPE_CHECKING:
     from geoscene.buildings.facades.description import FacadeTable as FacadeTable

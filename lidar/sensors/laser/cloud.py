@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.support.columns import Columns
-from geoscene.support.lazy import Previewed
+from geoscene.support.registry import Previewed
 from lidar.errors import LidarError
 
 

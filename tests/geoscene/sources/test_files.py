@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources import OsmData, demo_path, read_osm
 from geoscene.sources.areas import is_multipolygon
-from geoscene.sources.tags import is_building
+from geoscene.sources.data import is_building
 from geoscene.support.problems import Problem
 
 ALL = [

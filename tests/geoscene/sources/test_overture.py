@@ -16,8 +16,8 @@ from geoscene.buildings import read_buildings
 from geoscene.errors import InputError, MissingExtraError, SourceNotFoundError
 from geoscene.geometry.frames import Frame
 from geoscene.sources import SOURCES, credits_of, demo_path, merge_sources, read_osm, read_source
+from geoscene.sources.data import is_building
 from geoscene.sources.registry import reader_of
-from geoscene.sources.tags import is_building
 
 BLOCK = "POLYGON ((24.940 60.166, 24.941 60.166, 24.941 60.167, 24.940 60.167, 24.940 60.166))"
 
