@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+from geoscene.uses import RELIEFS
 from lidar.parameters import value_text
 from lidar.raycast import PRECISIONS
 from lidar.sensors.camera.settings import CameraSettings
