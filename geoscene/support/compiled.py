@@ -29,6 +29,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
 
 from geoscene.support.optimised import OwnCompiler
+from geoscene.support.shortcuts import PartCompiler
 
 try:
     import fcntl
@@ -104,7 +105,7 @@ class _Part:
     @functools.cached_property
     def _compiled(self) -> Any:
         wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        return _njit(**wrappers, **self._options)(self._function)
+        return _njit(pipeline_class=PartCompiler, **wrappers, **self._options)(self._function)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Types of a call, for the caller's compilation; compiles the function for them.
