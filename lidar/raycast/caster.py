@@ -18,10 +18,9 @@ from lidar.raycast.device import CPU
 from lidar.raycast.device import device as warp_device
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, MeshInstances, check_mesh, middle, split
-from lidar.raycast.hits import Hits
+from lidar.raycast.hits import Hits, Refiner
 from lidar.raycast.library import library
 from lidar.raycast.rays import EXACTLY, beyond, free_rays, limit_rays, posed_rays, taken
-from lidar.raycast.refine import Refiner
 from lidar.raycast.scene import Float64Scene
 
 log = logging.getLogger(__name__)

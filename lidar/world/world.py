@@ -19,7 +19,7 @@ from geoscene.typing import Float
 from geoscene.uses import MESH
 from lidar.errors import InputError
 from lidar.raycast import Caster, Hits, MeshInstances
-from lidar.raycast.refine import Refiner
+from lidar.raycast.hits import Refiner
 from lidar.raycast.relief import (
     NO_WALLS,
     GroundRefiner,
@@ -272,7 +272,7 @@ class World:
     def _refiners(self) -> list[Refiner]:
         """Refiners of the loaded tiles: they intersect rays with the surfaces behind the planes of faces.
 
-        A kind of surface is one `lidar.raycast.refine.Refiner`. It finds its own faces by `Hits.face`, which
+        A kind of surface is one `lidar.raycast.hits.Refiner`. It finds its own faces by `Hits.face`, which
         is also the row in the table of surfaces of the world.
         """
         count = len(self.surfaces)

@@ -14,6 +14,7 @@ from geoscene.typing import Float
 from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inline
+from lidar.raycast.planes import OVER, beyond_plane, direction_of, origin_of
 from lidar.raycast.rays import share
 from lidar.raycast.relief.crossing import (
     COLUMNS,
@@ -36,7 +37,6 @@ from lidar.raycast.relief.crossing import (
     joints,
     level_of,
 )
-from lidar.raycast.relief.lines import OVER, beyond_plane, direction_of, origin_of
 from lidar.raycast.relief.roughness import kinds_of, roughness
 
 
@@ -75,7 +75,7 @@ def joined_ground(tables: Mapping[int, GroundTables], *, count: int) -> GroundTa
 
 
 class GroundRefiner:
-    """Refines hits on rough ground; see `lidar.raycast.refine`.
+    """Refines hits on rough ground; see `lidar.raycast.hits`.
 
     Rays with a footprint meet the mean of the surface over it: heights whose cells, in powers of two, are
     nearest to half of its length along the ground. Scattered rays near the border of two such levels take
@@ -89,7 +89,7 @@ class GroundRefiner:
         self._rough = roughness()
 
     def refine(self, rays: RayColumns, hits: Hits, *, threads: int) -> None:
-        """Change hits on rough ground in place, as `lidar.raycast.refine.Refiner.refine` describes."""
+        """Change hits on rough ground in place, as `lidar.raycast.hits.Refiner.refine` describes."""
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal
         tables, rough = self.tables, self._rough
 
@@ -100,7 +100,7 @@ class GroundRefiner:
         share(work, rays, threads=threads)
 
     def leave(self, rays: RayColumns, on: NDArray[np.int32], hits: Hits) -> Float:
-        """Follow rays that start below the plane of a face, as `lidar.raycast.refine.Refiner.leave` says."""
+        """Follow rays that start below the plane of a face, as `lidar.raycast.hits.Refiner.leave` says."""
         at = np.zeros(len(on))
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal
         _leave(self.tables, self._rough, rays, on, columns, at)

@@ -14,8 +14,8 @@ from geoscene.typing import Float
 from lidar.raycast.columns import RayColumns
 from lidar.raycast.hits import Hits
 from lidar.raycast.memory import inline
+from lidar.raycast.planes import beyond_plane, direction_of, origin_of
 from lidar.raycast.rays import share
-from lidar.raycast.relief.lines import beyond_plane, direction_of, origin_of
 from lidar.raycast.relief.march import (
     INFILL,
     OUT,
@@ -163,7 +163,7 @@ def join(tables: Sequence[WallTables], *, faces: Sequence[int], count: int) -> W
 
 
 class WallRefiner:
-    """Refines hits on walls of buildings by the openings of their facades; see `lidar.raycast.refine`.
+    """Refines hits on walls of buildings by the openings of their facades; see `lidar.raycast.hits`.
 
     tables : of the loaded tiles, with scene coordinates
     """
@@ -172,7 +172,7 @@ class WallRefiner:
         self.tables = tables
 
     def refine(self, rays: RayColumns, hits: Hits, *, threads: int) -> None:
-        """Change hits on walls in place, as `lidar.raycast.refine.Refiner.refine` describes."""
+        """Change hits on walls in place, as `lidar.raycast.hits.Refiner.refine` describes."""
         columns = hits.range, hits.face, hits.instance, hits.cosine, hits.normal
         tables = self.tables
 
@@ -183,7 +183,7 @@ class WallRefiner:
         share(work, rays, threads=threads)
 
     def leave(self, rays: RayColumns, on: NDArray[np.int32], hits: Hits) -> Float:
-        """Follow rays that start in an opening, as `lidar.raycast.refine.Refiner.leave` describes."""
+        """Follow rays that start in an opening, as `lidar.raycast.hits.Refiner.leave` describes."""
         at = np.zeros(len(on))
         _leave(self.tables, rays, on, (hits.range, hits.face, hits.instance, hits.cosine, hits.normal), at)
         return at
