@@ -13,7 +13,7 @@ from typing import Annotated, Any
 from cyclopts import Group, Parameter
 
 from geoscene.cli.program import OUTPUT, Out, Reporting, print_scene
-from geoscene.errors import InputError
+from geoscene.errors import InputError, need
 from geoscene.options import BuildOptions, BuildTradeoffOptions, CloudOptions, Degrees
 from geoscene.support.console import (
     SEVERAL,
@@ -253,6 +253,7 @@ def tradeoff(
     if options.elevation_tiles:
         raise InputError("`dem` tiles: not compared; give elevation files")
     if out is not None:
+        need("matplotlib", "plots")
         note_new_folder(out)
         if out.exists() and not report.overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")

@@ -1,26 +1,185 @@
-"""Charts of reports: scatter plots, curves of shares, shares with intervals."""
+"""Charts as PNG and SVG by matplotlib: panels of lines, rasters, scatter plots, curves and shares."""
 
 from __future__ import annotations
 
 import io
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import TYPE_CHECKING, Any
 
-from PIL import Image, ImageDraw, ImageFont
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from geoscene.drawing.axes import log_axis
-from geoscene.drawing.canvas import INK, Color, drawable
+from geoscene.errors import need
 
-GREY: Color = (205, 208, 214)
-"""Of ticks and grids."""
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes as Plot
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
-_CHOICE, _OTHER = (200, 60, 40), (60, 110, 180)
-_BAND = (250, 224, 160)
-_LEGEND = (
-    (_CHOICE, "no other setting is both cheaper and more exact"),
-    (_OTHER, "another setting is cheaper and at least as exact"),
+SUFFIXES: Mapping[str, dict[str, Any]] = {".png": {"Software": None}, ".svg": {"Date": None, "Creator": None}}
+"""Of files of figures, and the metadata that they are without, so that the same figure has the same bytes."""
+
+COLORS = (
+    *("#c83c28", "#3c6eb4", "#46965a", "#965aaa", "#dc9628", "#5a5a5a"),
+    *("#28a0aa", "#be6e8c", "#826e3c", "#6e8cdc", "#a0be3c", "#143c5a"),
 )
+"""Of lines, by rank."""
+
+_GREY, _INK, _BAND, _PUBLISHED = "#cdd0d6", "#1e2026", "#96b4dc", "#fae0a0"
+_STYLE: dict[str, Any] = {
+    "figure.dpi": 100,
+    "figure.constrained_layout.use": True,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "geoscene",
+    "image.interpolation": "none",
+    "image.composite_image": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 11,
+    "axes.edgecolor": _GREY,
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.xmargin": 0,
+    "grid.color": _GREY,
+    "legend.frameon": False,
+    "font.size": 10,
+}
+_BESIDE: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.02)}
+_DOTS: dict[str, Any] = {"marker": "o", "linestyle": "", "markerfacecolor": "white", "clip_on": False}
+_LEGEND = (
+    (True, COLORS[0], "no other setting is both cheaper and more exact"),
+    (False, COLORS[1], "another setting is cheaper and at least as exact"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Axes:
+    """Titles of a chart and its axes, and perhaps the texts of values of y."""
+
+    title: str
+    x: str
+    y: str
+    y_text: Callable[[float], str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A named line through points (n,), or dots if these are single values such as published ones.
+
+    A line is broken at points that are not finite. ``color`` is by its rank by default.
+    """
+
+    name: str
+    x: ArrayLike
+    y: ArrayLike
+    _: KW_ONLY
+    dots: bool = False
+    color: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ShadedBand:
+    """A named area between two values of y at each x, all (n,); broken where not finite."""
+
+    name: str
+    x: ArrayLike
+    low: ArrayLike
+    high: ArrayLike
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """Series on common axes; that of y is linear with 0 on it, or logarithmic with 0 at its lower end."""
+
+    axes: Axes
+    series: Sequence[Series]
+    log: bool = False
+    bands: Sequence[ShadedBand] = ()
+
+    def draw(self, plot: Plot) -> None:
+        """Draw the panel and its legend."""
+        for band in self.bands:
+            area: dict[str, Any] = {"color": _BAND, "alpha": 0.5, "linewidth": 0}
+            plot.fill_between(band.x, band.low, band.high, label=band.name, gid=band.name, **area)
+        least = -np.inf
+        if self.log:
+            ends = _ends_around([v for one in self.series for v in np.asarray(one.y)])
+            plot.set(yscale="log", ylim=ends)
+            least = ends[0]
+        else:
+            plot.axhline(0, color=_GREY)
+        for k, one in enumerate(self.series):
+            _draw_series(plot, replace(one, y=np.maximum(one.y, least)), color=COLORS[k % len(COLORS)])
+        _write_titles(plot, self.axes)
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """The colours of a raster's values, from violet to yellow or, ``turned``, from yellow to violet."""
+
+    title: str
+    low: float
+    high: float
+    log: bool = False
+    turned: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Raster:
+    """An image whose sides are values: of ``x`` from left to right, of ``y`` from bottom to top.
+
+    pixels : (h, w, 3) uint8, or values (h, w) of a scale, NaN for none
+    legend : names and colours, if it has no scale
+    square : whether units of x and y are equally long
+    lines  : over the image
+    """
+
+    axes: Axes
+    pixels: NDArray[Any]
+    x: tuple[float, float]
+    y: tuple[float, float]
+    scale: Scale | None = None
+    legend: Sequence[tuple[str, str]] = ()
+    square: bool = False
+    lines: Sequence[Series] = ()
+
+    def draw(self, plot: Plot) -> None:
+        """Draw the raster, its scale and its legend."""
+        options: dict[str, Any] = {"extent": (*self.x, *self.y), "aspect": "equal" if self.square else "auto"}
+        if (scale := self.scale) is not None:
+            options |= {"norm": "log" if scale.log else "linear", "vmin": scale.low, "vmax": scale.high}
+            options |= {"cmap": "viridis_r" if scale.turned else "viridis"}
+        image = plot.imshow(self.pixels, gid=self.axes.title, **options)
+        plot.grid(visible=False)
+        if scale is not None:
+            bar = plot.figure.colorbar(image, ax=plot, label=scale.title, shrink=0.9, aspect=12, format="%g")
+            if scale.log:
+                _mark_decades(bar.ax.yaxis)
+        for k, one in enumerate(self.lines):
+            _draw_series(plot, one, color=COLORS[k % len(COLORS)])
+        for name, color in self.legend:
+            plot.plot([], [], "s", color=color, markeredgecolor=_GREY, label=name)
+        _write_titles(plot, self.axes)
+
+
+def figure(parts: Sequence[Panel | Raster], *, size: tuple[int, int]) -> Figure:
+    """A figure of panels one below the other, each ``size`` (width, height) pixels."""
+    with _styled():
+        drawn = _blank(size[0], size[1] * len(parts))
+        for part, plot in zip(parts, drawn.subplots(len(parts), squeeze=False).flat, strict=True):
+            part.draw(plot)
+    return drawn
+
+
+def encode(drawn: Figure, suffix: str = ".png") -> bytes:
+    """A figure as a file with a suffix of `SUFFIXES`. In an SVG the ``id`` of a mark's group is its name."""
+    file = io.BytesIO()
+    with _styled():
+        drawn.savefig(file, format=suffix[1:], metadata=SUFFIXES[suffix])
+    return file.getvalue()
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,128 +194,62 @@ class ChartPoint:
     y_interval: tuple[float, float] | None = None
 
     @property
-    def xs(self) -> tuple[float, ...]:
-        """The value of x and the ends of its interval."""
-        return (self.x, *(self.x_interval or ()))
+    def x_ends(self) -> tuple[float, float]:
+        """Ends of the interval of x, which holds x."""
+        values = (self.x, *(self.x_interval or ()))
+        return min(values), max(values)
 
     @property
-    def ys(self) -> tuple[float, ...]:
-        """The value of y and the ends of its interval."""
-        return (self.y, *(self.y_interval or ()))
+    def y_ends(self) -> tuple[float, float]:
+        """Ends of the interval of y, which holds y."""
+        values = (self.y, *(self.y_interval or ()))
+        return min(values), max(values)
 
 
-@dataclass(frozen=True, slots=True)
-class Axes:
-    """Titles of a chart and its axes, and the texts of values of y."""
-
-    title: str
-    x: str
-    y: str
-    y_text: Callable[[float], str]
-
-
-def scatter(points: Sequence[ChartPoint], axes: Axes, *, width: int = 1100, height: int = 700) -> bytes:
+def scatter(points: Sequence[ChartPoint], axes: Axes) -> bytes:
     """A PNG of points with a legend, both axes logarithmic.
 
-    Values of 0 are drawn at the lower end, marked ``0``. Points whose names have no room are counted in the
-    legend.
+    Values of y of 0 are drawn at the lower end, marked ``0``. Points whose names have no room are counted in
+    the corner.
     """
-    picture = Image.new("RGB", (width, height), (255, 255, 255))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=15)
-    left, right, top, bottom = 90, width - 130, 96, height - 70
-    x_axis, y_axis = log_axis(x for p in points for x in p.xs), log_axis(y for p in points for y in p.ys)
-    nothing = any(y <= 0 for p in points for y in p.ys)
-
-    def across(value: float) -> float:
-        return left + (right - left) * x_axis.share(value)
-
-    def up(value: float) -> float:
-        low = bottom - 40 * nothing
-        return low + (top - low) * y_axis.share(value) if value > 0 else bottom
-
-    def text(place: tuple[float, float], words: str, *, anchor: str) -> None:
-        pen.text(
-            place, drawable(words), fill=INK, font=font, anchor=anchor, stroke_width=2, stroke_fill="white"
-        )
-
-    text((left, 16), axes.title, anchor="la")
-    text(((left + right) / 2, height - 16), axes.x, anchor="ms")
-    text((12, top - 10), axes.y, anchor="ls")
-    for value in x_axis.ticks():
-        pen.line((across(value), top, across(value), bottom), fill=GREY)
-        text((across(value), bottom + 8), f"{value:g}", anchor="mt")
-    for value in [*y_axis.ticks(), *[0.0] * nothing]:
-        pen.line((left, up(value), right, up(value)), fill=GREY)
-        text((left - 8, up(value)), axes.y_text(value), anchor="rm")
-    ordered = sorted(points, key=lambda p: (not p.best, p.x))
-    line = [(across(p.x), up(p.y)) for p in ordered if p.best]
-    if len(line) > 1:
-        pen.line(line, fill=_CHOICE, width=2)
-    for p in ordered:
-        u, v, color = across(p.x), up(p.y), _CHOICE if p.best else _OTHER
-        pen.line((across(min(p.xs)), v, across(max(p.xs)), v), fill=color)
-        pen.line((u, up(min(p.ys)), u, up(max(p.ys))), fill=color)
-        pen.ellipse((u - 4, v - 4, u + 4, v + 4), fill=color)
-    named: list[tuple[float, float, float, float]] = []
-    for p in ordered:
-        u, v = across(p.x), up(p.y)
-        for place, anchor in (((u + 8, v - 4), "ls"), ((u + 8, v + 4), "lt"), ((u - 8, v + 4), "rt")):
-            box = pen.textbbox(place, p.name, font=font, anchor=anchor)
-            outside = box[0] < left or box[2] > width
-            if not outside and not any(_overlap(box, other) for other in named):  # else the table has it
-                text(place, p.name, anchor=anchor)
-                named.append(box)
-                break
-    at = left
-    unnamed = len(ordered) - len(named)
-    for color, words in _LEGEND:
-        pen.ellipse((at, 44, at + 8, 52), fill=color)
-        text((at + 14, 48), words, anchor="lm")
-        at += 34 + int(pen.textlength(words, font=font))
-    if unnamed:
-        text((at, 48), f"{unnamed} without a name, see the table", anchor="lm")
-    return _png(picture)
+    with _styled():
+        drawn = _blank(1100, 700)
+        plot = drawn.subplots()
+        plot.set(xscale="log", xlim=_ends_around([v for p in points for v in p.x_ends]))
+        least, most = _ends_around([v for p in points for v in (p.y, *p.y_ends)])
+        if any(p.y_ends[0] <= 0 for p in points):
+            decade = 10 ** math.floor(math.log10(least))
+            plot.set_yscale("symlog", linthresh=decade, linscale=0.3)
+            plot.set_ylim(-decade / 2, most)
+        else:
+            plot.set(yscale="log", ylim=(least, most))
+        for best, color, words in _LEGEND:
+            some = sorted((p for p in points if p.best == best), key=lambda p: p.x)
+            x, y = [p.x for p in some], [p.y for p in some]
+            plot.plot(x, y, "o-" if best else "o", color=color, label=words)
+            plot.hlines(y, *np.reshape([p.x_ends for p in some], (-1, 2)).T, color=color, linewidth=1)
+            plot.vlines(x, *np.reshape([p.y_ends for p in some], (-1, 2)).T, color=color, linewidth=1)
+        for axis in (plot.xaxis, plot.yaxis):
+            _mark_decades(axis)
+        _write_titles(plot, axes)
+        plot.set_title(axes.title, pad=26)
+        plot.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2)
+        _write_names(drawn, plot, points=sorted(points, key=lambda p: (not p.best, p.x)))
+    return encode(drawn)
 
 
-COLORS: tuple[Color, ...] = (
-    *((200, 60, 40), (60, 110, 180), (70, 150, 90), (150, 90, 170), (220, 150, 40), (90, 90, 90)),
-    *((40, 160, 170), (190, 110, 140), (130, 110, 60), (110, 140, 220), (160, 190, 60), (20, 60, 90)),
-)
-"""Of lines, by rank."""
-
-
-def curves(
-    lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, mark: float, size: int = 560
-) -> bytes:
+def curves(lines: Mapping[str, Sequence[tuple[float, float]]], axes: Axes, *, mark: float) -> bytes:
     """A PNG of named lines of shares, both axes linear from 0 to 1, with a legend and the diagonal.
 
     mark : value of x at which a line stands
     """
-    left, top, bottom = 70, 70, size - 60
-    right = left + bottom - top
-    picture = Image.new("RGB", (right + 200, size), (255, 255, 255))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
-
-    def place(point: tuple[float, float]) -> tuple[float, float]:
-        return left + (right - left) * point[0], bottom + (top - bottom) * point[1]
-
-    pen.text((left, 14), axes.title, fill=INK, font=font)
-    pen.text(((left + right) / 2, size - 14), axes.x, fill=INK, font=font, anchor="ms")
-    pen.text((12, top - 12), axes.y, fill=INK, font=font, anchor="ls")
-    for value in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
-        pen.line((*place((value, 0)), *place((value, 1))), fill=GREY)
-        pen.line((*place((0, value)), *place((1, value))), fill=GREY)
-        pen.text((place((value, 0))[0], bottom + 6), f"{value:g}", fill=INK, font=font, anchor="mt")
-        pen.text((left - 8, place((0, value))[1]), axes.y_text(value), fill=INK, font=font, anchor="rm")
-    pen.line((*place((0, 0)), *place((1, 1))), fill=GREY, width=2)
-    pen.line((*place((mark, 0)), *place((mark, 1))), fill=INK, width=1)
-    for k, (name, points) in enumerate(lines.items()):
-        color = COLORS[k % len(COLORS)]
-        if len(points) > 1:
-            pen.line([place(point) for point in points], fill=color, width=2)
-        pen.line((right + 16, top + 10 + 20 * k, right + 36, top + 10 + 20 * k), fill=color, width=3)
-        pen.text((right + 44, top + 10 + 20 * k), name, fill=INK, font=font, anchor="lm")
-    return _png(picture)
+    series = [Series(name, *np.reshape(points, (-1, 2)).T) for name, points in lines.items()]
+    drawn = figure([Panel(axes, series)], size=(760, 560))
+    plot = drawn.axes[0]
+    plot.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    plot.axline((0, 0), slope=1, color=_GREY)
+    plot.axvline(mark, color=_INK, linewidth=1)
+    return encode(drawn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,42 +262,84 @@ class Span:
     published: tuple[float, float] | None = None
 
 
-def spans(rows: Sequence[Span], *, title: str, width: int = 1000) -> bytes:
+def spans(rows: Sequence[Span], *, title: str) -> bytes:
     """A PNG of shares from 0 to 1 with their intervals, one below the other, published bounds as bars."""
-    left, right, top = 330, width - 40, 70
-    picture = Image.new("RGB", (width, top + 26 * len(rows) + 50), (255, 255, 255))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=14)
-    bottom = top + 26 * len(rows)
-    pen.text((left, 14), title, fill=INK, font=font)
-    pen.rectangle((left, 42, left + 14, 54), fill=_BAND)
-    pen.text((left + 22, 48), "published", fill=INK, font=font, anchor="lm")
-
-    def across(part: float) -> float:
-        return left + (right - left) * part
-
-    for k, row in enumerate(rows):
-        v = top + 26 * k + 13
-        if row.published is not None:
-            low, high = map(across, row.published)
-            pen.rectangle((low - 2, v - 9, high + 2, v + 9), fill=_BAND)
-    for value in (0.0, 0.25, 0.5, 0.75, 1.0):
-        pen.line((across(value), top, across(value), bottom), fill=GREY)
-        pen.text((across(value), bottom + 8), f"{100 * value:g} %", fill=INK, font=font, anchor="mt")
-    for k, row in enumerate(rows):
-        v = top + 26 * k + 13
-        pen.text((left - 10, v), row.name, fill=INK, font=font, anchor="rm")
-        if math.isfinite(row.share):
-            pen.line((across(row.interval[0]), v, across(row.interval[1]), v), fill=_CHOICE, width=2)
-            pen.ellipse((across(row.share) - 4, v - 4, across(row.share) + 4, v + 4), fill=_CHOICE)
-    return _png(picture)
+    with _styled():
+        drawn = _blank(1000, 120 + 26 * len(rows))
+        plot = drawn.subplots()
+        plot.barh([0], [0], color=_PUBLISHED, label="published")
+        for k, row in enumerate(rows):
+            if row.published is not None:
+                low, high = row.published
+                plot.barh(k, high - low, 0.7, low, color=_PUBLISHED, edgecolor=_PUBLISHED, linewidth=4)
+            if math.isfinite(row.share):
+                plot.plot(row.interval, (k, k), color=COLORS[0])
+                plot.plot(row.share, k, "o", color=COLORS[0])
+        plot.set(xlim=(-0.01, 1.01), ylim=(len(rows) - 0.5, -0.5), title=title)
+        plot.set_yticks(range(len(rows)), [row.name for row in rows])
+        plot.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
+        plot.grid(visible=False, axis="y")
+        plot.legend(**_BESIDE)
+    return encode(drawn)
 
 
-def _png(picture: Image.Image) -> bytes:
-    file = io.BytesIO()
-    picture.save(file, "PNG")
-    return file.getvalue()
+def _styled() -> AbstractContextManager[None]:
+    """A context in which figures look as here, whatever the user's settings are."""
+    context: AbstractContextManager[None] = need("matplotlib.style", "plots").context(["default", _STYLE])
+    return context
 
 
-def _overlap(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
-    """Whether two boxes (left, top, right, bottom) overlap."""
-    return one[0] < other[2] and other[0] < one[2] and one[1] < other[3] and other[1] < one[3]
+def _blank(width: int, height: int) -> Figure:
+    drawn: Figure = need("matplotlib.figure", "plots").Figure(figsize=(width / 100, height / 100))
+    return drawn
+
+
+def _mark_decades(axis: Axis) -> None:
+    """Mark 1, 2 and 5 times powers of ten on a logarithmic axis."""
+    locator: Any = axis.get_major_locator()
+    locator.set_params(subs=(1, 2, 5))
+    axis.set_major_formatter("{x:g}")
+    axis.minorticks_off()
+
+
+def _ends_around(values: Sequence[float]) -> tuple[float, float]:
+    """Ends of a logarithmic axis around the positive ones of some values."""
+    known = [v for v in values if v > 0] or [1.0]
+    return 0.8 * min(known), 1.25 * max(known)
+
+
+def _draw_series(plot: Plot, one: Series, *, color: str) -> None:
+    kind: dict[str, Any] = (
+        {"marker": "o", "linestyle": "", "markerfacecolor": "white", "clip_on": False} if one.dots else {}
+    )
+    plot.plot(one.x, one.y, color=one.color or color, label=one.name, gid=one.name, **kind)
+
+
+def _write_titles(plot: Plot, axes: Axes) -> None:
+    """Write the titles, the values of y, and a legend beside the axes if something has a name."""
+    plot.set(title=axes.title, xlabel=axes.x, ylabel=axes.y)
+    if (text := axes.y_text) is not None:
+        plot.yaxis.set_major_formatter(lambda value, _: text(value))
+    if plot.get_legend_handles_labels()[0]:
+        plot.legend(**_BESIDE)
+
+
+def _write_names(drawn: Figure, plot: Plot, *, points: Sequence[ChartPoint]) -> None:
+    """Write the names of points that have room beside them, and the number of the others."""
+    drawn.draw_without_rendering()
+    frame = plot.get_window_extent()
+    taken: list[Bbox] = []
+    for point in points:
+        for side, down in (("left", "bottom"), ("left", "top"), ("right", "top")):
+            shift = (6 if side == "left" else -6, 3 if down == "bottom" else -3)
+            text = plot.annotate(
+                point.name, (point.x, point.y), shift, textcoords="offset points", ha=side, va=down
+            )
+            box = text.get_window_extent()
+            if frame.containsx(box.x0) and frame.containsx(box.x1) and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+            text.remove()
+    if unnamed := len(points) - len(taken):
+        words = f"{unnamed} without a name, see the table"
+        plot.text(1, 0, words, transform=plot.transAxes, ha="right", va="bottom")

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.drawing.charts import Axes, ChartPoint, scatter
-from geoscene.drawing.figures import metres, share, size
-from geoscene.drawing.report import Column, Page, ReportTable, table_of
+from geoscene.drawing.report import Column, Page, ReportTable, metres, share, size, table_of
 from geoscene.support.files import write_atomically, write_json
 from geoscene.tradeoff.engine import BuildRow, BuildTradeoff
 

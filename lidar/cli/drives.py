@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+from geoscene.errors import need
 from geoscene.options import CloudOptions
 from geoscene.support.console import (
     FAILURE,
@@ -323,6 +324,7 @@ def tradeoff(
     if options.scheduler:
         raise InputError("`scheduler`: costs are those of this machine; leave it out")
     if out is not None:
+        need("matplotlib", "plots")
         note_new_folder(out)
         if out.exists() and not report.overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")

@@ -8,6 +8,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from geoscene.errors import need
 from geoscene.support.console import Report, command_line, note_new_folder, progress_bar
 from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
@@ -62,6 +63,7 @@ def evaluate(
         if out is None:
             found = evaluate_trajectory(estimate, against, options=options, progress=progress)
         else:
+            need("matplotlib", "plots")
             note_new_folder(out)
             with report_folder(out, overwrite=report.overwrite) as folder:
                 found = evaluate_trajectory(estimate, against, options=options, out=folder, progress=progress)

@@ -5,21 +5,23 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from geoscene.drawing.canvas import Canvas
-from geoscene.drawing.charts import COLORS, Axes
-from geoscene.drawing.panels import Panel, Raster, Series, ShadedBand, figure
+from geoscene.drawing.charts import COLORS, Axes, Panel, Raster, Series, ShadedBand, figure
 from geoscene.errors import GeosceneError
 from geoscene.scene import open_scene
 from geoscene.typing import Float
 from lidar.tools.evaluation.pose_errors import absolute, by_axis
 from lidar.tools.evaluation.trajectories import ESTIMATE, file_of
 from lidar.tools.evaluation.trajectory import Compared
-from lidar.tools.plots.drawn import WIDE, plain, thin
+from lidar.tools.plots import WIDE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _MARGIN = 25.0
 """Metres around the trajectories in the plan."""
@@ -29,13 +31,13 @@ _WIDTH = 1400
 
 _ROAD, _EARTH = (222, 224, 228), (255, 255, 255)
 _BARS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
-_TRUE, _FOUND = (40, 40, 46), (200, 60, 40)
+_TRUE = "#28282e"
 _KNOWN = re.compile(r"timestamp|time_(ns|s)|frame|[xyz]|alpha|beta|gamma|q[xyzw]|lon|lat|h|sigma_.*")
 """Columns of times, poses and their uncertainty."""
 _MOST_QUALITIES = 6
 
 
-def figures_of(compared: Compared, estimate: Path) -> dict[str, Canvas]:
+def figures_of(compared: Compared, estimate: Path) -> dict[str, Figure]:
     """Figures by name."""
     found = {"plan": plan(compared), "drift": drift(compared), "axes": axes(compared)}
     if (quality := qualities(estimate)) is not None:
@@ -43,7 +45,7 @@ def figures_of(compared: Compared, estimate: Path) -> dict[str, Canvas]:
     return found
 
 
-def plan(compared: Compared) -> Canvas:
+def plan(compared: Compared) -> Figure:
     """Both trajectories from above, over the roads of the scene where it is known, with a scale bar."""
     pairs = compared.pairs
     ways = [pairs.truth.position[:, :2], pairs.estimate.position[:, :2]]
@@ -54,18 +56,17 @@ def plan(compared: Compared) -> Canvas:
     bar = max(b for b in _BARS if b <= max(wide / 4, _BARS[0]))
     place = low + np.array([0.04 * wide, 0.05 * tall])
     lines = [
-        Series("truth", thin(*ways[0].T), color=_TRUE),
-        Series("estimate", thin(*ways[1].T), color=_FOUND),
-        Series(f"{bar:g} m", [(place[0], place[1]), (place[0] + bar, place[1])], color=(0, 0, 0)),
+        Series("truth", *ways[0].T, color=_TRUE),
+        Series("estimate", *ways[1].T, color=COLORS[0]),
+        Series(f"{bar:g} m", place[0] + np.array([0, bar]), place[[1, 1]], color="black"),
     ]
     errors = compared.errors
     title = (
         f"{errors.way_m:,.0f} m, root mean square error {errors.translation.rmse.value:.3g} m"
         f" (alignment {errors.alignment.kind}{roads})"
     )
-    shown = Axes(title, "x, m", "y, m", plain)
     ends = (float(low[0]), float(high[0])), (float(low[1]), float(high[1]))
-    raster = Raster(shown, pixels, *ends, square=True, lines=lines)
+    raster = Raster(Axes(title, "x, m", "y, m"), pixels, *ends, square=True, lines=lines)
     width = min(820, round(820 * wide / tall)) if tall > wide else 820
     width = max(width, 420)
     return figure([raster], size=(308 + width, 122 + max(min(round(width * tall / wide), 900), 160)))
@@ -96,74 +97,60 @@ def _roads(compared: Compared, *, low: Float, high: Float) -> tuple[NDArray[np.u
     return np.asarray(image), ""
 
 
-def drift(compared: Compared) -> Canvas:
+def drift(compared: Compared) -> Figure:
     """Absolute errors over the way, and the mean errors of segments with their intervals by length."""
     pairs = compared.pairs
     way = pairs.truth.distance()
     moved, turned = absolute(pairs)
-    ends = (0.0, max(float(way[-1]), 1e-3))
-    kind = compared.errors.alignment.kind
+    title = f"Absolute error (alignment {compared.errors.alignment.kind})"
     parts = [
+        Panel(Axes(title, "true way, m", "m"), [Series("translation", way, moved)]),
         Panel(
-            Axes(f"Absolute error (alignment {kind})", "true way, m", "m", plain),
-            [Series("translation", thin(way, moved), color=COLORS[0])],
-            x_log=False,
-            y_log=False,
-            x_ends=ends,
-        ),
-        Panel(
-            Axes("", "true way, m", "degrees", plain),
-            [Series("rotation", thin(way, np.degrees(turned)), color=COLORS[1])],
-            x_log=False,
-            y_log=False,
-            x_ends=ends,
+            Axes("", "true way, m", "degrees"),
+            [Series("rotation", way, np.degrees(turned), color=COLORS[1])],
         ),
     ]
     rows = [row for row in compared.errors.segments if row.length is not None]
     for name, unit in (("translation", "%"), ("rotation", "degrees per 100 m")) if rows else ():
-        values = [(float(row.length or 0), getattr(row, name)) for row in rows]
-        known = [(x, *v.interval) for x, v in values if v.interval is not None]
-        line = Series(f"mean {name}", [(x, v.value) for x, v in values], color=COLORS[2])
-        dots = Series("a length", line.points, dots=True, color=COLORS[2])
+        lengths = np.array([row.length for row in rows], float)
+        values = [getattr(row, name) for row in rows]
+        means = [v.value for v in values]
+        low, high = np.array([v.interval or (np.nan, np.nan) for v in values]).T
         what = "KITTI" if compared.errors.kitti else "shorter than KITTI's"
         title = f"Errors of segments ({what})" if name == "translation" else ""
         parts.append(
             Panel(
-                Axes(title, "length of the segments, m", unit, plain),
-                [line, dots],
-                x_log=False,
-                y_log=False,
-                bands=[ShadedBand("95 %", known)] if len(known) > 1 else [],
-                x_ends=(0.0, 1.05 * values[-1][0]),
+                Axes(title, "length of the segments, m", unit),
+                [
+                    Series(f"mean {name}", lengths, means, color=COLORS[2]),
+                    Series("a length", lengths, means, dots=True, color=COLORS[2]),
+                ],
+                bands=[ShadedBand("95 %", lengths, low, high)] if np.isfinite(low).sum() > 1 else [],
             )
         )
-    return figure(parts, columns=1, size=(WIDE[0], 270))
+    return figure(parts, size=(WIDE[0], 270))
 
 
-def axes(compared: Compared) -> Canvas:
+def axes(compared: Compared) -> Figure:
     """Errors along the true axes of the body, and its roll, pitch and yaw, over the way."""
     pairs = compared.pairs
     way = pairs.truth.distance()
     moved, turned = by_axis(pairs)
-    ends = (0.0, max(float(way[-1]), 1e-3))
     rows = [
         ("Errors along the true axes of the body", "m", ("forward (x)", "left (y)", "up (z)"), moved),
         ("Errors of its rotation", "degrees", ("roll", "pitch", "yaw"), np.degrees(turned)),
     ]
     parts = [
         Panel(
-            Axes(title, "true way, m", unit, plain),
-            [Series(name, thin(way, values[:, k]), color=COLORS[k]) for k, name in enumerate(names)],
-            x_log=False,
-            y_log=False,
-            x_ends=ends,
+            Axes(title, "true way, m", unit),
+            [Series(name, way, values[:, k]) for k, name in enumerate(names)],
         )
         for title, unit, names, values in rows
     ]
-    return figure(parts, columns=1, size=WIDE)
+    return figure(parts, size=WIDE)
 
 
-def qualities(estimate: Path) -> Canvas | None:
+def qualities(estimate: Path) -> Figure | None:
     """Quality figures that an estimate reports by frame, such as matches and inliers; None without any.
 
     It is in numeric columns, but those of poses, of a CSV file with the estimate's name, or of ``poses.csv``
@@ -187,15 +174,11 @@ def qualities(estimate: Path) -> Canvas | None:
     if not values:
         return None
     frame = columns.get("frame", np.arange(len(rows), dtype=float))
-    ends = (float(frame[0]), max(float(frame[-1]), float(frame[0]) + 1))
     parts = [
         Panel(
-            Axes("By the estimate" if k == 0 else "", "frame", name, plain),
-            [Series(name, thin(frame, v), color=COLORS[k % len(COLORS)])],
-            x_log=False,
-            y_log=False,
-            x_ends=ends,
+            Axes("By the estimate" if k == 0 else "", "frame", name),
+            [Series(name, frame, v, color=COLORS[k % len(COLORS)])],
         )
         for k, (name, v) in enumerate(list(values.items())[:_MOST_QUALITIES])
     ]
-    return figure(parts, columns=1, size=(WIDE[0], 230))
+    return figure(parts, size=(WIDE[0], 230))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from geoscene import __version__
+from geoscene.drawing.charts import encode
 from geoscene.drawing.report import Column, Page, ReportTable, table_of
 from geoscene.support.columns import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
@@ -70,10 +71,10 @@ def write_trajectory_report(compared: Compared, folder: Path, *, estimate: Path)
     page.paragraph(method_of(errors))
     for table in trajectory_tables(errors):
         page.table(table)
-    for name, canvas in figures_of(compared, estimate).items():
-        png = canvas.encoded(".png")
+    for name, chart in figures_of(compared, estimate).items():
+        png = encode(chart)
         write_atomically(folder / f"{name}.png", png)
-        write_atomically(folder / f"{name}.svg", canvas.encoded(".svg"))
+        write_atomically(folder / f"{name}.svg", encode(chart, ".svg"))
         page.picture(png, alt=name)
     write_atomically(folder / "evaluation.html", page.encoded())
     write_json(folder / DOCUMENT, {"generator": f"geoscene lidar {__version__}", **errors.to_json()})

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from geoscene.errors import need
 from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import Registry, load
@@ -13,8 +14,25 @@ from lidar.errors import InputError
 from lidar.options import PlotOptions
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Chart
+
     from lidar.dataset.layout import Dataset
-    from lidar.tools.plots.drawn import Drawn
+
+WIDE = (1180, 300)
+"""Pixels of a panel of the width of a page."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A figure, with a note and its numbers.
+
+    note    : its figures in one line
+    numbers : the same by name
+    """
+
+    chart: Chart
+    note: str
+    numbers: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,24 +58,9 @@ _FIGURES = (
         "range, intensity and class of a sweep by azimuth and ring",
         ("sensor", "frames"),
     ),
-    Figure(
-        "intensity",
-        "sweeps:intensity",
-        "histogram of intensities by class",
-        ("sensor", "frames"),
-    ),
-    Figure(
-        "returns",
-        "sweeps:returns",
-        "returns by range, class and origin",
-        ("sensor", "frames"),
-    ),
-    Figure(
-        "speed",
-        "motion:speed",
-        "speed and acceleration of the vehicle over time",
-        (),
-    ),
+    Figure("intensity", "sweeps:intensity", "histogram of intensities by class", ("sensor", "frames")),
+    Figure("returns", "sweeps:returns", "returns by range, class and origin", ("sensor", "frames")),
+    Figure("speed", "over_time:speed", "speed and acceleration of the vehicle over time", ()),
     Figure(
         "coverage",
         "coverage:coverage",
@@ -66,7 +69,7 @@ _FIGURES = (
     ),
     Figure(
         "gnss",
-        "fixes:gnss",
+        "over_time:gnss",
         "errors of a receiver east, north and up over time, with the stated standard deviation",
         ("sensor",),
     ),
@@ -101,16 +104,20 @@ def plot(
         if name not in row.takes and getattr(options, name) != getattr(PlotOptions(), name):
             raise InputError(f"`{name}`: {what} does not take it; leave it out")
     check_out(out, overwrite=overwrite)
+    from geoscene.drawing.charts import encode  # noqa: PLC0415  (0.1 s)
+
     drawn: Drawn = load(f"lidar.tools.plots.{row.function}")(dataset, options, progress=progress)
-    write_atomically(out, drawn.canvas.encoded(out.suffix.lower()))
+    write_atomically(out, encode(drawn.chart, out.suffix.lower()))
     return drawn
 
 
 def check_out(out: Path, *, overwrite: bool) -> None:
-    """Raise InputError for a name that is not of a PNG or SVG, or that is taken."""
-    from geoscene.drawing.canvas import SUFFIXES  # noqa: PLC0415  (0.1 s)
+    """Raise InputError for a name that is not of a PNG or SVG, or that is taken.
 
-    if out.suffix.lower() not in SUFFIXES:
+    Raises MissingExtraError without matplotlib.
+    """
+    if out.suffix.lower() not in (".png", ".svg"):
         raise InputError(f"`out` {out}: plots are PNG or SVG; give a name that ends with .png or .svg")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
+    need("matplotlib", "plots")

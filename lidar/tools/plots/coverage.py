@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.drawing.axes import Axis
-from geoscene.drawing.charts import Axes
-from geoscene.drawing.panels import Raster, Scale, Series, figure
+from geoscene.drawing.charts import Axes, Raster, Scale, Series, figure
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import placed_returns
@@ -19,8 +17,7 @@ from lidar.dataset.recorded import cloud_points, frames_within, scanner_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.options import PlotOptions
-from lidar.tools.maps.colors import ramp
-from lidar.tools.plots.drawn import Drawn, plain, thin
+from lidar.tools.plots import Drawn
 
 Counts = NDArray[np.unsignedinteger[Any]]
 
@@ -109,16 +106,10 @@ def _drawn(grid: Counts, *, corner: Float, side: float, trajectory: Trajectory, 
     scale = float(trajectory.scale.mean())
     density = grid / (side / scale) ** 2
     seen = density > 0
-    axis = Axis(
-        float(density[seen].min()),
-        max(float(np.percentile(density[seen], 99.5)), 2 * float(density[seen].min())),
-        log=True,
-    )
+    low = float(density[seen].min())
     by_density = Scale(
-        "returns per m^2", axis, lambda v: ramp(np.log(v), np.log(axis.low), high=np.log(axis.high))
+        "returns per m^2", low, max(float(np.percentile(density[seen], 99.5)), 2 * low), log=True
     )
-    pixels = np.full((*density.shape, 3), 255, np.uint8)
-    pixels[seen] = by_density.colors(density[seen])
     (west, south), (east, north) = corner, corner + side * np.array(grid.shape[::-1])
     area = float(seen.sum() * (side / scale) ** 2)
     about = f"{', '.join(names)}: {int(grid.sum()):,} returns on {area:,.0f} m^2"
@@ -126,16 +117,15 @@ def _drawn(grid: Counts, *, corner: Float, side: float, trajectory: Trajectory, 
         f"Coverage by {about}, cells of {side:g} m",
         "x, m (grid east, scene frame)",
         "y, m (grid north, scene frame)",
-        plain,
     )
     raster = Raster(
         axes,
-        pixels[::-1],
+        np.where(seen, density, np.nan)[::-1],
         (float(west), float(east)),
         (float(south), float(north)),
         scale=by_density,
         square=True,
-        lines=[Series("path of the vehicle", thin(*trajectory.position[:, :2].T), color=(200, 40, 30))],
+        lines=[Series("path of the vehicle", *trajectory.position[:, :2].T, color="#c8281e")],
     )
     wide, tall = float(east - west), float(north - south)
     width = min(820, round(820 * wide / tall)) if tall > wide else 820

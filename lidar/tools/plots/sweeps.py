@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.classes import class_codes
-from geoscene.drawing.axes import Axis
-from geoscene.drawing.canvas import Color
-from geoscene.drawing.charts import COLORS, Axes
-from geoscene.drawing.panels import Panel, Raster, Scale, Series, figure
+from geoscene.classes import Class, class_codes
+from geoscene.drawing.charts import COLORS, Axes, Panel, Raster, Scale, Series, figure
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
@@ -24,17 +22,7 @@ from lidar.errors import DatasetError
 from lidar.geometry.attitude import Mount
 from lidar.options import PlotOptions
 from lidar.sensors.physics.echoes import Origin
-from lidar.tools.maps.colors import ramp
-from lidar.tools.plots.drawn import (
-    WIDE,
-    Drawn,
-    class_name,
-    format_count,
-    most_frequent,
-    outline,
-    plain,
-    whole,
-)
+from lidar.tools.plots import WIDE, Drawn
 
 _WIDTH = 872
 """Pixels across a range image: those of its panel."""
@@ -92,34 +80,32 @@ def range_image(dataset: Dataset, options: PlotOptions, *, progress: Progress) -
     first = np.full((count, _WIDTH), -1)
     for_each = np.lexsort([-distance])  # the nearest is written last
     first[count - 1 - row[for_each], column[for_each]] = for_each
-    seen = first >= 0
     farthest = max(float(np.percentile(distance, 99)), 1.0)
-    ranges = Axis(max(float(distance.min()), 0.5), max(farthest, 1.1 * float(distance.min())), log=True)
+    nearest = float(distance.min())
+    ranges = Scale("range, m", max(nearest, 0.5), max(farthest, 1.1 * nearest), log=True, turned=True)
     codes, counts = np.unique(table["label"], return_counts=True)
     ranked = codes[np.argsort(-counts, kind="stable")][:_LEGEND].tolist()
-
-    def part(title: str, pixels: NDArray[np.uint8], *, scale: Scale | None = None) -> Raster:
-        image = np.where(seen[..., None], pixels[first], _EMPTY)
-        legend = [] if scale else [(class_name(c), _rgb(class_codes().color[c])) for c in ranked]
-        axes = Axes(title, across, rows.title, whole if rows.title == "ring" else plain)
-        return Raster(axes, image, (high, low), rows.ends, scale=scale, legend=legend)
-
+    colors = class_codes().color
+    legend = [(_class_name(c), "#" + bytes(colors[c]).hex()) for c in ranked]
     about = f"{clouds.name} ({clouds.sensor.get('model', 'scanner')}), frame {frame}"
-    by_range = Scale("range, m", ranges, lambda v: _shades(v, ranges))
-    by_intensity = Scale("intensity", Axis(0, 100), lambda v: ramp(v, 0, high=100))
+    sides: dict[str, Any] = {"x": (high, low), "y": rows.ends}
     parts = [
-        part(f"Range image of {about}: {len(distance):,} returns", _shades(distance, ranges), scale=by_range),
-        part(
-            "Intensity (diffuse reflectivity in per cent up to 100)",
-            by_intensity.colors(table["intensity"]),
-            scale=by_intensity,
-        ),
-        part("Class", class_codes().color[table["label"]]),
+        Raster(Axes(title, across, rows.title), np.append(values, np.nan)[first], scale=scale, **sides)
+        for title, values, scale in (
+            (f"Range image of {about}: {len(distance):,} returns", distance, ranges),
+            (
+                "Intensity (diffuse reflectivity in per cent up to 100)",
+                table["intensity"],
+                Scale("intensity", 0, 100),
+            ),
+        )
     ]
-    filled = float(seen.mean())
+    classes = np.concatenate([colors[table["label"]], [_EMPTY]])[first]
+    parts.append(Raster(Axes("Class", across, rows.title), classes, legend=legend, **sides))
+    filled = float((first >= 0).mean())
     numbers = {"sensor": clouds.name, "frame": frame, "returns": len(distance), "rows": count}
     note = f"{about}: {len(distance):,} returns, {100 * filled:.0f} % of {count} x {_WIDTH} cells"
-    return Drawn(figure(parts, columns=1, size=(WIDE[0], 340)), note, numbers | {"filled": filled})
+    return Drawn(figure(parts, size=(WIDE[0], 340)), note, numbers | {"filled": filled})
 
 
 def _directions(table: Table) -> tuple[Float, Float, Float]:
@@ -178,16 +164,6 @@ def _even_rows(value: Float, title: str) -> _Rows:
     return _Rows(row, (low, high), title)
 
 
-def _shades(distance: Float, axis: Axis) -> NDArray[np.uint8]:
-    """Colours (n, 3) of distances, bright near."""
-    return ramp(-np.log(np.maximum(distance, 1e-3)), -math.log(axis.high), high=-math.log(axis.low))
-
-
-def _rgb(color: NDArray[np.uint8]) -> Color:
-    red, green, blue = color.tolist()
-    return red, green, blue
-
-
 def intensity(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:
     """Histogram of the intensities of each class, returns per sweep and unit of intensity."""
     clouds = frames_within(scanner_clouds(dataset, options.sensor), options.limits)
@@ -200,15 +176,14 @@ def intensity(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> 
     per = len(clouds.frames) * (_INTENSITIES[1] - _INTENSITIES[0])
     series = _by_class(counts, edges=_INTENSITIES, per=per)
     points = counts.sum(axis=1)
-    means = {class_name(k): float(total[k] / points[k]) for k in most_frequent(points, most=len(points))}
+    means = {_class_name(k): float(total[k] / points[k]) for k in _most_frequent(points, most=len(points))}
     about = f"{clouds.name}, {len(clouds.frames)} sweeps, {points.sum():,} returns"
     axes = Axes(
         f"Intensities of {about}",
         "intensity (0 to 100: diffuse reflectivity in per cent; above: retro-reflectors)",
         "returns per sweep and unit",
-        format_count,
     )
-    panel = Panel(axes, series, x_log=False, x_ends=(0, 256), floor=True)
+    panel = Panel(axes, series, log=True)
     named = ", ".join(f"{name} {mean:.0f}" for name, mean in list(means.items())[:5])
     numbers = {"sensor": clouds.name, "sweeps": len(clouds.frames), "returns": int(points.sum())}
     numbers |= {"mean_intensity": means}
@@ -243,17 +218,16 @@ def returns(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Dr
     about = f"{clouds.name}, {sweeps} sweeps, {total / sweeps:,.0f} returns per sweep"
 
     def panel(title: str, series: list[Series]) -> Panel:
-        axes = Axes(title, "range, m", f"returns per sweep in {step:g} m", format_count)
-        return Panel(axes, series, x_log=False, x_ends=(0.0, float(edges[-1])), floor=True)
+        return Panel(Axes(title, "range, m", f"returns per sweep in {step:g} m"), series, log=True)
 
     parts = [panel(f"Returns by range of {about}", _by_class(counts, edges=edges, per=sweeps))]
     if known:
-        found = [Origin(k) for k in most_frequent(origins.sum(axis=1), most=len(Origin))]
-        series = [Series(o.name.lower(), outline(edges, origins[o] / sweeps)) for o in found]
+        found = [Origin(k) for k in _most_frequent(origins.sum(axis=1), most=len(Origin))]
+        series = [_histogram(o.name.lower(), edges=edges, counts=origins[o] / sweeps) for o in found]
         parts.append(panel("By origin", series))
     note = f"{about}, half of them nearer than {median:g} m"
     numbers = {"sensor": clouds.name, "sweeps": sweeps, "returns": total, "median_m": median, "bin_m": step}
-    return Drawn(figure(parts, columns=1, size=(WIDE[0], 500)), note, numbers)
+    return Drawn(figure(parts, size=(WIDE[0], 500)), note, numbers)
 
 
 def _tables(dataset: Dataset, clouds: Stream, *, progress: Progress) -> Iterator[Table]:
@@ -271,13 +245,31 @@ def _by_label(label: NDArray[np.integer], value: Float, *, edges: Float) -> Ints
 
 def _by_class(counts: Ints, *, edges: Float, per: float) -> list[Series]:
     """Histograms of all returns and of the most frequent classes, divided by ``per``."""
-    named = most_frequent(counts.sum(axis=1), most=_LEGEND)
-    series = [Series("all", outline(edges, counts.sum(axis=0) / per), color=(170, 172, 178))]
+    named = _most_frequent(counts.sum(axis=1), most=_LEGEND)
+    series = [_histogram("all", edges=edges, counts=counts.sum(axis=0) / per, color="#aaacb2")]
     series += [
-        Series(class_name(k), outline(edges, counts[k] / per), color=COLORS[rank])
+        _histogram(_class_name(k), edges=edges, counts=counts[k] / per, color=COLORS[rank])
         for rank, k in enumerate(named)
     ]
     rest = np.delete(counts, named, axis=0).sum(axis=0)
     return (
-        [*series, Series("other", outline(edges, rest / per), color=(20, 20, 20))] if rest.any() else series
+        [*series, _histogram("other", edges=edges, counts=rest / per, color="#141414")]
+        if rest.any()
+        else series
     )
+
+
+def _class_name(code: int) -> str:
+    """The name of a class in words."""
+    return Class(code).name.lower().replace("_", " ")
+
+
+def _histogram(name: str, *, edges: Float, counts: Float, color: str | None = None) -> Series:
+    """The outline of a histogram."""
+    return Series(name, np.repeat(edges, 2)[1:-1], np.repeat(counts, 2), color=color)
+
+
+def _most_frequent(counts: Ints, *, most: int) -> list[int]:
+    """Rows of ``counts`` (n,) that are not 0, the largest first, at most ``most``."""
+    ranked = np.argsort(-counts, kind="stable")
+    return [int(k) for k in ranked[:most] if counts[k] > 0]

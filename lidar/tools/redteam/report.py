@@ -9,8 +9,7 @@ from typing import Any
 
 from geoscene import __version__
 from geoscene.drawing.charts import Axes, Span, curves, spans
-from geoscene.drawing.figures import share
-from geoscene.drawing.report import Column, Page, ReportTable, table_of
+from geoscene.drawing.report import Column, Page, ReportTable, share, table_of
 from geoscene.support.columns import write_columns
 from geoscene.support.files import write_atomically, write_json
 from lidar.tools.redteam.matrix import (
@@ -316,7 +315,7 @@ def _draw_curves(page: Page, rows: Sequence[AttackDetection], *, allowed: float)
         mine = [row for row in rows if row.attack == attack and row.score.roc]
         lines = {f"{row.defence} {row.score.auc[0]:.2f}": row.score.roc for row in mine}
         title = f"ROC of frames with areas: {attack}; threshold at {share(allowed)} false alarms"
-        axes = Axes(title, "false alarms", "detected", lambda value: f"{value:g}")
+        axes = Axes(title, "false alarms", "detected")
         page.picture(curves(lines, axes, mark=allowed), alt=f"ROC of {attack}")
 
 

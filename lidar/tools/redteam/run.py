@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from geoscene.errors import need
 from geoscene.support.files import exclusive
 from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
@@ -48,8 +49,10 @@ def redteam(
     ``redteam.html``. What is there of the same drives and options is kept. A drive that fails is named in the
     results, and the others count. The bytes do not depend on ``workers``, but for times that were measured.
 
-    Raises InputError for a file with an error, before the first drive starts.
+    Raises InputError for a file with an error, and MissingExtraError without matplotlib, before the first
+    drive starts.
     """
+    need("matplotlib", "plots")
     plan, folder = read_plan(Path(file)), Path(out)
     check_folder(folder, mark="drives/sweep.json", what="matrix")
     with exclusive(folder):

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.drawing.figures import metres
+from geoscene.drawing.report import metres
 from geoscene.support.columns import Columns
 from geoscene.typing import Float
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from geoscene.drawing.figures import levels, metres, share
+from geoscene.drawing.report import levels, metres, share
 from lidar.options import AccuracyTarget, DriveOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from geoscene.drawing.charts import Axes, ChartPoint, scatter
-from geoscene.drawing.figures import levels, metres, share, size
-from geoscene.drawing.report import Column, Page, ReportTable, table_of
+from geoscene.drawing.report import Column, Page, ReportTable, levels, metres, share, size, table_of
 from geoscene.support.files import write_atomically, write_json
 from lidar.tools.tradeoff.compare import DriveTradeoff
 from lidar.tools.tradeoff.errors import LOST, ErrorEstimate, Kind, SensorComparison, VariantRow

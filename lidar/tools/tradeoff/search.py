@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.drawing.figures import levels, metres
+from geoscene.drawing.report import levels, metres
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress
 from lidar.errors import InputError

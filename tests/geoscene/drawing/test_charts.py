@@ -1,42 +1,113 @@
-"""Figures as people read them, and scatter plots of points with intervals."""
+"""Charts show their values, and the same charts have the same bytes."""
 
 import io
+import math
+import sys
 
 import numpy as np
-from PIL import Image, ImageFont
+import pytest
+from helpers.figures import images, lines
+from PIL import Image
 
-from geoscene.drawing.canvas import drawable
-from geoscene.drawing.charts import Axes, ChartPoint, scatter
-from geoscene.drawing.figures import metres, share
+from geoscene.drawing.charts import (
+    Axes,
+    ChartPoint,
+    Panel,
+    Raster,
+    Scale,
+    Series,
+    ShadedBand,
+    Span,
+    curves,
+    encode,
+    figure,
+    scatter,
+    spans,
+)
+from geoscene.drawing.report import metres
+from geoscene.errors import MissingExtraError
 
 RED = (200, 60, 40)
+TEXTS = Axes("a < b & c", "x", "y")
+SIZE = (700, 400)
 
 
-def red_box(*points):
-    """Left, top, right and bottom of what is red in a plot of points, below the legend."""
-    png = scatter(points, Axes("title", "x", "y", metres))
-    down, across = np.nonzero((np.asarray(Image.open(io.BytesIO(png))) == RED).all(axis=2))
-    plotted = down > 60
-    across, down = across[plotted], down[plotted]
-    return across.min(), down.min(), across.max(), down.max()
+def test_gaps_break_lines_and_counts_of_zero_lie_at_the_end_of_a_logarithmic_axis():
+    y = np.array([100.0, 0.0, 1.0, math.nan, 10.0, 100.0])
+    band = ShadedBand("b", np.arange(6), y, y + 1)
+    svg = encode(figure([Panel(TEXTS, [Series("a", np.arange(6), y)], bands=[band])], size=SIZE), ".svg")
+    first, second = lines(svg, "a")
+    assert len(first) == 3
+    assert len(second) == 2
+    assert np.allclose(first[0, 1], second[1, 1])
+    assert first[0, 1] < first[2, 1] < first[1, 1], "up is larger"
+    assert b"a &lt; b &amp; c" in svg
+    drawn = figure([Panel(TEXTS, [Series("a", np.arange(6), y)], log=True)], size=SIZE)
+    first, _ = lines(encode(drawn, ".svg"), "a")
+    bottom = (1 - drawn.axes[0].get_position().y0) * SIZE[1] * 72 / 100
+    assert first[0, 1] < first[2, 1] < first[1, 1]
+    assert math.isclose(first[1, 1], bottom, abs_tol=0.5)
+
+
+def test_the_same_figure_has_the_same_bytes_and_names_no_date():
+    def drawn(suffix):
+        return encode(figure([Panel(TEXTS, [Series("a", [0, 1], [0, 1], dots=True)])], size=SIZE), suffix)
+
+    assert drawn(".png") == drawn(".png")
+    assert drawn(".svg") == drawn(".svg")
+    assert b"dc:date" not in drawn(".svg")
+    assert Image.open(io.BytesIO(drawn(".png"))).size == SIZE
+
+
+def test_a_raster_has_north_up_and_square_cells():
+    image = np.full((2, 4, 3), 255, np.uint8)
+    image[0, 3] = RED  # the north-eastern cell
+    raster = Raster(TEXTS, image, (0, 40), (0, 20), square=True, lines=[Series("a", [0, 40], [0, 20])])
+    drawn = figure([raster], size=SIZE)
+    (((left, bottom), (right, top)),) = lines(encode(drawn, ".svg"), "a")
+    assert math.isclose((right - left) / 40, (bottom - top) / 20, rel_tol=1e-3)
+    pixels = np.asarray(Image.open(io.BytesIO(encode(drawn))).convert("RGB"))
+    down, across = np.nonzero((pixels == RED).all(axis=2))
+    side = (right - left) / 4 * 100 / 72  # SVG has points of 1/72 inch
+    assert (across > right * 100 / 72 - side - 2).mean() > 0.9
+    assert (down < top * 100 / 72 + side + 2).mean() > 0.9
+    assert len(down) > 0.8 * side**2
+
+
+def test_values_of_a_scale_have_its_colours_and_none_is_white():
+    values = np.array([[1.0, 100.0, math.nan]])
+    scale = Scale("s", 1.0, 100.0, log=True)
+    svg = encode(figure([Raster(TEXTS, values, (0, 3), (0, 1), scale=scale)], size=SIZE), ".svg")
+    (image,) = images(svg)
+    assert image[0, :, :3].tolist()[:2] == [[68, 1, 84], [253, 231, 36]]
+    assert image[0, 2, 3] == 0
 
 
 def test_figures_have_fitting_units():
     assert [metres(v) for v in (0, 1e-12, 2e-6, 0.25)] == ["0", "below 1 nm", "2 µm", "25 cm"]
-    assert [share(v) for v in (0, 0.1, -0.0021, 1.0)] == ["0", "10 %", "-0.21 %", "100 %"]
 
 
-def test_the_font_of_pictures_has_every_letter_of_lengths():
-    font = ImageFont.load_default(size=15)
-    unknown = bytes(font.getmask("\uffff"))
-    for letter in set("".join(metres(v) for v in (0, 1e-12, 2e-9, 2e-6, 2e-3, 0.25, 3.0))) - {" "}:
-        assert bytes(font.getmask(drawable(letter))) != unknown, letter
+@pytest.mark.parametrize(
+    "points",
+    [
+        [ChartPoint("a", 2.0, 0.1, True, (1.0, 30.0), (0.0, 0.4))],
+        [ChartPoint(str(k), 1 + 0.001 * k, 0.1, k > 3) for k in range(9)],
+        [ChartPoint("a", 2.0, 0.0, True)],
+    ],
+)
+def test_charts_of_reports_are_whole_pictures(points):
+    for png in (
+        scatter(points, Axes("title", "x", "y", metres)),
+        curves({"a": [(0, 0), (0.1, 0.8), (1, 1)], "b": []}, TEXTS, mark=0.05),
+        spans([Span("a", 0.4, (0.2, 0.5), (0.3, 0.3)), Span("b", math.nan, (math.nan,) * 2)], title="t"),
+    ):
+        picture = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+        edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+        assert (edge == 255).all(), "nothing is cut off"
+        assert (picture == RED).all(axis=2).any()
 
 
-def test_intervals_are_lines_within_the_axes():
-    plain = red_box(ChartPoint("a", 2.0, 0.1, True))
-    wide = red_box(ChartPoint("a", 2.0, 0.1, True, (1.0, 30.0), (0.0, 0.4)))
-    assert (plain[2] - plain[0], plain[3] - plain[1]) == (8, 8)
-    assert wide[2] - wide[0] > 500
-    assert 90 <= wide[0] < wide[2] <= 970
-    assert wide[3] == 630  # an end of 0 lies on the lower axis
+def test_a_missing_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.style", None)
+    with pytest.raises(MissingExtraError, match=r"geoscene\[plots\]"):
+        figure([Panel(TEXTS, [])], size=SIZE)

@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 import pytest
 
-from geoscene.drawing.figures import levels, metres
+from geoscene.drawing.report import levels, metres
 from geoscene.support.progress import silent
 from lidar.errors import InputError
 from lidar.options import DriveOptions, TradeoffOptions

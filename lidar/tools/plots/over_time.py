@@ -1,12 +1,11 @@
-"""Errors of satellite receivers against the truth."""
+"""Figures over time: the speed profile of a drive, and errors of its receivers against the truth."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.drawing.charts import COLORS, Axes
-from geoscene.drawing.panels import Panel, Series, ShadedBand, figure
+from geoscene.drawing.charts import COLORS, Axes, Panel, Series, ShadedBand, figure
 from geoscene.geometry.frames import Frame
 from geoscene.support.progress import Progress
 from geoscene.typing import Float
@@ -15,9 +14,46 @@ from lidar.dataset.navigation_files import read_fixes
 from lidar.errors import DatasetError, InputError
 from lidar.options import PlotOptions
 from lidar.sensors.navigation.measurements import Fixes, fix_variances
-from lidar.tools.plots.drawn import WIDE, Drawn, plain, thin
+from lidar.tools.plots import WIDE, Drawn
+
+_TIME = "time since the start, s"
+_SMOOTHED_S = 0.1
+"""Seconds over which accelerations are differences."""
 
 _DIRECTIONS = ("east", "north", "up")
+
+
+def speed(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:  # noqa: ARG001
+    """Speed of the ego vehicle, and its acceleration along and across the direction of motion."""
+    trajectory = dataset.trajectory()
+    seconds = trajectory.time_ns * 1e-9
+    fast = np.linalg.norm(trajectory.velocity, axis=1)
+    step = max(round(_SMOOTHED_S / max(float(np.median(np.diff(seconds))), 1e-9)), 1)
+    before, after = np.maximum(np.arange(len(seconds)) - step, 0), np.arange(len(seconds)) + step
+    after = np.minimum(after, len(seconds) - 1)
+    change = (trajectory.velocity[after] - trajectory.velocity[before]) / (seconds[after] - seconds[before])[
+        :, None
+    ]
+    forward = trajectory.at(trajectory.time_ns).rotation[:, :, 0]
+    left = np.column_stack([-forward[:, 1], forward[:, 0]])
+    left /= np.maximum(np.linalg.norm(left, axis=1), 1e-12)[:, None]
+    along, across = (change * forward).sum(axis=1), (change[:, :2] * left).sum(axis=1)
+    length = float(np.sum((fast[1:] + fast[:-1]) / 2 * np.diff(seconds)))
+    duration = float(seconds[-1] - seconds[0])
+    most = f"{fast.max():.1f} m/s ({3.6 * fast.max():.0f} km/h)"
+    about = f"{length:,.0f} m in {duration:,.1f} s, at most {most}"
+    parts = [
+        Panel(Axes(f"Speed: {about}", _TIME, "m/s"), [Series("speed", seconds, fast, color=COLORS[1])]),
+        Panel(
+            Axes("Acceleration of the vehicle's reference point", _TIME, "m/s^2"),
+            [Series("forward", seconds, along), Series("to the left", seconds, across)],
+        ),
+    ]
+    numbers = {"length_m": length, "duration_s": duration, "maximum_speed_m_s": float(fast.max())}
+    numbers |= {"mean_speed_m_s": length / (duration)}
+    numbers |= {"maximum_forward_m_s2": float(np.abs(along).max())}
+    numbers |= {"maximum_sideways_m_s2": float(np.abs(across).max())}
+    return Drawn(figure(parts, size=WIDE), about, numbers)
 
 
 def gnss(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn:  # noqa: ARG001
@@ -38,24 +74,14 @@ def gnss(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn
     known: NDArray[np.bool_] = np.asarray(np.isfinite(error).all(axis=1))
     sigma = np.where(known[:, None], np.sqrt(fix_variances(fixes)), np.nan)
     seconds = fixes.time_ns * 1e-9
-    ends = (float(seconds[0]), float(seconds[-1]))
     parts = []
     for k, direction in enumerate(_DIRECTIONS):
-        band = list(zip(seconds.tolist(), (-sigma[:, k]).tolist(), sigma[:, k].tolist(), strict=True))
         title = f"Errors of {name}: {known.sum():,} of {len(fixes):,} epochs with a fix" if k == 0 else ""
-        parts.append(
-            Panel(
-                Axes(title, "time since the start, s", f"{direction}, m", plain),
-                [Series(f"error {direction}", thin(seconds, error[:, k]), color=COLORS[k])],
-                x_log=False,
-                y_log=False,
-                bands=[ShadedBand("± 1 sigma, as stated", band)],
-                x_ends=ends,
-            )
-        )
-    used = Series("satellites used", thin(seconds, fixes.satellites.astype(float)), color=COLORS[5])
-    axes = Axes("", "time since the start, s", "satellites", plain)
-    parts.append(Panel(axes, [used], x_log=False, y_log=False, x_ends=ends))
+        band = ShadedBand("± 1 sigma, as stated", seconds, -sigma[:, k], sigma[:, k])
+        line = Series(f"error {direction}", seconds, error[:, k], color=COLORS[k])
+        parts.append(Panel(Axes(title, _TIME, f"{direction}, m"), [line], bands=[band]))
+    used = Series("satellites used", seconds, fixes.satellites, color=COLORS[5])
+    parts.append(Panel(Axes("", _TIME, "satellites"), [used]))
     numbers: dict[str, object] = {"receiver": name, "epochs": len(fixes), "fixes": int(known.sum())}
     words = []
     for k, direction in enumerate(_DIRECTIONS if known.any() else ()):
@@ -64,7 +90,7 @@ def gnss(dataset: Dataset, options: PlotOptions, *, progress: Progress) -> Drawn
         numbers |= {f"rms_{direction}_m": rms, f"sigma_{direction}_m": stated, f"inside_{direction}": inside}
         words.append(f"{direction} {rms:.3g} m (stated {stated:.3g})")
     note = f"{name}: {known.sum():,} fixes, rms errors {', '.join(words)}" if words else f"{name}: no fix"
-    return Drawn(figure(parts, columns=1, size=(WIDE[0], 260)), note, numbers)
+    return Drawn(figure(parts, size=(WIDE[0], 260)), note, numbers)
 
 
 def position_errors(frame: Frame, fixes: Fixes) -> Float:
