@@ -1,8 +1,9 @@
-"""Contents of a page: chosen layers with inferred appearance, attributes, and bounding boxes."""
+"""Contents of a page: layers with inferred appearance, tables of attributes, grid of degrees, boxes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,24 +11,131 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, class_codes, materials
 from geoscene.errors import InputError
-from geoscene.export.kinds import compact_json
-from geoscene.export.objects import read_features
+from geoscene.export.kinds import compact_json, plain
+from geoscene.export.objects import FeatureAttributes, read_features
+from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
 from geoscene.options import Degrees
 from geoscene.scene import Scene
 from geoscene.scene.tile_files import Tile
 from geoscene.typing import Bools, Float, Ints
 from geoscene.view.assembly import gzip
-from geoscene.view.attributes import tables
-from geoscene.view.lonlat import lonlat_grid
 from geoscene.view.looks import read_looks
 from geoscene.view.tiles import Groups, groups_of, only, pack_shapes, pack_tile
+
+Rows = Ints
+ACCURACY = 0.01
+"""Largest error of the interpolation in metres."""
+
+_MOST = 129
 
 _BOX_STEP = 0.01
 """Quantisation step of boxes of features in metres, outwards."""
 
 _BUSY = 0.9
 """Share of the things along each axis that the first view shows."""
+
+
+def tables(features: FeatureAttributes, present: Bools) -> list[dict[str, Any]]:
+    """One table per layer with the features in the page, in the layers' order, empty ones left out.
+
+    present : (n,) bool by feature number: it has faces or copies in the page
+
+    Parts come with their building, road edges with the surfaces made from the same OSM ways. A table has
+    ``layer``, ``feature`` numbers and ``columns``: a list of values (null for none) or, for text,
+    ``words`` and the index of each row's among them (-1 for none).
+    """
+    out = []
+    for number, layer in enumerate(features.layers):
+        columns = features.columns[number]
+        own = features.numbers[number]
+        rows = _chosen(layer, columns, own=present[own], features=features, present=present)
+        if len(rows):
+            encoded = {name: _column(values[rows]) for name, values in columns.items()}
+            out.append({"layer": layer, "feature": own[rows].tolist(), "columns": encoded})
+    return out
+
+
+def _chosen(
+    layer: str, columns: dict[str, NDArray[Any]], *, own: Bools, features: FeatureAttributes, present: Bools
+) -> Rows:
+    """Rows of a layer that are in the page, or belong to a feature that is."""
+    keep = own.copy()
+    if layer == "building_parts" and "buildings" in features.layers:
+        start = int(features.starts[features.layers.index("buildings")])
+        keep |= present[start + columns["building"].astype(np.int64)]
+    if layer == "roads" and "road_surfaces" in features.layers:
+        number = features.layers.index("road_surfaces")
+        ids = _text(features.columns[number]["osm_id"])
+        known = {way for text in ids[present[features.numbers[number]]] for way in text.split(";")}
+        keep |= np.array([not known.isdisjoint(text.split(";")) for text in _text(columns["osm_id"])])
+    return np.flatnonzero(keep)
+
+
+def _text(values: NDArray[Any]) -> NDArray[np.object_]:
+    """Text of a column, "" for none."""
+    return np.array(["" if v is None else str(v) for v in values], object)
+
+
+def _column(values: NDArray[Any]) -> Any:
+    if values.dtype.kind in "OU":
+        words, index = np.unique(_text(values).astype(str), return_inverse=True)
+        empty = int(words[0] == "")
+        return {"words": words[empty:].tolist(), "index": (index.ravel() - empty).tolist()}
+    if values.dtype.kind == "f":
+        values = np.round(values, 4) + 0.0  # no minus zero
+    return [plain(value) for value in values]
+
+
+@dataclass(frozen=True, slots=True)
+class LonLatGrid:
+    """Degrees at the nodes of a grid over a rectangle; bilinear between them.
+
+    bounds : (xmin, ymin, xmax, ymax) in scene metres
+    lon, lat : (n, n) degrees, rows from south to north
+    error  : metres, the largest found between nodes
+    """
+
+    bounds: tuple[float, float, float, float]
+    lon: Float
+    lat: Float
+    error: float
+
+    def at(self, x: Float, y: Float) -> tuple[Float, Float]:
+        """Longitude and latitude in degrees of scene coordinates."""
+        xmin, ymin, xmax, ymax = self.bounds
+        last = len(self.lon) - 1
+        u, v = (x - xmin) / (xmax - xmin) * last, (y - ymin) / (ymax - ymin) * last
+        i, j = (np.clip(np.floor(w), 0, last - 1).astype(int) for w in (u, v))
+        u, v = u - i, v - j
+        weights = ((1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v)
+        nodes = ((j, i), (j, i + 1), (j + 1, i), (j + 1, i + 1))
+        lon, lat = (
+            sum(w * grid[n] for w, n in zip(weights, nodes, strict=True)) for grid in (self.lon, self.lat)
+        )
+        return lon, lat
+
+
+def lonlat_grid(frame: Frame, bounds: tuple[float, float, float, float]) -> LonLatGrid:
+    """The coarsest grid of 2^k + 1 nodes a side that is within `ACCURACY`, or one of 129, with its error.
+
+    The error is taken at the middles of cells and of their sides, where a bilinear patch is furthest from a
+    quadratic one.
+    """
+    xmin, ymin, xmax, ymax = bounds
+    n = 2
+    while True:
+        fine = np.linspace(0, 1, 2 * n - 1)
+        x, y = np.meshgrid(xmin + (xmax - xmin) * fine, ymin + (ymax - ymin) * fine)
+        lon, lat = (np.asarray(v, float) for v in frame.to_geographic(x, y))
+        # Nine decimals of a degree are 0.1 mm; across the date line degrees must not jump.
+        lon, lat = np.round(lon[0, 0] + (lon - lon[0, 0] + 180) % 360 - 180, 9), np.round(lat, 9)
+        grid = LonLatGrid(bounds, lon[::2, ::2], lat[::2, ::2], 0.0)
+        there = frame.from_geographic(*grid.at(x, y))
+        error = float(np.hypot(there[0] - x, there[1] - y).max())
+        if error <= ACCURACY or n >= _MOST:
+            return LonLatGrid(bounds, grid.lon, grid.lat, error)
+        n = 2 * n - 1
 
 
 class PageContents:

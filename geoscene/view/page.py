@@ -17,8 +17,7 @@ from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Ints
 from geoscene.view.assembly import check_page, write_blob, write_page
-from geoscene.view.contents import PageContents, tiles_within
-from geoscene.view.lonlat import ACCURACY
+from geoscene.view.contents import ACCURACY, PageContents, tiles_within
 from geoscene.view.streamed import MARK, NAMES, write_streamed
 
 _SCRIPTS = ("data.js", "facades.js", "shaders.js", "draw.js", "panel.js")

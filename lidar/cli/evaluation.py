@@ -122,7 +122,7 @@ def detect(
         Folder to make: NNNNNN.txt of each frame, or results.json.
     """
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.tools.detection.registry import read_detector  # noqa: PLC0415
+    from lidar.tools.detection.learned import read_detector  # noqa: PLC0415
     from lidar.tools.evaluation.detect import LAYOUTS  # noqa: PLC0415
     from lidar.tools.evaluation.detect import detect as detected  # noqa: PLC0415
 

@@ -100,7 +100,7 @@ def view(
     if (out is not None) + serve + open3d != 1:
         raise InputError("give one of `out`, `serve` and `open3d`")
     if open3d:
-        from lidar.tools.view.window import show_window  # noqa: PLC0415
+        from lidar.tools.view.live import show_window  # noqa: PLC0415
 
         show_window(dataset, options=options)
         return 0
@@ -122,7 +122,7 @@ def view(
 def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:
     """Serve the player until interrupted."""
     from lidar.dataset.layout import open_dataset  # noqa: PLC0415
-    from lidar.tools.view.server import DriveServer  # noqa: PLC0415
+    from lidar.tools.view.page import DriveServer  # noqa: PLC0415
 
     with DriveServer(open_dataset(dataset), options=options, port=port) as server:
         print(f"{server.address} plays {len(server.drive)} frames of {dataset}; Ctrl+C ends it", flush=True)

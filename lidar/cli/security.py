@@ -56,7 +56,7 @@ def defend(
     from lidar.tools.defences.defend import calibrate, score_table  # noqa: PLC0415
     from lidar.tools.defences.defend import defend as judged  # noqa: PLC0415
     from lidar.tools.defences.registry import read_defences  # noqa: PLC0415
-    from lidar.tools.detection.registry import read_detector  # noqa: PLC0415
+    from lidar.tools.detection.learned import read_detector  # noqa: PLC0415
 
     if not datasets:
         raise InputError("`datasets`: give one or more")

@@ -22,9 +22,8 @@ from lidar.dataset.recorded import Stream, cloud_points, instance_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.tools.detection.clusters import PLAIN, find_clusters
 from lidar.tools.detection.detector import KINDS
-from lidar.tools.detection.features import FEATURES, features
 from lidar.tools.detection.forest import Forest, forest_of
-from lidar.tools.detection.learned import CLASSES, Learned
+from lidar.tools.detection.learned import CLASSES, FEATURES, Learned, features
 
 FEWEST = 20
 """Clusters of a kind that a model needs to learn it."""
@@ -43,7 +42,7 @@ _THRESHOLDS = np.linspace(0.05, 0.95, 91)
 class Examples(Columns):
     """Labelled clusters for training.
 
-    measures : (n, features) float32, as `lidar.tools.detection.features.features`
+    measures : (n, features) float32, as `lidar.tools.detection.learned.features`
     kind     : (n,) row of `lidar.tools.detection.learned.CLASSES`
     group    : (n,) part of the data that they are of: those of one part are alike
     """

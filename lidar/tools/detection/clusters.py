@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from geoscene.support.graphs import components
 from geoscene.typing import Bools, Float, Ints
-from lidar.tools.detection.boxes import Rectangle, fit_rectangle
-from lidar.tools.detection.detector import CloudPoints
+from lidar.tools.detection.detector import CloudPoints, Rectangle, fit_rectangle
 from lidar.tools.detection.ground import height_above_ground
 
 

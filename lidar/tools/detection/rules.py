@@ -4,9 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lidar.tools.detection.boxes import Rectangle, complete_rectangle
 from lidar.tools.detection.clusters import PLAIN, WALL, ClusterShape, DetectorSettings, find_clusters, ramp
-from lidar.tools.detection.detector import CloudPoints, DetectedObject, Detections, apart, table
+from lidar.tools.detection.detector import (
+    CloudPoints,
+    DetectedObject,
+    Detections,
+    Rectangle,
+    apart,
+    complete_rectangle,
+    table,
+)
 
 
 @dataclass(frozen=True, slots=True)

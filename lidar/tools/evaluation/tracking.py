@@ -12,8 +12,16 @@ from scipy.optimize import linear_sum_assignment
 
 from geoscene.typing import Bools, Float, Ints
 from lidar.errors import FormatError
-from lidar.tools.evaluation.kitti_detection import DIFFICULTIES, LIKE, Labels, labels_of
-from lidar.tools.evaluation.overlap import area_overlap, flat_overlap, footprints, volume_overlap
+from lidar.tools.evaluation.kitti_detection import (
+    DIFFICULTIES,
+    LIKE,
+    Labels,
+    area_overlap,
+    flat_overlap,
+    footprints,
+    labels_of,
+    volume_overlap,
+)
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 LIMITS = {"2d": 0.5, "3d": 0.25}

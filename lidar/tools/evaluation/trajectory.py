@@ -13,19 +13,30 @@ from geoscene.support.progress import Progress, silent
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import EvaluateOptions, MapOptions
-from lidar.tools.evaluation.intervals import Statistics, Value, statistics
-from lidar.tools.evaluation.matching import PosePairs, TrajectoryAlignment, alignment, match_poses
 from lidar.tools.evaluation.pose_errors import (
     KITTI_LENGTHS,
     KITTI_STEP,
     Segments,
+    Statistics,
+    Value,
     absolute,
     lengths_for,
     over_frames,
     over_metres,
     segments,
+    statistics,
 )
-from lidar.tools.evaluation.trajectories import Path3D, file_of, read_path, read_truth, sensor_mount
+from lidar.tools.evaluation.trajectories import (
+    Path3D,
+    PosePairs,
+    TrajectoryAlignment,
+    alignment,
+    file_of,
+    match_poses,
+    read_path,
+    read_truth,
+    sensor_mount,
+)
 
 if TYPE_CHECKING:
     from lidar.tools.maps.compare import SurfaceDistances

@@ -25,13 +25,10 @@ from lidar.options import MapOptions
 from lidar.tools.maps.colors import distinct, ramp
 from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances
 from lidar.tools.maps.image_colors import ImageColors
-from lidar.tools.maps.outliers import Outliers
-from lidar.tools.maps.poses import PoseErrors, pose_errors, read_poses, write_poses
 from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.selection import Selection
-from lidar.tools.maps.source import COLUMNS, MapClouds
-from lidar.tools.maps.tiles import INDEX, NAMES, open_tiles
-from lidar.tools.maps.voxels import thin
+from lidar.tools.maps.source import COLUMNS, MapClouds, PoseErrors, pose_errors, read_poses, write_poses
+from lidar.tools.maps.squares import INDEX, NAMES, Outliers, open_tiles, thin
 
 _MOST_DRAWN = 5_000_000
 """Points of a map up to which notebooks show a picture of it."""

@@ -17,10 +17,9 @@ import numpy as np
 from geoscene.errors import need
 from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
-from lidar.tools.odometry.deskewing import still
 from lidar.tools.odometry.estimate import MotionEstimate, propagate
 from lidar.tools.odometry.local_map import LocalMap
-from lidar.tools.odometry.scans import SweepSequence
+from lidar.tools.odometry.scans import SweepSequence, still
 from lidar.tools.odometry.settings import OdometrySettings
 
 _LEAST = 50  # points of a sweep, below which the vehicle moves on as before

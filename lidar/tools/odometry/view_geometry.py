@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.errors import need
 from geoscene.typing import Bools, Float
-from lidar.tools.odometry.deskewing import moved_back
+from lidar.tools.odometry.scans import moved_back
 
 _FORWARD = 0.34  # cosine of 70 degrees: bearings nearer to the axis have image coordinates
 _CERTAIN = 0.999  # probability that a sample of the trials is without outliers

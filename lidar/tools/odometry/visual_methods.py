@@ -12,12 +12,16 @@ from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, color_images
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.odometry.deskewing import scaled_motion, still
 from lidar.tools.odometry.estimate import MotionEstimate, propagate
-from lidar.tools.odometry.feature_depths import laser_distances, stereo_distances
-from lidar.tools.odometry.features import ImageFeatures, camera_of, read_features
+from lidar.tools.odometry.features import (
+    ImageFeatures,
+    camera_of,
+    laser_distances,
+    read_features,
+    stereo_distances,
+)
 from lidar.tools.odometry.keyframes import Keyframe, close_loops
-from lidar.tools.odometry.scans import SweepSequence, scans_of
+from lidar.tools.odometry.scans import SweepSequence, scaled_motion, scans_of, still
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.visual_tracking import ENOUGH, FeatureDepths, Tracked, track_camera
 

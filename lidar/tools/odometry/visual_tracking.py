@@ -17,9 +17,9 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.recorded import Stream
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.odometry.deskewing import scaled_motion, still, turns
 from lidar.tools.odometry.features import ImageFeatures, matches, read_features
 from lidar.tools.odometry.keyframes import Keyframe, refine_window
+from lidar.tools.odometry.scans import scaled_motion, still, turns
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import Sighted, pose_of, triangulate, two_view_pose
 

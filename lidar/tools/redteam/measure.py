@@ -27,7 +27,7 @@ from lidar.tools.defences.registry import NamedDefence, judged_frames, lacks
 from lidar.tools.defences.scores import frame_truth
 from lidar.tools.detection import RULES
 from lidar.tools.detection.detector import KINDS
-from lidar.tools.detection.registry import read_detector
+from lidar.tools.detection.learned import read_detector
 
 KIND_OF = {code.name.lower(): kind for code, kind in KINDS.items()}
 """What the detector calls a class of road users, by its name in files of boxes."""

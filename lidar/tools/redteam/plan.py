@@ -14,7 +14,7 @@ from lidar.errors import InputError
 from lidar.parameters import check_parameters, parameter, read_values
 from lidar.tools.defences.registry import NamedDefence, read_defences
 from lidar.tools.detection import RULES
-from lidar.tools.detection.registry import read_detector
+from lidar.tools.detection.learned import read_detector
 from lidar.tools.sweep.grid import GridDrive, drives_of, naming, text_of
 
 GOALS = ("forge", "hide", "mislead")
@@ -111,7 +111,7 @@ class Attack:
 class Measure:
     """Parameters of the evaluation of a matrix.
 
-    detector : what reports road users, as for `lidar.tools.detection.registry.read_detector`; several are
+    detector : what reports road users, as for `lidar.tools.detection.learned.read_detector`; several are
                measured on the same drives and stand side by side
 
     Raises InputError for values that are out of bounds.

@@ -13,9 +13,8 @@ from PIL import Image
 from geoscene.errors import InputError
 from geoscene.options import BuildOptions
 from geoscene.sources import demo_path, read_osm
-from geoscene.tradeoff.engine import BuildCost, BuildRow, BuildTradeoff, tradeoff
+from geoscene.tradeoff.engine import BuildCost, BuildRow, BuildTradeoff, coarse_elevation, tradeoff, variants
 from geoscene.tradeoff.report import document, pareto, recommendations, write_report
-from geoscene.tradeoff.variants import coarse_elevation, variants
 
 BOX = (24.9400, 60.1660, 24.9430, 60.1675)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from geoscene.classes import Class
 from geoscene.geometry.mesh import FLOOR, ROOF, WALL, Mesh, ShapeInstances, concatenate
-from geoscene.view.coarse import coarser_mesh, fewer_instances
+from geoscene.view.streamed import coarser_mesh, fewer_instances
 
 BOX = (0.0, 0.0, 64.0, 64.0)
 

@@ -22,7 +22,7 @@ from geoscene.pipeline.build import build
 from geoscene.scene.tile_files import Tile
 from geoscene.sources import demo_path, read_osm
 from geoscene.view import view_scene
-from geoscene.view.lonlat import ACCURACY, lonlat_grid
+from geoscene.view.contents import ACCURACY, lonlat_grid
 from geoscene.view.looks import FacadeLooks, read_looks
 from geoscene.view.tiles import STEP, Groups, groups_of, pack_tile
 

@@ -21,7 +21,7 @@ from lidar.tools.defences.defend import calibrate, defend
 from lidar.tools.defences.observation import SEEN, read_scans
 from lidar.tools.defences.registry import DEFENCES, DETECTOR, read_defences
 from lidar.tools.defences.returns import Physics
-from lidar.tools.detection.registry import read_detector
+from lidar.tools.detection.learned import read_detector
 from lidar.tools.integrity.watermark import WatermarkKey
 from lidar.tools.sign import sign_dataset
 

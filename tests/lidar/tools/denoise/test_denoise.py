@@ -16,9 +16,8 @@ from lidar.sensors.physics.echoes import Origin
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages
-from lidar.tools.denoise.denoise import denoise
+from lidar.tools.denoise.denoise import FilterTally, denoise
 from lidar.tools.denoise.filters import METHODS, Ddior, Dror, Dsor, Lior, StatisticalFilter, read_methods
-from lidar.tools.denoise.scores import FilterTally
 
 
 def wall(distance, *, step=0.05):

@@ -21,10 +21,16 @@ from geoscene.scene import Scene
 from lidar.errors import DatasetError, FormatError, InputError
 from lidar.options import DriveOptions
 from lidar.simulation.drive import drive
-from lidar.tools.detection.features import FEATURES
 from lidar.tools.detection.forest import forest_of, read_forest
-from lidar.tools.detection.learned import CLASSES, Learned, read_model, scores_of
-from lidar.tools.detection.registry import MODEL, read_detector
+from lidar.tools.detection.learned import (
+    CLASSES,
+    FEATURES,
+    MODEL,
+    Learned,
+    read_detector,
+    read_model,
+    scores_of,
+)
 from lidar.tools.redteam.evaluate import accuracies
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure

@@ -13,16 +13,20 @@ from lidar.dataset.layouts.kitti import true_lines
 from lidar.dataset.layouts.kitti_drive import read_drive
 from lidar.dataset.layouts.nuscenes import token_of
 from lidar.errors import FormatError, InputError
-from lidar.tools.detection.registry import read_detector
+from lidar.tools.detection.learned import read_detector
 from lidar.tools.evaluation.detect import detect
 from lidar.tools.evaluation.kitti_detection import (
     DIFFICULTIES,
     LIKE,
     OVERLAPS,
     Labels,
+    area_overlap,
     evaluate_kitti,
+    flat_overlap,
+    footprints,
     labels_of,
     read_labels,
+    volume_overlap,
 )
 from lidar.tools.evaluation.nuscenes_detection import (
     ERRORS,
@@ -32,8 +36,7 @@ from lidar.tools.evaluation.nuscenes_detection import (
     samples_of,
     true_boxes,
 )
-from lidar.tools.evaluation.objects import evaluate_objects, kind_of
-from lidar.tools.evaluation.overlap import area_overlap, flat_overlap, footprints, volume_overlap
+from lidar.tools.evaluation.objects import evaluate_objects, kind_of, true_lines
 
 
 def made(seed, frames=12):

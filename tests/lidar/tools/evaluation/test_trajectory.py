@@ -20,18 +20,26 @@ from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
 from lidar.options import EvaluateOptions
-from lidar.tools.evaluation.figures import qualities
-from lidar.tools.evaluation.intervals import correlation_time, statistics
-from lidar.tools.evaluation.matching import PosePairs, alignment, match_poses
 from lidar.tools.evaluation.pose_errors import (
     absolute,
     by_axis,
+    correlation_time,
     lengths_for,
     over_frames,
     over_metres,
     segments,
+    statistics,
 )
-from lidar.tools.evaluation.trajectories import Path3D, read_path, read_truth, true_path
+from lidar.tools.evaluation.report import qualities
+from lidar.tools.evaluation.trajectories import (
+    Path3D,
+    PosePairs,
+    alignment,
+    match_poses,
+    read_path,
+    read_truth,
+    true_path,
+)
 from lidar.tools.evaluation.trajectory import evaluate_trajectory
 from lidar.tools.odometry.estimate import MotionEstimate, write_estimate
 

@@ -17,8 +17,7 @@ from geoscene.sources import demo_path, read_osm
 from lidar.errors import InputError
 from lidar.geometry.box_tree import lower_to_nearest, tree_of
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.tools.maps.compare import LIMIT, SurfaceComparison
-from lidar.tools.maps.surfaces import TrueSurfaces
+from lidar.tools.maps.compare import LIMIT, SurfaceComparison, TrueSurfaces
 from lidar.world.world import World
 
 BOX = (24.9405, 60.1660, 24.9425, 60.1670)

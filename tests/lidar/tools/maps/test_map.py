@@ -83,7 +83,7 @@ def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
 
 @pytest.mark.parametrize("voxel", [None, 0.5])
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, voxel):
-    monkeypatch.setattr("lidar.tools.maps.voxels._SHRINK_AT", 200_000)
+    monkeypatch.setattr("lidar.tools.maps.squares._SHRINK_AT", 200_000)
     peaks = []
     for frames in (10, 60):
         data = dataset(tmp_path / f"d{frames}", first=100, frames=frames, n=5000)  # at rest

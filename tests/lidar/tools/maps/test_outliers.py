@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from lidar.errors import InputError
 from lidar.options import MapOptions
-from lidar.tools.maps import outliers
+from lidar.tools.maps import squares
 from lidar.tools.maps.aggregate import aggregate
-from lidar.tools.maps.outliers import Outliers
+from lidar.tools.maps.squares import Outliers
 
 OFFSET = (500_000.0, 6_700_000.0, 0.0)
 
@@ -29,7 +29,7 @@ def kept_of_all_pairs(points, neighbours, factor):
     """Whether each point is kept, by the distances of all pairs."""
     away = np.sort(np.linalg.norm(points[:, None] - points, axis=2), axis=1)[:, 1 : neighbours + 1]
     short = np.pad(away, ((0, 0), (0, max(0, neighbours - away.shape[1]))), constant_values=np.inf)
-    spacing = np.minimum(short, outliers._FARTHEST).mean(axis=1)
+    spacing = np.minimum(short, squares._FARTHEST).mean(axis=1)
     return spacing <= spacing.mean() + factor * spacing.std() + 1e-6
 
 

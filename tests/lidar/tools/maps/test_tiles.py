@@ -18,7 +18,7 @@ from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
 from lidar.options import MapOptions
 from lidar.tools.maps.aggregate import aggregate
-from lidar.tools.maps.tiles import INDEX, open_tiles
+from lidar.tools.maps.squares import INDEX, open_tiles
 
 SIDE = 10
 

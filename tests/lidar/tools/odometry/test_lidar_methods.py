@@ -15,11 +15,10 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.trajectory_files import read_tum
 from lidar.motion.replay import read_replay
 from lidar.options import OdometryOptions
-from lidar.tools.odometry.deskewing import still
 from lidar.tools.odometry.estimate import propagate
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.run import estimate_motion
-from lidar.tools.odometry.scans import scans_of
+from lidar.tools.odometry.scans import scans_of, still
 from lidar.tools.odometry.settings import OdometrySettings, read_settings
 
 SETTINGS = OdometrySettings()

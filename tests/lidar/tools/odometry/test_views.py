@@ -12,10 +12,17 @@ from lidar.errors import DatasetError
 from lidar.geometry.attitude import Mount
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
-from lidar.tools.odometry.deskewing import moved_back, scaled_motion
-from lidar.tools.odometry.feature_depths import laser_distances, stereo_distances, unhidden
-from lidar.tools.odometry.features import ImageFeatures, _spread, matches, read_features
+from lidar.tools.odometry.features import (
+    ImageFeatures,
+    _spread,
+    laser_distances,
+    matches,
+    read_features,
+    stereo_distances,
+    unhidden,
+)
 from lidar.tools.odometry.keyframes import Keyframe, close_loops, refine_window
+from lidar.tools.odometry.scans import moved_back, scaled_motion
 from lidar.tools.odometry.settings import OdometrySettings
 from lidar.tools.odometry.view_geometry import (
     Sighted,

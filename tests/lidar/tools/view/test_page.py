@@ -25,9 +25,9 @@ from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options import PlaybackOptions
 from lidar.tools.view import view_drive
-from lidar.tools.view.server import DriveServer
+from lidar.tools.view.live import colored_points, show_window
+from lidar.tools.view.page import DriveServer
 from lidar.tools.view.sweeps import planes
-from lidar.tools.view.window import colored_points, show_window
 
 
 @pytest.fixture(scope="module")

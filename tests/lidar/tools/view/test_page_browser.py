@@ -15,7 +15,7 @@ from lidar.dataset.layout import open_dataset
 from lidar.options import PlaybackOptions
 from lidar.sensors.physics.echoes import Origin
 from lidar.tools.view import view_drive
-from lidar.tools.view.server import DriveServer
+from lidar.tools.view.page import DriveServer
 from lidar.tools.view.sweeps import ANGLE_STEP, RANGE_STEP, TIME_STEP_NS
 
 BACKGROUND = (16, 18, 24)
