@@ -214,11 +214,7 @@ def _average(
         right = wrong = 0
         for frame, role in zip(frames, roles, strict=True):
             found = _match(
-                frame.overlap[measure] > limit,
-                frame,
-                roles=role,
-                best=frame.overlap[measure],
-                least=least,
+                frame.overlap[measure] > limit, frame, roles=role, best=frame.overlap[measure], least=least
             )
             right, wrong = right + len(found.scores), wrong + found.wrong
         precision[k] = right / (right + wrong) if right + wrong else 0.0

@@ -131,8 +131,7 @@ def drift(compared: Compared) -> Figure:
     parts = [
         Panel(Axes(title, "true way, m", "m"), [Series("translation", way, moved)]),
         Panel(
-            Axes("", "true way, m", "degrees"),
-            [Series("rotation", way, np.degrees(turned), color=COLORS[1])],
+            Axes("", "true way, m", "degrees"), [Series("rotation", way, np.degrees(turned), color=COLORS[1])]
         ),
     ]
     rows = [row for row in compared.errors.segments if row.length is not None]

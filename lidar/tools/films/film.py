@@ -162,12 +162,7 @@ def _shown_ns(lead: Stream, *, speed: float) -> Ints:
 
 
 def _laid_out(
-    dataset: Dataset,
-    sweeps: Sweeps | None,
-    *,
-    cameras: list[Images],
-    time_ns: Ints,
-    options: FilmOptions,
+    dataset: Dataset, sweeps: Sweeps | None, *, cameras: list[Images], time_ns: Ints, options: FilmOptions
 ) -> Placed:
     """The panes and their upper left corners."""
     width, height = options.size[0], options.size[1] - _STATUS

@@ -142,10 +142,7 @@ class Sweeps:
         """A cloud and its returns (n, 3) in the scene."""
         table = cloud_points(self.dataset.frame_file(stream.files[row]))
         placed, _ = placed_returns(
-            table,
-            self.trajectory,
-            start_ns=int(stream.time_ns[row]),
-            vehicle_from_sensor=stream.mount.matrix,
+            table, self.trajectory, start_ns=int(stream.time_ns[row]), vehicle_from_sensor=stream.mount.matrix
         )
         return table, placed
 

@@ -37,7 +37,7 @@ _WRITTEN = 1 << 20  # points that are written at once
 
 
 class Squares:
-    """Records of points by square; coordinates are less a whole-metre offset, so that borders are exact.
+    """Records of points by square, files of a folder; coordinates are less an offset of whole metres.
 
     side : metres
     """
@@ -95,15 +95,6 @@ class Squares:
         return table
 
 
-@contextmanager
-def squares_beside(
-    out: Path, side: float, *, offset: tuple[float, float, float], what: str
-) -> Iterator[Squares]:
-    """Yield empty `Squares` in a temporary folder beside a map; ``what`` is part of its name."""
-    with temporary_folder(out, what) as folder:
-        yield Squares(folder, side, offset=offset)
-
-
 def nearest_to_centre(data: NDArray[np.void], voxel: float) -> NDArray[np.void]:
     """The record nearest to the centre of each voxel; of equally near ones the earliest."""
     xyz = np.column_stack([data[k] for k in "xyz"])
@@ -123,7 +114,8 @@ def thin(
     # The side is a multiple of the voxel, so that no voxel spans two squares.
     side = max(1.0, np.ceil(_BUCKET / voxel)) * voxel
     limits: dict[Square, int] = {}  # bytes at which a square's file is thinned
-    with squares_beside(out, side, offset=offset, what="voxels") as squares:
+    with temporary_folder(out, "voxels") as folder:
+        squares = Squares(folder, side, offset=offset)
         for table in tables:
             for square in squares.add(nearest_to_centre(squares.records(table), voxel)):
                 path = squares.path(square)
@@ -152,7 +144,8 @@ class Outliers:
         self, tables: Iterator[Table], *, out: Path, offset: tuple[float, float, float]
     ) -> Iterator[Table]:
         """The tables without outliers, square by square; points are on disk meanwhile, beside ``out``."""
-        with squares_beside(out, _SIDE, offset=offset, what="outliers") as squares:
+        with temporary_folder(out, "outliers") as folder:
+            squares = Squares(folder, _SIDE, offset=offset)
             for table in tables:
                 squares.add(squares.records(table))
             count, total, squared = 0, 0.0, 0.0
@@ -211,7 +204,8 @@ def open_tiles(
     squares with file name, number of points, and least and greatest height.
     """
     east, north = (int(v // side) * side for v in info.offset[:2])
-    with squares_beside(folder / INDEX, side, offset=(east, north, 0.0), what="squares") as squares:
+    with temporary_folder(folder / INDEX, "squares") as beside:
+        squares = Squares(beside, side, offset=(east, north, 0.0))
 
         def append(table: Table) -> None:
             # As files hold them: a rounded coordinate can be beyond a border.

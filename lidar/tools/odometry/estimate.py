@@ -63,16 +63,15 @@ class MotionEstimate:
         return float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).sum())
 
 
-def propagate(poses: Float, step_covariance: Float, *, first: Float | None = None) -> Float:
+def propagate(poses: Float, step_covariance: Float) -> Float:
     """Standard deviations (n, 6) of poses whose steps have errors that do not depend on each other.
 
     poses           : (n, 4, 4)
     step_covariance : (n - 1, 6, 6) of small rotations and translations along the axes of the later pose
-    first           : (6, 6) covariance of the first pose along its own axes; none by default
 
     The errors of rotations move the later positions (first order; Barfoot and Furgale 2014).
     """
-    covariance = np.zeros((6, 6)) if first is None else first
+    covariance = np.zeros((6, 6))
     found = [covariance]
     for step, added in zip(np.linalg.inv(poses[:-1]) @ poses[1:], step_covariance, strict=True):
         back = _adjoint(np.linalg.inv(step))

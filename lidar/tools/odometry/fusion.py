@@ -326,9 +326,7 @@ class _Graph:
         yaw = gtsam.Rot3.Yaw(first.rotation().yaw())
         graph.add(
             gtsam.PriorFactorPose3(
-                self._pose(0),
-                gtsam.Pose3(yaw, first.translation()),
-                gtsam.noiseModel.Diagonal.Sigmas(loose),
+                self._pose(0), gtsam.Pose3(yaw, first.translation()), gtsam.noiseModel.Diagonal.Sigmas(loose)
             )
         )
         if self._unit is not None:

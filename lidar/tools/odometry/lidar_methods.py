@@ -271,9 +271,5 @@ def _seconds(scans: SweepSequence) -> float:
     return 1.0 / float(scans.streams[0].sensor["rate_hz"])
 
 
-LIDAR_METHODS: dict[str, _Method] = {
-    "kiss-icp": _kiss_icp,
-    "genz-icp": _genz_icp,
-    "small_gicp": _small_gicp,
-}
+LIDAR_METHODS: dict[str, _Method] = {"kiss-icp": _kiss_icp, "genz-icp": _genz_icp, "small_gicp": _small_gicp}
 """Methods by their names."""

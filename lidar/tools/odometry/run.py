@@ -101,12 +101,7 @@ def _name_of(dataset: Dataset, kind: str, *, names: tuple[str, ...]) -> str:
 
 
 def _relative(
-    dataset: Dataset,
-    method: str,
-    *,
-    names: tuple[str, ...],
-    settings: OdometrySettings,
-    progress: Progress,
+    dataset: Dataset, method: str, *, names: tuple[str, ...], settings: OdometrySettings, progress: Progress
 ) -> MotionEstimate | None:
     """The estimate of a method of odometry; of the first that the data allow, or None, for an empty one."""
     if method == "none":

@@ -18,11 +18,7 @@ class OdometrySettings:
     """Settings of odometry; docs/reference/odometry.md lists them."""
 
     min_range: float = parameter(
-        3.0,
-        "range of a scanner, below which points are left out",
-        unit="m",
-        low=0,
-        high=1000,
+        3.0, "range of a scanner, below which points are left out", unit="m", low=0, high=1000
     )
     max_range: float = parameter(
         0.0,
@@ -61,35 +57,19 @@ class OdometrySettings:
         high=1e4,
     )
     loop_path: float = parameter(
-        30.0,
-        "least length of the way between such keyframes",
-        unit="m",
-        low=1,
-        high=1e6,
+        30.0, "least length of the way between such keyframes", unit="m", low=1, high=1e6
     )
     depth_radius: float = parameter(
-        12.0,
-        "distance from a feature in which laser points tell its depth",
-        unit="pixels",
-        low=1,
-        high=200,
+        12.0, "distance from a feature in which laser points tell its depth", unit="pixels", low=1, high=200
     )
     knot_s: float = parameter(
-        0.2,
-        "time between the poses of a fusion without odometry",
-        unit="s",
-        low=0.01,
-        high=10,
+        0.2, "time between the poses of a fusion without odometry", unit="s", low=0.01, high=10
     )
     gate: float = parameter(
         0.999, "probability that a fix without fault passes the chi-square test", low=0.5, high=0.999999
     )
     correlation_s: float = parameter(
-        10.0,
-        "time for which the errors of fixes are taken as the same",
-        unit="s",
-        low=0,
-        high=3600,
+        10.0, "time for which the errors of fixes are taken as the same", unit="s", low=0, high=3600
     )
 
     def __post_init__(self) -> None:

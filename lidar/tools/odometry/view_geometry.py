@@ -78,12 +78,7 @@ def tangents(bearing: Float) -> Float:
 
 
 def pose_of(
-    sighted: Sighted,
-    *,
-    start: Float,
-    trials: int,
-    rng: np.random.Generator,
-    prior: Float | None = None,
+    sighted: Sighted, *, start: Float, trials: int, rng: np.random.Generator, prior: Float | None = None
 ) -> tuple[Float, Bools, Float] | None:
     """Camera pose from known points (PnP), the inliers (n,) and the pose's covariance (6, 6).
 

@@ -223,13 +223,7 @@ def _matches(last: Keyframe, features: ImageFeatures, *, expected: Float | None)
 
 
 def _keyframe(
-    row: int,
-    features: ImageFeatures,
-    *,
-    pose: Float,
-    rate: Float,
-    measure: FeatureDepths | None,
-    tracks: int,
+    row: int, features: ImageFeatures, *, pose: Float, rate: Float, measure: FeatureDepths | None, tracks: int
 ) -> Keyframe:
     """A keyframe with the distances that are measured."""
     distance, fuzz = np.full(len(features), np.nan), np.full(len(features), np.nan)

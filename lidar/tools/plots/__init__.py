@@ -75,11 +75,7 @@ _FIGURES = (
     ),
 )
 
-FIGURES: Registry[Figure] = Registry(
-    "figure",
-    {row.name: row for row in _FIGURES},
-    error=InputError,
-)
+FIGURES: Registry[Figure] = Registry("figure", {row.name: row for row in _FIGURES}, error=InputError)
 """The figures of a dataset by name."""
 
 

@@ -57,21 +57,8 @@ _PATH_POINTS = 4000
 """Points of the path on the plan, at most."""
 
 _BOX = (
-    "id",
-    "instance",
-    "x",
-    "y",
-    "z",
-    "qx",
-    "qy",
-    "qz",
-    "qw",
-    "length",
-    "width",
-    "height",
-    "vx",
-    "vy",
-    "points",
+    *("id", "instance", "x", "y", "z", "qx", "qy", "qz", "qw"),
+    *("length", "width", "height", "vx", "vy", "points"),
 )
 
 
