@@ -39,7 +39,7 @@ from lidar.tools.defences.calibration import read_calibration
 from lidar.tools.detection.forest import read_forest
 from lidar.tools.integrity.digests import read_digests, read_links
 from lidar.tools.integrity.keys import read_signer
-from lidar.tools.maps.selection import _polygons
+from lidar.tools.maps.source import _polygons
 from lidar.tools.redteam.plan import read_plan
 from lidar.tools.sweep.grid import read_grid
 from lidar.traffic.fcd import read_fcd

@@ -22,12 +22,18 @@ from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import MapOptions
-from lidar.tools.maps.colors import distinct, ramp
+from lidar.tools.maps.colors import ImageColors, distinct, ramp
 from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances
-from lidar.tools.maps.image_colors import ImageColors
 from lidar.tools.maps.rasters import Rasters
-from lidar.tools.maps.selection import Selection
-from lidar.tools.maps.source import COLUMNS, MapClouds, PoseErrors, pose_errors, read_poses, write_poses
+from lidar.tools.maps.source import (
+    COLUMNS,
+    MapClouds,
+    PoseErrors,
+    Selection,
+    pose_errors,
+    read_poses,
+    write_poses,
+)
 from lidar.tools.maps.squares import INDEX, NAMES, Outliers, open_tiles, thin
 
 _MOST_DRAWN = 5_000_000
