@@ -307,12 +307,9 @@ def _row(
     error = _errors(_Measures.of(scene, grid), exact)
     note = "" if any(error.values()) or lost else "no error here"
     if variant.options.use != "all":
-        note = "; ".join(filter(None, (note, f"no {', '.join(_left_out(scene))}")))
+        lacks = [name for name in ("features", "attributes") if scene.manifest["left_out"].get(name)]
+        note = "; ".join(filter(None, (note, f"no {', '.join(lacks)}")))
     return BuildRow(variant.label, costs, error, lost, note)
-
-
-def _left_out(scene: Scene) -> list[str]:
-    return [name for name in ("features", "attributes") if scene.manifest["left_out"].get(name)]
 
 
 def _errors(found: _Measures, exact: _Measures) -> dict[str, Any]:

@@ -192,7 +192,8 @@ def _scores(
         clouds = foreign_clouds(source)
         if not clouds:
             raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
-        job, count, frames = None, len(clouds), _foreign_frames(clouds, source, out=out)
+        job, count = None, len(clouds)
+        frames = (_ForeignFrame(path, form, source=source, out=out) for path, form in clouds)
     scores: dict[str, dict[str, FilterTally]] = {text: {} for text in methods}
     for done, frame in enumerate(frames):
         progress("frames", done, total=count)
@@ -307,11 +308,6 @@ def _filtered_truth(truth: dict[str, NDArray[Any]], kept: Bools) -> dict[str, ND
 
 
 # KITTI and nuScenes.
-
-
-def _foreign_frames(clouds: list[tuple[Path, Format]], source: Path, *, out: Path | None) -> Iterator[_Frame]:
-    for path, form in clouds:
-        yield _ForeignFrame(path, form, source=source, out=out)
 
 
 class _ForeignFrame(_Frame):

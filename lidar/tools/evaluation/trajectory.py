@@ -176,7 +176,7 @@ def evaluate_trajectory(
         alignment=motion,
         translation=statistics(moved),
         rotation=statistics(np.degrees(turned)),
-        relative=[_relative(aligned, delta) for delta in options.delta if _fits(aligned, delta)],
+        relative=[one for delta in options.delta if (one := _relative(aligned, delta)) is not None],
         segments=_segment_errors(parts, float(way[-1])),
         kitti=len(parts) > 0 and float(parts.length.min()) >= KITTI_LENGTHS[0],
         map=distances,
@@ -184,18 +184,14 @@ def evaluate_trajectory(
     return Compared(errors, aligned, parts, dataset)
 
 
-def _pairs_apart(pairs: PosePairs, delta: str) -> Any:
+def _relative(pairs: PosePairs, delta: str) -> RelativeError | None:
+    """Errors of pairs of poses that are a number of frames or metres apart; None without such pairs."""
     if delta.endswith("f"):
-        return over_frames(pairs, int(delta[:-1]))
-    return over_metres(pairs, float(delta[:-1]))
-
-
-def _fits(pairs: PosePairs, delta: str) -> bool:
-    return len(_pairs_apart(pairs, delta)) > 0
-
-
-def _relative(pairs: PosePairs, delta: str) -> RelativeError:
-    found = _pairs_apart(pairs, delta)
+        found = over_frames(pairs, int(delta[:-1]))
+    else:
+        found = over_metres(pairs, float(delta[:-1]))
+    if not len(found):
+        return None
     least = int(np.median(found.last - found.first))
     return RelativeError(
         delta, statistics(found.shift, least=least), statistics(np.degrees(found.turn), least=least)

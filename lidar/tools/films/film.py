@@ -144,12 +144,9 @@ def _slow_enough(lead: Stream, *, speed: float, shortest_ns: int) -> tuple[Strea
     step = math.ceil(shortest_ns * speed / float(np.median(np.diff(lead.time_ns))) - 1e-6)
     if step <= 1:
         return lead, []
-    note = f"each {_nth(step)} frame only: at this speed all would be {step} times too many a second"
+    ending = {2: "nd", 3: "rd"}.get(step, "th")
+    note = f"each {step}{ending} frame only: at this speed all would be {step} times too many a second"
     return frames_within(lead, (0, math.inf), every=step), [note]
-
-
-def _nth(number: int) -> str:
-    return f"{number}{ {2: 'nd', 3: 'rd'}.get(number, 'th') }"
 
 
 def _shown_ns(lead: Stream, *, speed: float) -> Ints:

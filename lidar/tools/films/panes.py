@@ -104,7 +104,8 @@ class Sweeps:
         """Returns (n, 3) in the scene, their colours, and which are of road users that move."""
         parts = []
         for k, stream in enumerate(self._streams):
-            mine = row if k == 0 else self._latest(stream, int(self.time_ns[row]))
+            after = np.searchsorted(stream.time_ns, self.time_ns[row], side="right")
+            mine = row if k == 0 else int(after) - 1
             if mine < 0:
                 continue
             table, placed = self._cloud(stream, mine)
@@ -145,9 +146,6 @@ class Sweeps:
             table, self.trajectory, start_ns=int(stream.time_ns[row]), vehicle_from_sensor=stream.mount.matrix
         )
         return table, placed
-
-    def _latest(self, stream: Stream, time_ns: int) -> int:
-        return int(np.searchsorted(stream.time_ns, time_ns, side="right")) - 1
 
     def _truth(self, stream: Stream, row: int, *, count: int | None = None) -> NDArray[np.uint8] | None:
         path = self.dataset.frame_file(self.dataset.paths.truth(stream.name, int(stream.frames[row])))

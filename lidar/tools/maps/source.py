@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from geoscene.classes import Class
-from geoscene.typing import Ints
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import Table, placed_returns, rows
 from lidar.dataset.ground_truth import read_truth
@@ -206,7 +205,7 @@ def read_poses(path: Path, dataset: Dataset) -> Trajectory:
 def pose_errors(found: Trajectory, true: Trajectory) -> PoseErrors:
     """Errors of a trajectory, every 0.1 s of the time that it shares with the true one."""
     first, last = max(found.time_ns[0], true.time_ns[0]), min(found.time_ns[-1], true.time_ns[-1])
-    time_ns = _even_times(first, last)
+    time_ns = np.unique(np.append(np.arange(first, last, _STEP_NS), last))
     here, there = found.at(time_ns), true.at(time_ns)
     off = (here.position - there.position) / there.scale
     ahead = np.einsum("nji,nj->ni", there.rotation, here.rotation[:, :, 0])
@@ -219,11 +218,6 @@ def write_poses(path: Path, trajectory: Trajectory, *, dataset: Dataset) -> None
     position = trajectory.position / [trajectory.scale[0], trajectory.scale[0], 1.0]
     time_ns = posix_ns(dataset.start) + trajectory.time_ns
     write_tum(path, time_ns, position=position, quat_xyzw=trajectory.quat_xyzw)
-
-
-def _even_times(first: int, last: int) -> Ints:
-    """Times every `_STEP_NS` from the first to the last, and the last."""
-    return np.unique(np.append(np.arange(first, last, _STEP_NS), last))
 
 
 def _readable(frames: tuple[str, ...]) -> list[Format]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -24,7 +23,7 @@ from lidar.options import OdometryOptions
 from lidar.sensors.rig.specs import PRESETS, ImuSpec, Noise, rig_of
 from lidar.tools.odometry.estimate import OWN_FILES, MotionEstimate, begun_at, write_estimate
 from lidar.tools.odometry.fusion import Fixed, fixes_of, fuse_measurements, unit_of
-from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
+from lidar.tools.odometry.lidar_methods import lidar_odometry
 from lidar.tools.odometry.scans import scans_of
 from lidar.tools.odometry.settings import OdometrySettings, read_settings
 from lidar.tools.odometry.visual_methods import VISUAL_METHODS, visual_odometry
@@ -108,12 +107,18 @@ def _relative(
         return None
     for one in [method] if method else ["small_gicp", "stereo"]:
         with suppress(*(() if method else (DatasetError,))):
-            if one in LIDAR_METHODS:
-                scans = scans_of(dataset, names, least=settings.min_range, most=settings.max_range or None)
-                return lidar_odometry(scans, one, settings=settings, progress=progress)
-            if one in VISUAL_METHODS:
-                return visual_odometry(dataset, one, names=names, settings=settings, progress=progress)
+            return _estimated(dataset, one, names=names, settings=settings, progress=progress)
     return None
+
+
+def _estimated(
+    dataset: Dataset, method: str, *, names: tuple[str, ...], settings: OdometrySettings, progress: Progress
+) -> MotionEstimate:
+    """The estimate of a method of scanners or cameras."""
+    if method in VISUAL_METHODS:
+        return visual_odometry(dataset, method, names=names, settings=settings, progress=progress)
+    scans = scans_of(dataset, names, least=settings.min_range, most=settings.max_range or None)
+    return lidar_odometry(scans, method, settings=settings, progress=progress)
 
 
 def _noise(dataset: Dataset, unit: str, *, grade: str) -> Noise:
@@ -184,7 +189,11 @@ def estimate_motion(
     settings = read_settings(options.settings, path=options.settings_file)
     dataset, out = open_dataset(path), Path(out)
     check_target(out, source=dataset.path, overwrite=overwrite)
-    estimate = _METHODS[options.method](dataset, options, settings=settings, progress=progress)
+    given: dict[str, Any] = {"names": options.sensors, "settings": settings, "progress": progress}
+    if options.method == "fused":
+        estimate = fused_odometry(dataset, options.relative, grade=options.imu_grade, **given)
+    else:
+        estimate = _estimated(dataset, options.method, **given)
     if options.start_pose is not None and not estimate.in_scene:
         x, y, z, roll, pitch, yaw = options.start_pose
         place = (x, y, z, radians(roll), radians(pitch), radians(yaw))
@@ -201,39 +210,3 @@ def estimate_motion(
     with replaced_folder(out, own=lambda _: OWN_FILES.__contains__) as part:
         write_estimate(part, estimate, dataset=dataset)
     return OdometrySummary(estimate, estimate.length(), time.monotonic() - begin)
-
-
-def _by_lidar(
-    dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> MotionEstimate:
-    scans = scans_of(dataset, options.sensors, least=settings.min_range, most=settings.max_range or None)
-    return lidar_odometry(scans, options.method, settings=settings, progress=progress)
-
-
-def _by_camera(
-    dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> MotionEstimate:
-    return visual_odometry(
-        dataset, options.method, names=options.sensors, settings=settings, progress=progress
-    )
-
-
-def _by_fusion(
-    dataset: Dataset, options: OdometryOptions, *, settings: OdometrySettings, progress: Progress
-) -> MotionEstimate:
-    return fused_odometry(
-        dataset,
-        options.relative,
-        names=options.sensors,
-        grade=options.imu_grade,
-        settings=settings,
-        progress=progress,
-    )
-
-
-_METHODS: dict[str, Callable[..., MotionEstimate]] = {
-    "fused": _by_fusion,
-    **dict.fromkeys(LIDAR_METHODS, _by_lidar),
-    **dict.fromkeys(VISUAL_METHODS, _by_camera),
-}
-"""Function of each method."""

@@ -132,7 +132,7 @@ def scans_of(
             f"{dataset.path}: no clouds{of} in the sensor frame with times; drive with --format pcd"
         )
     if not names:
-        found = [max(found, key=_points_of_first)]
+        found = [max(found, key=lambda stream: format_of(stream.files[0]).count(stream.files[0]))]
     if len(found[0].frames) < 2:
         raise DatasetError(
             f"{dataset.path}: {len(found[0].frames)} sweep of {found[0].name}; odometry needs two or more"
@@ -154,7 +154,3 @@ def scans_of(
 def _clouds(dataset: Dataset, name: str) -> Stream | None:
     """A scanner's clouds with times, or those of KITTI, whose motion was removed; None without either."""
     return labelled_clouds(dataset, name) or clouds_in(dataset, name, form=FORMATS["kitti"])
-
-
-def _points_of_first(stream: Stream) -> int:
-    return int(format_of(stream.files[0]).count(stream.files[0]))
