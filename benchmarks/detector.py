@@ -18,7 +18,8 @@ from pathlib import Path
 
 from geoscene.scene.layout import SceneFiles
 from lidar.dataset.layout import Paths
-from lidar.tools.redteam.evaluate import DetectorAccuracy, accuracies
+from lidar.tools.detection.learned import MODEL
+from lidar.tools.redteam.evaluate import accuracies
 from lidar.tools.redteam.matrix import DetectorAccuracy
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import Measure

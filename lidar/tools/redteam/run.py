@@ -13,7 +13,7 @@ from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, silent
 from lidar.tools.detection import RULES
 from lidar.tools.detection.learned import read_detector
-from lidar.tools.redteam.evaluate import Figures, Matrix, evaluate
+from lidar.tools.redteam.evaluate import Figures, evaluate
 from lidar.tools.redteam.matrix import Matrix
 from lidar.tools.redteam.measure import AttackCase, measure_drive
 from lidar.tools.redteam.plan import RedteamPlan, Run, read_plan

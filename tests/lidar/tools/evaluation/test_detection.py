@@ -36,7 +36,7 @@ from lidar.tools.evaluation.nuscenes_detection import (
     samples_of,
     true_boxes,
 )
-from lidar.tools.evaluation.objects import evaluate_objects, kind_of, true_lines
+from lidar.tools.evaluation.objects import evaluate_objects, kind_of
 
 
 def made(seed, frames=12):
