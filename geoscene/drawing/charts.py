@@ -275,7 +275,7 @@ def spans(rows: Sequence[Span], *, title: str) -> bytes:
             if math.isfinite(row.share):
                 plot.plot(row.interval, (k, k), color=COLORS[0])
                 plot.plot(row.share, k, "o", color=COLORS[0])
-        plot.set(xlim=(-0.01, 1.01), ylim=(len(rows) - 0.5, -0.5), title=title)
+        plot.set(xlim=(-0.01, 1.01), ylim=(max(len(rows), 1) - 0.5, -0.5), title=title)
         plot.set_yticks(range(len(rows)), [row.name for row in rows])
         plot.xaxis.set_major_formatter(lambda value, _: f"{100 * value:g} %")
         plot.grid(visible=False, axis="y")

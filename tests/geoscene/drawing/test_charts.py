@@ -107,6 +107,10 @@ def test_charts_of_reports_are_whole_pictures(points):
         assert (picture == RED).all(axis=2).any()
 
 
+def test_shares_of_nothing_are_an_empty_chart():
+    assert Image.open(io.BytesIO(spans([], title="t"))).width == 1000
+
+
 def test_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.style", None)
     with pytest.raises(MissingExtraError, match=r"geoscene\[plots\]"):

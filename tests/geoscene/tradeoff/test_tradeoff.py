@@ -50,7 +50,7 @@ def test_report_has_table_plot_page_and_document(found, tmp_path):
     assert "http" not in page
     with Image.open(tmp_path / "pareto.png") as picture:
         assert picture.size == (1100, 700)
-        assert len(np.unique(np.asarray(picture).reshape(-1, 3), axis=0)) > 3
+        assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 3
 
 
 def row(label, cpu, rms, **missing):
