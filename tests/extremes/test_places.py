@@ -14,8 +14,17 @@ from lidar.simulation.plan import plan_drive
 from lidar.tools.selftest.places import CASES, write_elevation, write_hamlet
 from lidar.tools.selftest.run import outcome
 
+ARITHMETIC = 1000
+"""Samples from which on a case only computes, and takes seconds at most."""
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=[pytest.mark.gate] if case.quick >= ARITHMETIC else [])
+        for case in CASES
+    ],
+)
 def test_places_stay_within_the_bound(case):
     done = outcome(case, case.quick)
     assert done.error == ""

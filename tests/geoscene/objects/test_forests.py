@@ -88,6 +88,18 @@ def test_the_leaf_type_of_a_forest_decides_the_forms_of_its_trees():
     assert needled[feature == 5].mean() == pytest.approx(0.5, abs=0.1)
 
 
+def test_needle_leaved_trees_have_narrower_crowns():
+    plan = wood_plan(400.0)
+    ground = ground_tile(plan, 0, j=0, height=hill)
+    forests = Forests(np.array([5, 7]), np.array([0.0, 1.0]))
+    trees, _ = forest_trees(ground, forests, box=tile_box(plan, 0, j=0))
+    needled = trees.form == "needleleaved"
+    assert set(trees.feature[needled].tolist()) == {7}
+    share = trees.crown / trees.height
+    assert share[needled].max() == pytest.approx(0.4)
+    assert share[~needled].max() == pytest.approx(0.67)
+
+
 def test_a_tile_without_forest_has_no_trees():
     assert len(forest_instances(Mesh.empty(), NONE, box=(0, 0, 100, 100))) == 0
     assert forest_tree_count(Mesh.empty(), NONE, box=(0, 0, 100, 100)) == 0

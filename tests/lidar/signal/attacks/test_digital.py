@@ -16,7 +16,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.measurements import Fixes
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.registry import stages_of
 from lidar.signal.run import altered_cloud
@@ -198,11 +198,12 @@ def test_a_spoofed_receiver_is_led_away_as_told(kind):
     np.testing.assert_allclose(middles[inside], (true + drift)[inside], atol=0.02)
 
 
-def test_an_offset_to_the_left_is_across_the_driven_direction():
+@pytest.mark.parametrize(("course", "left"), [(np.pi / 2, [0, 3, 0]), (0.0, [-3, 0, 0])])
+def test_an_offset_to_the_left_is_across_the_driven_direction(course, left):
     stage = stages_of([{"name": "gnss_spoof", "kind": "step", "left": 3.0, "start": 0.0}]).stages[0].stage
-    before = fixes(course=np.pi / 2)  # eastwards
+    before = fixes(course=course)  # clockwise from north
     found = stage.fixes(before, at=Situation("gnss", 0), rng=np.random.default_rng(0))
-    np.testing.assert_allclose(offset(found, before)[10], [0, 3, 0], atol=5e-3)
+    np.testing.assert_allclose(offset(found, before)[10], left, atol=5e-3)
 
 
 def picture(depth=20.0):

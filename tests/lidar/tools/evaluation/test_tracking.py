@@ -58,6 +58,13 @@ def test_vans_are_neither_missed_nor_wrong_cars():
     assert score(true, {0: at((6, 400, "Pedestrian"))}, frames=1).missed == 1
 
 
+def test_a_van_beside_the_cars_adds_nothing_to_idf1():
+    """One track covers a car in each of two frames, and the same van beside both."""
+    true = {k: at((k, 0, "Car"), (9, 20, "Van")) for k in range(2)}
+    result = score(true, {k: at((5, 4, "Car")) for k in range(2)}, frames=2)
+    assert result.idf1 == pytest.approx(2 * 1 / (2 + 2))
+
+
 def test_files_of_kitti_and_of_mot_hold_the_same_tracks(tmp_path):
     line = "Car 0 0 0 100 100 200 250 1.5 2 4 1 1.5 20 0"
     (tmp_path / "k.txt").write_text(f"0 5 {line} 0.9\n2 5 {line} 0.8\n")
