@@ -13,8 +13,9 @@ import numpy as np
 
 from geoscene.geometry.frames import Frame
 from lidar.sensors.physics.reflect import WATER, fresnel
+from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.sensors.rig.scanner import firings, load_sensor
-from lidar.sensors.rig.specs import PRESETS, load_rig
+from lidar.sensors.rig.specs import load_rig
 
 Row = tuple[str, float, float, str, str]
 """Quantity, published value, computed value, unit, source."""

@@ -24,7 +24,7 @@ import numpy as np
 from geoscene.scene import open_scene
 from lidar.options import DriveOptions
 from lidar.sensors.laser.scan import cast, measure
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.run import altered_sweep
 from lidar.signal.truth import Altered, cloud_truth

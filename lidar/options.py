@@ -26,7 +26,7 @@ from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
 from lidar.geometry.time_scales import LONGEST_S
 from lidar.parameters import split_pairs
-from lidar.sensors.rig.specs import PRESETS
+from lidar.sensors.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
     from geoscene.pipeline.reach import RoadMap

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.physics.detector import quantise
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, number_echoes, select_reported, trace
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, number_echoes, select_reported, trace
 from lidar.sensors.physics.link import apparent_of_code, reflectivity_code
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.patterns.beams import Firings, T, unit_vectors
 from lidar.sensors.rig.scanner import Sensor, firings
 from lidar.signal.registry import Stages

@@ -18,7 +18,8 @@ from lidar.sensors.laser.cloud import Cloud, TracedCloud
 from lidar.sensors.laser.scan import Sweep, detect, deviates_of, report
 from lidar.sensors.navigation.measurements import Fixes, Inertial
 from lidar.sensors.physics.detector import added_noise
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, mix, trace
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, mix, trace
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation, row_changes
 from lidar.signal.stage import Pulses, pulses_of

@@ -14,8 +14,9 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.parameters import Parameters
 from lidar.sensors.physics.detector import receive
-from lidar.sensors.physics.echoes import Echoes, Origin, TracedEchoes, artificial_echoes, trace
+from lidar.sensors.physics.echoes import Echoes, TracedEchoes, artificial_echoes, trace
 from lidar.sensors.physics.link import apparent_of
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.patterns.beams import Firings
 from lidar.sensors.rig.scanner import Sensor
 from lidar.signal.situation import Situation

@@ -16,7 +16,7 @@ from lidar.sensors.laser.cloud import Cloud, TracedCloud
 from lidar.sensors.navigation.gnss import gnss_columns
 from lidar.sensors.navigation.imu import imu_columns
 from lidar.sensors.navigation.measurements import Fixes, Inertial
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 
 if TYPE_CHECKING:
     from lidar.sensors.camera.render import CameraImage

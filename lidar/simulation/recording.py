@@ -30,7 +30,8 @@ from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.settings import RecordingSettings
 from lidar.signal.situation import Effects
-from lidar.world.actors import Actors, Visibility
+from lidar.world.actors import Actors
+from lidar.world.visibility import Visibility
 
 if TYPE_CHECKING:
     from lidar.sensors.camera.render import CameraImage as Image

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Bools, Float
 from lidar.geometry.random_streams import generator
-from lidar.sensors.physics.echoes import Echoes, EchoesT, Origin, artificial_echoes
+from lidar.sensors.physics.echoes import Echoes, EchoesT, artificial_echoes
 from lidar.sensors.physics.link import (
     amplitude,
     apparent_of,
@@ -18,6 +18,7 @@ from lidar.sensors.physics.link import (
     false_alarm_probability,
     noise_of,
 )
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.reflect import RETRO
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.patterns.beams import Firings

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -14,6 +13,7 @@ from geoscene.support.columns import Columns
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.raycast.memory import inline
+from lidar.sensors.physics.origin import Origin
 
 
 class Gap(NamedTuple):
@@ -29,18 +29,6 @@ class Gap(NamedTuple):
 
 AXIS_ONLY = Gap()
 """Of a beam of one ray."""
-
-
-class Origin(IntEnum):
-    """Cause of an echo or a return."""
-
-    SURFACE = 0
-    WEATHER = 1
-    INTERFERENCE = 2
-    INJECTED = 3
-    REPLAYED = 4
-    MOVED = 5
-    RECEIVER = 6  # false alarms and blooming
 
 
 _MODES = ("strongest", "first", "last", "dual", "all")

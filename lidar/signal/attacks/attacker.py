@@ -19,8 +19,9 @@ from lidar.geometry.poses import Poses
 from lidar.parameters import parameter
 from lidar.raycast.geometry import ALL
 from lidar.sensors.physics.detector import METRES_PER_NS
-from lidar.sensors.physics.echoes import Origin, TracedEchoes, artificial_echoes, join, number_echoes, trace
+from lidar.sensors.physics.echoes import TracedEchoes, artificial_echoes, join, number_echoes, trace
 from lidar.sensors.physics.link import amplitude
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.scanner import Sensor, firings
 from lidar.signal.registry import Stages
 from lidar.signal.situation import Situation, degrees_of, point_of

@@ -13,7 +13,8 @@ from lidar.errors import InputError
 from lidar.parameters import parameter
 from lidar.raycast import Caster
 from lidar.sensors.physics.detector import has_code, shift_by_delay
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, in_body, power_of, sent_back
 from lidar.signal.situation import Situation
 from lidar.signal.stage import POSES, Pulses

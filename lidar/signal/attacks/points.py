@@ -11,7 +11,7 @@ from geoscene.classes import Class
 from geoscene.typing import Float, Ints
 from lidar.parameters import parameter
 from lidar.sensors.laser.cloud import TracedCloud
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import LABELS, Stage
 

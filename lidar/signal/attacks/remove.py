@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from lidar.parameters import parameter
 from lidar.sensors.physics.detector import METRES_PER_NS, has_code, shift_by_delay
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.attacks.attacker import DEVICES, Aim, Attacker, sent_back
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses

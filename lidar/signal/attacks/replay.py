@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from lidar.parameters import parameter
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.physics.detector import METRES_PER_NS, has_code, shift_by_delay
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.link import apparent_of_code
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.attacks.attacker import Aim, SynchronisedAttacker, TimedAttacker, power_of, sent_back
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses

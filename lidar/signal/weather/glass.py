@@ -16,8 +16,9 @@ from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.random_streams import generator
 from lidar.sensors.camera.light import sun_direction
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
 from lidar.sensors.physics.link import daylight_noise, false_alarm_probability
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, added_echoes

@@ -15,7 +15,8 @@ from lidar.errors import InputError
 from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import TracedCloud
-from lidar.sensors.physics.echoes import Origin, TracedEchoes
+from lidar.sensors.physics.echoes import TracedEchoes
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.situation import Situation
 from lidar.signal.stage import Pulses, added_echoes
 from lidar.signal.weather.backscatter import (

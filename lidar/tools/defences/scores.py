@@ -13,7 +13,7 @@ from geoscene.support.untrusted import read_arrays
 from geoscene.typing import Float
 from lidar.dataset.layout import reading_file
 from lidar.errors import DatasetError
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import ATTACKS, acts_on
 from lidar.tools.defences.observation import Observation, RecordedScans
 

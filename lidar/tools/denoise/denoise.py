@@ -35,7 +35,7 @@ from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
 from lidar.signal.truth import Altered, cloud_truth, trace_unaltered, write_truth

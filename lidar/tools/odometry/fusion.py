@@ -23,7 +23,7 @@ from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.errors import DatasetError
 from lidar.sensors.navigation.imu import EARTH_RATE, normal_gravity
 from lidar.sensors.navigation.measurements import NAMES, STATES, Inertial
-from lidar.sensors.rig.specs import Noise
+from lidar.sensors.rig.imu_grades import Noise
 from lidar.tools.odometry.estimate import along_axes
 from lidar.tools.odometry.settings import OdometrySettings
 

@@ -20,7 +20,8 @@ from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options import OdometryOptions
-from lidar.sensors.rig.specs import PRESETS, ImuSpec, Noise, rig_of
+from lidar.sensors.rig.imu_grades import PRESETS, Noise
+from lidar.sensors.rig.specs import ImuSpec, rig_of
 from lidar.tools.odometry.estimate import OWN_FILES, MotionEstimate, begun_at, write_estimate
 from lidar.tools.odometry.fusion import Fixed, fixes_of, fuse_measurements, unit_of
 from lidar.tools.odometry.lidar_methods import lidar_odometry

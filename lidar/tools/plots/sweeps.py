@@ -21,7 +21,7 @@ from lidar.dataset.recorded import Stream, cloud_points, frames_within, scanner_
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import Mount
 from lidar.options import PlotOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.tools.plots import WIDE, Drawn
 
 _WIDTH = 872

@@ -68,7 +68,7 @@ def test_an_aircraft_keeps_its_speed_and_banks_into_turns():
     assert speed.min() > 30.0  # slower only to limit the roll rate
     yaw = np.unwrap(euler_from_quat(trajectory.quat_xyzw)[:, 2])
     roll = euler_from_quat(trajectory.quat_xyzw)[:, 0]
-    across = speed * np.gradient(yaw, 0.05)
+    across = speed * np.gradient(yaw, 0.01)
     steep = np.abs(across) > 3.0
     assert steep.any()
     # coordinated: the bank that balances the turn, the left wing down in a left turn

@@ -9,7 +9,7 @@ from helpers.programs import run_program
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

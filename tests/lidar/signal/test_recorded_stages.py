@@ -16,7 +16,7 @@ from lidar.dataset.png import read_png
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
 from lidar.parameters import parameter
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import NamedStage, number_stages, read_stages
 from lidar.signal.stage import Stage
 from lidar.signal.weather.setting import read_weather

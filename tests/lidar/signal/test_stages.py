@@ -15,7 +15,8 @@ from lidar.parameters import parameter
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast, scan
-from lidar.sensors.physics.echoes import Origin, join
+from lidar.sensors.physics.echoes import join
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, PLAIN, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.faults import DroppedPackets

@@ -13,7 +13,7 @@ from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import read_stages
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive

@@ -13,7 +13,8 @@ from lidar.raycast import Caster
 from lidar.sensors.camera.outline import outline
 from lidar.sensors.laser.doppler import surface_velocity
 from lidar.world.actor_shapes import KINDS, PAINTS, ActorShape, catalogue
-from lidar.world.actors import Actors, Visibility
+from lidar.world.actors import Actors
+from lidar.world.visibility import Visibility
 
 SIZES = {
     "sedan": (4.4, 5.0, 1.7, 1.95, 1.35, 1.55),

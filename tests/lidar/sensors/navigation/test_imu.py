@@ -15,7 +15,8 @@ from lidar.sensors.navigation.imu import (
     observe_imu,
     true_inertial,
 )
-from lidar.sensors.rig.specs import PRESETS, ImuSpec
+from lidar.sensors.rig.imu_grades import PRESETS
+from lidar.sensors.rig.specs import ImuSpec
 
 FRAME = Frame.at(13.377704, 52.516275)
 PHI = np.radians(52.516275)

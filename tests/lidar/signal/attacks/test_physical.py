@@ -14,7 +14,7 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import cast
 from lidar.sensors.physics.detector import METRES_PER_NS
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.signal.attacks.attacker import DEVICES, check_sight, sent_only

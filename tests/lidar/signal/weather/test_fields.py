@@ -13,7 +13,8 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import Origin, trace
+from lidar.sensors.physics.echoes import trace
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import NamedStage, Stages, number_stages

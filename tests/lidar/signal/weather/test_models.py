@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from lidar.errors import InputError
 from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.scan import scan
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.registry import Stages
 from lidar.signal.run import altered_cloud

@@ -13,7 +13,7 @@ from lidar.geometry.poses import Poses
 from lidar.sensors.camera.light import daylight
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import CameraSpec

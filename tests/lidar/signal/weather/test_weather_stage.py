@@ -14,7 +14,7 @@ from geoscene.classes import Class
 from lidar.geometry.attitude import Mount
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.laser.scan import cast
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.sensors.physics.settings import LEVELS, ScannerSettings
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.signal.recorded import altered_recording

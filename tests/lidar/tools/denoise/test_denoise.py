@@ -12,7 +12,7 @@ from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.options import ApplyOptions, DriveOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

@@ -21,7 +21,7 @@ from lidar.geometry.georeference import Georeference
 from lidar.geometry.time_scales import gps_seconds
 from lidar.geometry.trajectory_files import read_trajectory, write_trajectory
 from lidar.options import ORIGINS, MapOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.tools.maps.aggregate import aggregate
 
 

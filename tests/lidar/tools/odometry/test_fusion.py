@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from lidar.errors import DatasetError, InputError
 from lidar.options import OdometryOptions
 from lidar.sensors.navigation.measurements import NAMES, Fixes, Inertial
-from lidar.sensors.rig.specs import PRESETS
+from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.tools.odometry.fusion import Fixed, Unit, fixes_of, fuse_measurements
 from lidar.tools.odometry.run import estimate_motion
 from lidar.tools.odometry.settings import OdometrySettings

@@ -13,7 +13,7 @@ from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.layout import open_dataset
 from lidar.options import PlaybackOptions
-from lidar.sensors.physics.echoes import Origin
+from lidar.sensors.physics.origin import Origin
 from lidar.tools.view import view_drive
 from lidar.tools.view.page import DriveServer
 from lidar.tools.view.sweeps import ANGLE_STEP, RANGE_STEP, TIME_STEP_NS
