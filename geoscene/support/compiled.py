@@ -29,7 +29,6 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.runtime.nrt import rtsys
 
 from geoscene.support.optimised import OwnCompiler
-from geoscene.support.shortcuts import PartCompiler
 
 try:
     import fcntl
@@ -105,7 +104,7 @@ class _Part:
     @functools.cached_property
     def _compiled(self) -> Any:
         wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        return _njit(pipeline_class=PartCompiler, **wrappers, **self._options)(self._function)
+        return _njit(**wrappers, **self._options)(self._function)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Types of a call, for the caller's compilation; compiles the function for them.

@@ -9,11 +9,11 @@ from typing import Any
 
 from llvmlite.binding import Linkage, create_new_module_pass_manager
 from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.environment import lookup_environment
 
-from geoscene.support.shortcuts import PartCompiler, take_shortcuts
-
 _Library: Any = JITCodeLibrary
+_Compiler: Any = Compiler
 _lookup_environment: Any = lookup_environment  # numba has no types
 
 
@@ -97,7 +97,7 @@ def _copy_module(library: Any) -> Any:
     return module
 
 
-class OwnCompiler(PartCompiler):
+class OwnCompiler(_Compiler):  # type: ignore[misc]
     """numba's compiler, which optimises the compiled function and all that it calls together."""
 
     def compile_extra(self, func: Any) -> Any:
@@ -107,7 +107,6 @@ class OwnCompiler(PartCompiler):
         self.state.library.enable_object_caching()
         before, codegen._library_class = codegen._library_class, _Unassembled
         try:
-            with take_shortcuts():
-                return super().compile_extra(func)
+            return super().compile_extra(func)
         finally:
             codegen._library_class = before

@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from numba import types as kinds
 from numba.core import config
 
 from geoscene.export import raster
@@ -199,18 +198,3 @@ def test_what_is_missing_is_compiled_and_said(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("compiling, once; functions: 1\ncompiled in ")
     monkeypatch.undo()
     assert not smallest.is_missing()
-
-
-def test_functions_with_inner_functions_get_all_passes_of_numba():
-    @compiled.njit()
-    def squares(count):
-        return sum([k * k for k in range(count)])
-
-    assert squares(4) == 14
-
-
-def test_shortcuts_end_with_the_compilation():
-    infer = kinds.BaseFunction.get_call_type
-    assert compiled.njit()(lambda number: number + 1)(2) == 3
-    assert kinds.BaseFunction.get_call_type is infer
-    assert "__instancecheck__" not in vars(type(kinds.Type))
