@@ -193,7 +193,7 @@ def select_labels(path: Path, out: Path, *, altered: Altered) -> None:
 
 
 def read_past(path: Path, cloud: Cloud) -> Past:
-    """A recorded cloud with the ground truth of its truth file, if any; see `lidar.signal.past.past_of`.
+    """A recorded cloud with the ground truth of its truth file, if any; see `lidar.signal.truth.past_of`.
 
     Raises DatasetError for a file that is damaged or of another cloud.
     """

@@ -183,7 +183,7 @@ class PoseErrors:
 def read_poses(path: Path, dataset: Dataset) -> Trajectory:
     """The vehicle's trajectory in the scene, from a TUM file of true metres from the scene's origin.
 
-    Raises as `lidar.geometry.trajectory_tum.read_tum`, and InputError for poses that are not of the drive.
+    Raises as `lidar.geometry.trajectory_files.read_tum`, and InputError for poses that are not of the drive.
     """
     absolute_ns, position, quat = read_tum(path)
     begin, last = posix_ns(dataset.start), dataset.trajectory().duration_ns
