@@ -47,15 +47,16 @@ def sample(count=500, seed=0):
     return np.random.default_rng(seed).uniform(-200, 200, (2, count))
 
 
-def test_interpolated_heights_of_a_plane_are_exact(tmp_path):
-    """Bilinear interpolation reproduces a plane to float32 precision if posts are at pixel centres."""
-    corner = around()
-    east, north = posts(corner, (60, 60))
+@pytest.mark.parametrize(("posted", "reach"), [(60, 200.0), (10, 100.0)])
+def test_interpolated_heights_of_a_plane_are_exact(tmp_path, posted, reach):
+    """Bilinear interpolation reproduces a plane to float32 precision, up to the outermost posts."""
+    corner = around((posted, posted))
+    east, north = posts(corner, (posted, posted))
     path = write_dem(
         tmp_path / "a.tif", 100 + 0.1 * (east - 500000) - 0.05 * (north - 5538000), corner=corner
     )
-    terrain = open_terrain([path], FRAME, bounds=BOUNDS)
-    x, y = sample()
+    terrain = open_terrain([path], FRAME, bounds=(-reach, -reach, reach, reach))
+    x, y = np.random.default_rng(0).uniform(-reach, reach, (2, 500))
     e, n = FRAME.to_crs(x, y, crs=UTM)
     np.testing.assert_allclose(
         terrain.height(x, y), 100 + 0.1 * (e - 500000) - 0.05 * (n - 5538000), atol=1e-4
