@@ -43,6 +43,8 @@ from lidar.world.world import World
 ROUTE = ((60.16765, 24.94750), (60.16640, 24.94350))
 """Latitude and longitude of start and end: westwards along Pohjoisesplanadi, with the sun behind."""
 
+RIG = Path(__file__).with_name("demo_rig.toml")
+
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "demo")
 pictures = out / "pictures"
 pictures.mkdir(parents=True, exist_ok=True)
@@ -54,15 +56,15 @@ def say(text: str) -> None:
     print(f"[{time.perf_counter() - began:5.1f} s] {text}", flush=True)
 
 
-def busiest_frame(boxes: Path) -> str:
-    """Name of the camera frame with the most road users that are mostly visible and not too small."""
+def find_busiest_frame(boxes: Path) -> int:
+    """The camera frame with the most road users that are mostly visible and not too small."""
     with boxes.open(newline="") as file:
         seen = Counter(
             int(row["frame"])
             for row in csv.DictReader(file)
             if float(row["visibility"]) > 0.5 and int(row["pixels"]) > 800
         )
-    return f"{max(seen, key=lambda frame: (seen[frame], -frame)):06d}"
+    return max(seen, key=lambda frame: (seen[frame], -frame))
 
 
 def main() -> None:
@@ -92,21 +94,24 @@ def main() -> None:
         # 3. A drive with a 3D scanner, a 2D scanner, a camera and a satellite receiver in busy traffic.
         say("driving for 25 seconds among cars, cyclists and pedestrians")
         traffic = TrafficOptions(vehicles=30.0, cyclists=8.0, pedestrians=100.0, parked=0.9)
-        options = DriveOptions(route=ROUTE, duration=25.0, seed=3, traffic=traffic)
+        options = DriveOptions(route=ROUTE, rig=str(RIG), duration=25.0, seed=3, traffic=traffic)
         summary = drive(scene, out / "drive", options=options, overwrite=True, progress=progress)
         say(f"{summary.length:.0f} m, {summary.frames} frames, {summary.written:,} returns")
 
         # 4. The camera frame with most road users, and the sweep of that moment by class.
-        camera = out / "drive" / "camera_front"
-        frame = busiest_frame(camera / "boxes.csv")
-        sweep = read_table(out / "drive" / "lidar_top" / "pcd" / f"{frame}.pcd")
-        mount = load_rig("seed").lidars[0].mount
+        rig, camera = load_rig(str(RIG)), out / "drive" / "camera_front"
+        frame = find_busiest_frame(camera / "boxes.csv")
+        scanner, sweeps_per_image = rig.lidars[0], rig.lidars[0].rate_hz / rig.cameras[0].rate_hz
+        sweep = read_table(
+            out / "drive" / scanner.name / "pcd" / f"{round(frame * sweeps_per_image):06d}.pcd"
+        )
+        mount = scanner.mount
         xyz = np.column_stack([sweep[axis] for axis in "xyz"]) @ mount.rotation.T + mount.translation
         label = sweep["label"].astype(np.uint8)
         image = sweep_picture(xyz, class_colors(label), vehicle=load_vehicle("car"))
         write_png(pictures / "sweep_class.png", with_legend(image, label))
-        write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{frame}.png"))
-        depth = counts_to_depth(read_png(camera / "depth" / f"{frame}.png"))
+        write_png(pictures / "camera_rgb.png", read_png(camera / "rgb" / f"{frame:06d}.png"))
+        depth = counts_to_depth(read_png(camera / "depth" / f"{frame:06d}.png"))
         write_png(pictures / "camera_depth.png", depth_picture(depth))
 
         # 5. All sweeps as one georeferenced map.
