@@ -44,7 +44,8 @@ from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_files import MANIFEST, read_trajectory
-from lidar.sensors.rig.specs import Rig, names_folder, rig_of
+from lidar.sensors.rig.names import names_folder
+from lidar.sensors.rig.specs import Rig, rig_of
 
 log = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, RigError
 from lidar.geometry.attitude import OPTICAL_QUAT, Mount, quat_from_euler, quat_product
 from lidar.sensors.rig.imu_grades import PRESETS
+from lidar.sensors.rig.names import folded, name_fault
 from lidar.sensors.rig.scanner import MOST_CODE_BITS, MOST_JITTER_NS
 from lidar.toml_table import Table, built_in_names, read_named_table
 
@@ -335,20 +336,19 @@ def rig_digest(name: str | Path) -> str:
     return recipe_digest(b"".join(len(part).to_bytes(8) + part for part in parts))
 
 
-def names_folder(name: str) -> bool:
-    """Whether a sensor's name can name its folder: letters, digits, _ and - only."""
-    return bool(name) and all(c.isalnum() or c in "_-" for c in name)
-
-
 def _check_names(tables: dict[str, list[Table]]) -> None:
-    """Raise RigError for unknown keys, repeated names, and names that cannot name a folder."""
-    seen: set[str] = set()
+    """Raise RigError for unknown keys, and for names that repeat or cannot name files of a dataset."""
+    seen: dict[str, str] = {}
     for kind, group in tables.items():
         for table in group:
             table.close()
             name = table.data.get("name", kind)
-            if not names_folder(name):
-                raise table.error("name", f"{name!r}: letters, digits, _ and - only (it names a folder)")
-            if name in seen:
-                raise table.error("name", f"{name!r} is taken by another sensor of the rig")
-            seen.add(name)
+            if fault := name_fault(name, kind=kind):
+                raise table.error("name", fault)
+            if other := seen.get(folded(name)):
+                same = "" if other == name else f", as {other!r} where file systems do not tell case apart"
+                raise table.error(
+                    "name",
+                    f"{name!r} is taken by another sensor of the rig{same}; write {name}_2, for example",
+                )
+            seen[folded(name)] = name
