@@ -46,6 +46,7 @@ class Class(IntEnum):
     BENCH = 26
     WIRE = 27
     OTHER_STRUCTURE = 28
+    PAVED = 29
     CAR = 40
     VAN = 41
     TRUCK = 42
@@ -57,6 +58,10 @@ class Class(IntEnum):
     MOTORCYCLIST = 48
     NOISE = 60
     SKY = 61
+
+
+GROUND = (*(Class(code) for code in range(Class.ROAD, Class.BUILDING_PAD + 1)), Class.PAVED)
+"""Classes of the surface of the ground, water and the floors of tunnels among them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,17 +87,17 @@ _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
     Class.UNLABELED: (0, 0, 0, 1, (60, 60, 60)),
     Class.ROAD: (40, 24, 18, 11, (128, 64, 128)),
     Class.LANE_MARKING: (60, 24, 19, 11, (255, 255, 255)),
-    Class.CROSSING: (60, 24, 19, 11, (220, 220, 190)),
+    Class.CROSSING: (60, 24, 20, 11, (220, 220, 190)),
     Class.SIDEWALK: (48, 26, 22, 2, (244, 35, 232)),
     Class.KERB: (48, 26, 17, 2, (196, 196, 196)),
     Class.PARKING: (44, 24, 18, 11, (250, 170, 160)),
     Class.RAIL: (49, 25, 20, 10, (230, 150, 140)),
-    Class.TERRAIN: (72, 27, 20, 2, (170, 155, 125)),
-    Class.GRASS: (72, 27, 20, 2, (152, 251, 152)),
-    Class.FOREST_FLOOR: (72, 27, 20, 2, (90, 130, 70)),
-    Class.SAND: (72, 27, 20, 2, (230, 210, 150)),
+    Class.TERRAIN: (72, 27, 21, 2, (170, 155, 125)),
+    Class.GRASS: (72, 27, 21, 2, (152, 251, 152)),
+    Class.FOREST_FLOOR: (72, 27, 21, 2, (90, 130, 70)),
+    Class.SAND: (72, 27, 21, 2, (230, 210, 150)),
     Class.WATER: (49, 25, 20, 9, (45, 110, 200)),
-    Class.BUILDING_PAD: (49, 25, 20, 2, (150, 150, 160)),
+    Class.BUILDING_PAD: (49, 25, 21, 2, (150, 150, 160)),
     Class.BUILDING: (50, 28, 14, 6, (240, 180, 80)),
     Class.BRIDGE: (52, 28, 18, 17, (150, 100, 100)),
     Class.TUNNEL: (52, 28, 14, 19, (150, 120, 90)),
@@ -108,6 +113,7 @@ _CODES: dict[Class, tuple[int, int, int, int, tuple[int, int, int]]] = {
     Class.BENCH: (99, 29, 0, 69, (160, 110, 60)),
     Class.WIRE: (99, 28, 0, 14, (80, 80, 80)),
     Class.OTHER_STRUCTURE: (52, 28, 14, 69, (180, 130, 110)),
+    Class.PAVED: (49, 25, 21, 2, (190, 170, 185)),
     Class.CAR: (10, 17, 1, 70, (0, 60, 200)),
     Class.VAN: (20, 17, 1, 70, (0, 80, 150)),
     Class.TRUCK: (18, 23, 2, 71, (0, 0, 110)),

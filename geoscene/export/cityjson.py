@@ -51,7 +51,7 @@ _TYPES: dict[int, str] = {
         "Road": (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.PARKING),
         "Railway": (Class.RAIL,),
         "TINRelief": (Class.TERRAIN,),
-        "LandUse": (Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.BUILDING_PAD),
+        "LandUse": (Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.BUILDING_PAD, Class.PAVED),
         "WaterBody": (Class.WATER,),
         "Building": (Class.BUILDING,),
         "Bridge": (Class.BRIDGE,),

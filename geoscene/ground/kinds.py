@@ -27,7 +27,7 @@ class GroundKind:
 
 
 _BUILT = GroundKind(Class.TERRAIN, "soil", 10)
-_PAVED = GroundKind(Class.TERRAIN, "paving", 11)
+_PAVED = GroundKind(Class.PAVED, "paving", 11)
 _LOOSE = GroundKind(Class.TERRAIN, "gravel", 12)
 _FIELD = GroundKind(Class.TERRAIN, "soil", 20)
 _GREEN = GroundKind(Class.GRASS, "grass", 22)
@@ -74,12 +74,12 @@ AREAS: dict[str, dict[str, GroundKind]] = {
         "garden": _LAWN,
         "dog_park": _GREEN, "pitch": GroundKind(Class.GRASS, "grass", 62), "stadium": _PAVED,
         "sports_centre": _BUILT,
-        "playground": GroundKind(Class.TERRAIN, "sand", 61),
+        "playground": GroundKind(Class.SAND, "sand", 61),
         "track": GroundKind(Class.TERRAIN, "soil", 61),
         "swimming_pool": _BASIN, "schoolyard": _PAVED,
-        "fitness_station": GroundKind(Class.TERRAIN, "sand", 61),
-        "marina": GroundKind(Class.TERRAIN, "concrete", 9),
-        "slipway": GroundKind(Class.TERRAIN, "concrete", 56),
+        "fitness_station": GroundKind(Class.SAND, "sand", 61),
+        "marina": GroundKind(Class.PAVED, "concrete", 9),
+        "slipway": GroundKind(Class.PAVED, "concrete", 56),
     },
     "golf": {
         "green": _LAWN, "fairway": _LAWN, "tee": _LAWN, "rough": _GREEN, "driving_range": _LAWN,
@@ -160,8 +160,37 @@ SURFACES: dict[str, str] = {
 }  # fmt: skip
 """Materials by value of ``surface``."""
 
+_UNPAVED: dict[str, Class] = {
+    "grass": Class.GRASS, "dry_grass": Class.GRASS, "sand": Class.SAND, "soil": Class.TERRAIN,
+    "gravel": Class.TERRAIN, "bark": Class.TERRAIN, "snow": Class.TERRAIN,
+}  # fmt: skip
+"""Classes of ground of unpaved materials; all other materials are paving."""
+
+_OPEN = frozenset({Class.TERRAIN, Class.GRASS, Class.SAND, Class.PAVED})
+_BEDROCK = frozenset({"stone", "rock"})
+"""Values of ``surface`` that are natural on open ground."""
+
 _NO = frozenset({"no", "false", "0"})
 _RIVERS = frozenset({"river", "stream", "canal", "rapids", "ditch", "drain", "lock"})
+
+
+def ground_class(klass: Class, material: str) -> Class:
+    """The class of ground of a kind and a material: open ground and places for pedestrians are paved or not.
+
+    Forests, water, rails, carriageways and car parks stay what they are.
+    """
+    if klass == Class.SIDEWALK:
+        return _UNPAVED.get(material, klass)
+    return _UNPAVED.get(material, Class.PAVED) if klass in _OPEN else klass
+
+
+def read_surface(tags: Tags, kind: GroundKind) -> tuple[Class, str, str]:
+    """Class, material and source: by the tag ``surface``, else those of the kind (source ``tags``)."""
+    value = tags.get("surface", "").split(";", maxsplit=1)[0].strip()
+    if value not in SURFACES or kind.body:
+        return kind.klass, kind.material, "tags"
+    natural = value in _BEDROCK and kind.klass in _OPEN
+    return kind.klass if natural else ground_class(kind.klass, SURFACES[value]), SURFACES[value], "surface"
 
 
 def is_underground(tags: Tags) -> bool:

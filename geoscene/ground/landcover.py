@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
-from geoscene.ground.kinds import SEA, SURFACES, GroundKind, area_kind, line_kind
+from geoscene.ground.kinds import SEA, GroundKind, area_kind, line_kind, read_surface
 from geoscene.ground.layers import Layers
-from geoscene.sources.data import Area, OsmData, Tags, Way
+from geoscene.sources.data import Area, OsmData, Way
 from geoscene.support.columns import nth
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
@@ -65,14 +65,6 @@ def _to_scene(frame: Frame, lonlat: Float) -> Float:
     return np.column_stack(frame.from_geographic(lonlat[:, 0], lonlat[:, 1]))
 
 
-def _material(tags: Tags, kind: GroundKind) -> tuple[str, str]:
-    """(material, source): the surface tag's, else the kind's."""
-    named = SURFACES.get(tags.get("surface", "").split(";")[0].strip())
-    if named is None or kind.body:
-        return kind.material, "tags"
-    return named, "surface"
-
-
 def _layers(
     found: Sequence[tuple[Area | Way, GroundKind]],
     polygons: NDArray[np.object_],
@@ -83,15 +75,15 @@ def _layers(
 
     source : of each row; by default that of its material
     """
-    looks = [_material(feature.tags, kind) for feature, kind in found]
+    looks = [read_surface(feature.tags, kind) for feature, kind in found]
     tier = np.array([kind.tier for _, kind in found], int)
     return Layers.of(
         polygons,
-        klass=[kind.klass for _, kind in found],
-        material=[materials()[name].code for name, _ in looks],
+        klass=[klass for klass, _, _ in looks],
+        material=[materials()[name].code for _, name, _ in looks],
         priority=tier + 0.99 / (1.0 + shapely.area(polygons) / 100.0),
         osm_id=[feature.osm_id for feature, _ in found],
-        source=source or [name for _, name in looks],
+        source=source or [given for _, _, given in looks],
         body=[kind.body for _, kind in found],
     )
 
@@ -252,7 +244,7 @@ def paved_fabric(footprints: NDArray[Any]) -> Layers:
     smooth = shapely.get_parts(shapely.buffer(wide, -15.0, quad_segs=_ROUND))
     return Layers.of(
         smooth,
-        klass=Class.TERRAIN,
+        klass=Class.PAVED,
         material=materials()["paving"].code,
         priority=_PRIORITY,
         source="assumed-built-up",

@@ -57,7 +57,7 @@ _PARASOLS = 0.4
 _BESIDE = (-3.6, -1.8, 1.8, 3.6)
 """Metres along the front between the door and the tables."""
 
-_WALKED = (Class.SIDEWALK, Class.TERRAIN)
+_WALKED = (Class.SIDEWALK, Class.PAVED, Class.TERRAIN)
 """Ground between a front and a carriageway; where the map has no sidewalk up to the front, it is bare."""
 
 _KERB = 0.5

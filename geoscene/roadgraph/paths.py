@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.polylines import directions
-from geoscene.roadgraph.carriageways import PAVED, Carriageways, surface_material
+from geoscene.ground.kinds import ground_class
+from geoscene.roadgraph.carriageways import Carriageways, surface_material
 from geoscene.roadgraph.junctions import carriageway
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.roadgraph.tags import place_and_layer
@@ -85,7 +86,7 @@ def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     bands = shapely.buffer(lines, np.array(width, float) / 2, quad_segs=4)
     return SurfaceRows.of(
         bands,
-        klass=[Class.SIDEWALK if m in PAVED | {"wood", "metal"} else Class.TERRAIN for m in material],
+        klass=[ground_class(Class.SIDEWALK, name) for name in material],
         material=material,
         priority=[PRIORITY[_PRIORITIES.get(name, "path")] for name in kind],
         osm_id=[way.osm_id for way in ways],
@@ -124,7 +125,10 @@ def square_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     ]
     return SurfaceRows.of(
         shapes,
-        klass=[Class.ROAD if y else Class.SIDEWALK for y in yard],
+        klass=[
+            Class.ROAD if y else ground_class(Class.SIDEWALK, name)
+            for y, (name, _) in zip(yard, made_of, strict=True)
+        ],
         material=[name for name, _ in made_of],
         priority=[PRIORITY["yard" if y else "square"] for y in yard],
         osm_id=[area.osm_id for area in areas],

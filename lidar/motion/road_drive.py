@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.classes import Class
+from geoscene.classes import GROUND, Class
 from geoscene.geometry.frames import Frame
 from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
@@ -35,7 +35,7 @@ It covers the braking distance at any speed that streets allow."""
 _HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
-_DRIVEN = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD or c == Class.BRIDGE]
+_DRIVEN = [*map(int, GROUND), int(Class.BRIDGE)]
 
 
 @dataclass(frozen=True, slots=True)

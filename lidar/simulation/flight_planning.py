@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 import shapely
 
-from geoscene.classes import Class
+from geoscene.classes import GROUND
 from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
@@ -49,7 +49,7 @@ _BORDER = 1e-3  # metres inside the scene's border, on which rays may miss the g
 _CLEAR = 2.0  # metres, minimum clearance above the scene
 _STEEPEST = 0.2  # sine of the smallest depression angle of a beam that counts for the swath
 _FURTHEST = 20_000.0  # metres from the scene to a waypoint; sensors do not range further
-_GROUND = [int(c) for c in Class if Class.ROAD <= c <= Class.BUILDING_PAD]
+_GROUND = [int(c) for c in GROUND]
 
 
 def plan_flight(

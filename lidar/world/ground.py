@@ -13,7 +13,8 @@ from lidar.raycast import Caster
 
 _GROUND = (
     *(Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.SIDEWALK, Class.KERB, Class.PARKING, Class.RAIL),
-    *(Class.TERRAIN, Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.BUILDING_PAD, Class.BRIDGE),
+    *(Class.TERRAIN, Class.GRASS, Class.FOREST_FLOOR, Class.SAND, Class.PAVED),
+    *(Class.BUILDING_PAD, Class.BRIDGE),
 )
 _ABOVE, _BELOW = 1.5, 6.0
 """Metres above and below the expected height within which the ground is looked for."""

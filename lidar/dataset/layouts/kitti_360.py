@@ -40,7 +40,7 @@ _DOWN = np.diag([1.0, -1.0, -1.0])
 
 _LABELS = {
     "unlabeled": (0, -1, (Class.UNLABELED, Class.NOISE)),
-    "ground": (6, -1, (Class.WATER, Class.BUILDING_PAD)),
+    "ground": (6, -1, (Class.WATER, Class.BUILDING_PAD, Class.PAVED)),
     "road": (7, 1, (Class.ROAD, Class.LANE_MARKING, Class.CROSSING)),
     "sidewalk": (8, 3, (Class.SIDEWALK, Class.KERB)),
     "parking": (9, 2, (Class.PARKING,)),

@@ -117,6 +117,7 @@ _GROUND = (
     Class.GRASS,
     Class.FOREST_FLOOR,
     Class.SAND,
+    Class.PAVED,
 )
 
 _STEEPEST = 0.5

@@ -40,7 +40,7 @@ MATERIALS = {
     GREEN: ("grass", "dry_grass"),
 }
 
-LOWEST, HIGHEST = int(Class.ROAD), int(Class.BUILDING_PAD)
+LOWEST, HIGHEST, PAVED = int(Class.ROAD), int(Class.BUILDING_PAD), int(Class.PAVED)
 """Classes from and up to which level surfaces are ground; road markings are among them."""
 
 PAINT_KEPT = 0.35

@@ -18,7 +18,7 @@ from lidar.sensors.camera import ground_texture, texture
 from lidar.sensors.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, RenderedFacades, facade
 from lidar.sensors.camera.facades import PAINTED as PAINTED_PARTS
 from lidar.sensors.camera.facades import UPRIGHT as UPRIGHT_SIDES
-from lidar.sensors.camera.ground_texture import HIGHEST, LOWEST, ground
+from lidar.sensors.camera.ground_texture import HIGHEST, LOWEST, PAVED, ground
 from lidar.sensors.camera.texture import compiled, detail, grain, hash_place, inlined, noise
 from lidar.sensors.camera.texture_blocks import BLOCK, DETAIL, PAINTED, PLACES, UPRIGHT, factors
 from lidar.sensors.camera.texture_blocks import scratch as block_scratch
@@ -333,7 +333,8 @@ def _texture(i: int, at: Any, view: Any, found: Any, frame: Any, tables: Any) ->
     kinds, floors, _, _, _, _ = tables
     m = material[i] & 127
     nx, ny, nz = _facing(i, normal, wall, frame)
-    if nz > _LEVEL and LOWEST <= klass[i] <= HIGHEST and kinds[m] != texture.LIQUID:
+    on_ground = LOWEST <= klass[i] <= HIGHEST or klass[i] == PAVED
+    if nz > _LEVEL and on_ground and kinds[m] != texture.LIQUID:
         flat = math.sqrt(dx * dx + dy * dy)
         hx, hy = (dx / flat, dy / flat) if flat > 1e-9 else (1.0, 0.0)
         painted = klass[i] == _MARKING

@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
-from geoscene.classes import Class
+from geoscene.classes import GROUND, Class
 from geoscene.support.files import atomic_path
 from lidar.dataset.formats.table import Table
 from lidar.errors import InputError
 
-GROUND = tuple(
-    int(k) for k in Class if Class.ROAD <= k <= Class.BUILDING_PAD and k not in (Class.WATER, Class.TUNNEL)
-)
+_TERRAIN = tuple(int(k) for k in GROUND if k != Class.WATER)
 """Classes of which the terrain is made: all of the ground but water."""
 
 _BLOCK = 256  # cells: side of the blocks that are in memory, those with points
@@ -65,7 +63,7 @@ class Rasters:
         self._high = np.maximum(self._high, cell.max(axis=0))
         place = cell // _BLOCK
         keys, which = np.unique(place, axis=0, return_inverse=True)
-        ground = np.isin(table["label"], GROUND)
+        ground = np.isin(table["label"], _TERRAIN)
         for k, key in enumerate(keys.tolist()):
             mine = np.flatnonzero(which.ravel() == k)
             block = self._blocks.setdefault((key[0], key[1]), _empty())

@@ -5,7 +5,7 @@ import pytest
 import shapely
 from helpers.surfaces import partition
 
-from geoscene.classes import Class, materials
+from geoscene.classes import GROUND, Class, class_codes, materials
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import concatenate
 from geoscene.ground import (
@@ -18,6 +18,7 @@ from geoscene.ground import (
 )
 from geoscene.ground.landcover import sea
 from geoscene.ground.terrain import open_terrain
+from geoscene.roadgraph.paths import path_surfaces, square_surfaces
 from geoscene.sources import read_osm
 from geoscene.sources.data import Area, OsmData, Way
 from geoscene.support.problems import Problem
@@ -62,7 +63,22 @@ BOX = shapely.box(-50, -50, 50, 50)
     [
         ({"landuse": "forest"}, ("FOREST_FLOOR", "soil")),
         ({"natural": "beach"}, ("SAND", "sand")),
-        ({"natural": "beach", "surface": "gravel"}, ("SAND", "gravel")),
+        ({"natural": "beach", "surface": "gravel"}, ("TERRAIN", "gravel")),
+        ({"natural": "bare_rock", "surface": "rock"}, ("TERRAIN", "stone")),
+        ({"natural": "wood", "surface": "asphalt"}, ("FOREST_FLOOR", "asphalt")),
+        ({"landuse": "retail"}, ("PAVED", "paving")),
+        ({"landuse": "industrial", "surface": "concrete"}, ("PAVED", "concrete")),
+        ({"landuse": "commercial", "surface": "gravel"}, ("TERRAIN", "gravel")),
+        ({"man_made": "courtyard", "surface": "sett"}, ("PAVED", "stone")),
+        ({"leisure": "schoolyard", "surface": "grass"}, ("GRASS", "grass")),
+        ({"leisure": "pitch", "surface": "asphalt"}, ("PAVED", "asphalt")),
+        ({"leisure": "pitch", "surface": "sand"}, ("SAND", "sand")),
+        ({"leisure": "playground", "surface": "rubber"}, ("PAVED", "asphalt")),
+        ({"leisure": "garden", "surface": "bricks;grass"}, ("PAVED", "brick")),
+        ({"place": "square"}, ("SIDEWALK", "paving")),
+        ({"place": "square", "surface": "cobblestone"}, ("SIDEWALK", "stone")),
+        ({"place": "square", "surface": "grass"}, ("GRASS", "grass")),
+        ({"amenity": "marketplace", "surface": "dirt"}, ("TERRAIN", "soil")),
         ({"amenity": "parking"}, ("PARKING", "asphalt")),
         ({"amenity": "parking", "surface": "grass_paver"}, ("PARKING", "grass")),
         ({"natural": "water", "surface": "asphalt"}, ("WATER", "water")),
@@ -74,6 +90,36 @@ def test_tags_decide_class_and_material(tags, expected):
     assert names(layers) == [expected]
     assert layers.source[0] == ("surface" if "surface" in tags and expected[1] != "water" else "tags")
     assert problems == []
+
+
+@pytest.mark.parametrize(
+    ("surface", "expected"),
+    [
+        ("", "SIDEWALK"), ("sett", "SIDEWALK"), ("wood", "SIDEWALK"), ("grass", "GRASS"), ("sand", "SAND"),
+        ("compacted", "TERRAIN"), ("dirt", "TERRAIN"),
+    ],
+)  # fmt: skip
+def test_footways_and_squares_are_sidewalks_where_they_are_paved(surface, expected):
+    tags = {"highway": "footway"} | ({"surface": surface} if surface else {})
+    line, square = way(1, [(-30, 0), (30, 0)], **tags), area(2, BOX, **tags)
+    for rows in (path_surfaces(osm_of(line), FRAME), square_surfaces(osm_of(square), FRAME)):
+        assert [Class(k).name for k in rows.klass] == [expected]
+
+
+def test_no_paved_ground_of_a_scene_is_labelled_terrain(scene):
+    """Terrain is 72 in SemanticKITTI, 27 in nuScenes, 21 in Waymo's segmentation and 22 in KITTI-360."""
+    paving = [materials()[name].code for name in ("asphalt", "concrete", "paving", "brick")]
+    codes, paved = class_codes(), set()
+    for index in scene.tile_indices:
+        mesh = scene.tile(*index).mesh
+        ground = mesh.take(~mesh.closed & np.isin(mesh.klass, GROUND))
+        paved |= set(ground.klass[np.isin(ground.material, paving)].tolist())
+    assert Class.PAVED in paved
+    assert not {Class.TERRAIN, Class.GRASS, Class.FOREST_FLOOR, Class.SAND} & paved
+    klass = sorted(paved)
+    assert 72 not in codes.semantic_kitti[klass]
+    assert 27 not in codes.nuscenes[klass]
+    assert set(codes.asprs[klass]) <= {2, 10, 11}
 
 
 @pytest.mark.parametrize(
