@@ -806,6 +806,18 @@ def test_tower_height_is_not_used_for_houses_nearby():
     assert (block[1:3] > 1.2 * alone[1:3]).all()
 
 
+def test_a_neighbour_of_the_same_use_counts_as_much_as_four_of_another():
+    around = 2 * np.pi * np.arange(5) / 5
+    xy = np.vstack([[0.0, 0.0], 30 * np.column_stack([np.cos(around), np.sin(around)])])
+    use, area_ = np.array(["house"] * 2 + ["apartments"] * 4, dtype=object), np.full(6, 120.0)
+    typical = infer_heights(xy, use, area=area_, height=np.full(6, np.nan))[0]
+    height = typical * [np.nan, 1.5, *[1 / 1.5] * 4]  # the house is high for its use, the others are low
+    for others, factor in ((4, 1.0), (1, 1.2)):
+        some = slice(2 + others)
+        inferred = infer_heights(xy[some], use[some], area=area_[some], height=height[some])[0]
+        assert inferred[0] / typical[0] == pytest.approx(factor, rel=1e-9 if others == 4 else 0.1)
+
+
 def test_bodies_that_share_an_edge_with_a_narrow_gap_are_joined():
     upper = shapely.Polygon([(0, 0), (10, 0.0005), (10, 10), (-10, 10), (-10, 0.0005)])
     lower = shapely.Polygon([(0, 0), (-10, -0.0005), (-10, -10), (10, -10), (10, -0.0005)])

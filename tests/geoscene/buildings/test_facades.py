@@ -12,6 +12,7 @@ from shapely import affinity
 from geoscene.buildings import build_solids, read_buildings
 from geoscene.buildings.facades import read_setting, wall_relief
 from geoscene.buildings.facades.solids import are_simple, outlines, relief_mesh
+from geoscene.buildings.facades.styles import PARAPET
 from geoscene.buildings.facades.walls import find_walls
 from geoscene.classes import materials
 from geoscene.geometry.frames import Frame
@@ -131,6 +132,16 @@ def test_a_building_has_as_many_rows_of_windows_as_storeys_are_tagged(number, le
     rows = {r for _, r, _, _, _ in panels_of(layout.relief)}
     assert rows == set(range(levels))
     assert set(layout.relief.facades.grid[:, 1].tolist()) == {levels}
+
+
+@pytest.mark.parametrize(("height", "levels", "parapet"), [(13.0, 4, PARAPET), (3.2, 1, 0.1)])
+def test_the_storeys_of_the_map_share_the_height_of_a_wall_below_its_parapet(height, levels, parapet):
+    tags = {"height": str(height), "building__levels": str(levels), "roof__shape": "flat"}
+    _, _, layout = facades_of(house(1, shapely.box(0, 0, 24, 12), building="apartments", **tags))
+    facades = layout.relief.facades
+    assert len(facades) == 4
+    ceiling = facades.ground + (levels - 1) * facades.cell[:, 1]
+    assert ceiling == pytest.approx(height - parapet)
 
 
 def test_walls_closer_than_a_metre_to_another_building_are_blank_up_to_its_roof():
