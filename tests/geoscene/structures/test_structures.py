@@ -263,6 +263,16 @@ def test_piers_avoid_the_road_below(bridge):
     assert low < bridge.height(*foot.T).min()  # they reach into the ground
 
 
+@pytest.mark.parametrize(("gap", "stands"), [(0.9, False), (1.1, True)])
+def test_a_bridge_has_piers_where_it_is_more_than_a_metre_above_the_ground(gap, stands):
+    def dip(x, y):
+        return np.where(np.abs(x) < 50, -(SIZES.deck + gap), 0.0) + 0 * y
+
+    low = Town(town(PLACES, OVER[:3]), ground=dip)
+    np.testing.assert_allclose(low.centre_lines("bridge")[:, 2], 0.0, atol=0.01)
+    assert (not shapely.is_empty(low.table.pier).all()) == stands
+
+
 def test_ground_stays_below_a_bridge(bridge):
     points = bridge.centre_lines("bridge")
     ground = bridge.height(points[:, 0], points[:, 1])
@@ -499,6 +509,29 @@ def test_a_footbridge_clears_the_road_and_its_parapets_are_railings():
     assert z[0] >= SIZES.headroom + SIZES.slab - 1e-6
     assert klass[0] == Class.SIDEWALK
     assert set(walk.table.rise) == {SIZES.railing}
+
+
+def test_a_footbridge_clears_a_railway_by_its_underside():
+    places = PLACES | {7: (-80, 20), 8: (80, 20)}
+    walk = {"highway": "footway", "bridge": "yes", "layer": "1"}
+    made = Town(town(places, [({"railway": "rail"}, [5, 6]), (walk, [7, 8])]))
+    line = np.concatenate(list(made.table.line))
+    over = np.abs(line[:, 0]) < 1
+    assert over.any()
+    assert line[over, 2] - SIZES.slab == pytest.approx(5.7, abs=0.01)  # that of an overhead line
+
+
+def test_a_footbridge_passes_below_the_deck_of_a_road_bridge():
+    places = PLACES | {7: (20, -77), 8: (20, 80)}
+    walk = {"highway": "footway", "bridge": "yes", "layer": "1"}
+    ways = [OVER[0], (BRIDGE | {"layer": "2"}, [2, 3]), *OVER[2:], (walk, [7, 8])]
+    made = Town(town(places, ways), ground=lambda x, y: 4.0 * (np.abs(y) > 50) + 0 * x)
+    line = np.concatenate([z for z, edge in zip(made.table.line, made.table.edge, strict=True) if edge < 0])
+    road = made.centre_lines("bridge")
+    soffit = np.interp(20.0, road[:, 0], road[:, 2]) - SIZES.deck
+    below = np.abs(line[:, 1]) < 3
+    assert below.any()
+    assert line[below, 2] == pytest.approx(soffit - SIZES.passage, abs=0.05)
 
 
 def test_a_footway_on_a_road_bridge_is_as_high_as_the_road():
