@@ -295,3 +295,18 @@ def test_fewer_trees_cover_as_much_and_do_not_depend_on_the_others():
     other = fewer_instances(trees, sizes, cell=2.0, share=0.25, seed=2)
     assert len(np.intersect1d(other.feature, some.feature)) < 0.5 * len(some)
     assert len(fewer_instances(trees, sizes, cell=100.0, share=0.25, seed=1)) == 0
+
+
+@pytest.mark.parametrize(
+    ("sides", "remains"),
+    [((0.4, 0.4, 30.0), False), ((0.6, 0.6, 30.0), True), ((8.0, 0.1, 0.8), False), ((8.0, 0.1, 1.2), True)],
+)
+def test_instances_remain_if_two_of_their_sides_are_seen_and_keep_their_height(sides, remains):
+    """Of a quarter of masts and of walls, those that remain are twice as wide; half a cell is one metre."""
+    count = 40
+    matrix = np.tile(np.eye(3, 4), (count, 1, 1))
+    matrix[:, 0, 3] = 10.0 * np.arange(count)
+    copies = ShapeInstances(np.zeros(count, np.int32), matrix, np.arange(count, dtype=np.int32))
+    some = fewer_instances(copies, np.array([sides]), cell=2.0, share=0.25, seed=1)
+    assert bool(len(some)) == remains
+    assert (some.transform[:, :, :3] == np.diag([2.0, 2.0, 1.0])).all()
