@@ -107,6 +107,29 @@ def test_drones_survey_at_a_height_above_the_ground_below_them_and_aircraft_fly_
     assert 537.0 < level[0] - drone[:, 2].max() < 560.0
 
 
+@pytest.mark.parametrize("side", ["west", "south", "east", "north"])
+def test_beyond_the_scene_the_ground_is_that_of_the_nearest_border(hillside, side):
+    xmin, ymin, xmax, ymax = hillside.bounds
+    along = np.linspace(0.2, 0.8, 3)
+    line = {
+        "west": [xmin + 0 * along, ymin + (ymax - ymin) * along, -1.0, 0.0],
+        "south": [xmin + (xmax - xmin) * along, ymin + 0 * along, 0.0, -1.0],
+        "east": [xmax + 0 * along, ymin + (ymax - ymin) * along, 1.0, 0.0],
+        "north": [xmin + (xmax - xmin) * along, ymax + 0 * along, 0.0, 1.0],
+    }
+
+    def heights(out):
+        x, y, dx, dy = line[side]
+        lon, lat = hillside.frame.to_geographic(x + out * dx, y + out * dy)
+        route = list(zip(lat.tolist(), lon.tolist(), strict=True))
+        position = flight(hillside, route=route, altitude=60.0).position
+        return position[np.linspace(0, len(position) - 1, 50).astype(int), 2]
+
+    within, beyond = heights(-0.1), heights(40.0)
+    np.testing.assert_allclose(beyond, within, atol=0.5)
+    assert np.ptp(within) > 10.0
+
+
 def test_the_swath_follows_from_the_field_of_view():
     aircraft = load_rig("aircraft")
     # 30 degrees to each side
