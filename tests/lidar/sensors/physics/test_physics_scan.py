@@ -233,11 +233,15 @@ def test_glass_transmits_and_reflects():
     assert 3 not in blocked.feature
 
 
-def test_water_mirrors_the_far_bank_and_glints_below():
-    pond = world(
+def pond_before_a_bank():
+    return world(
         box((-60, -60, -1), (60, 60, 0), feature=1, klass=Class.WATER, material="water"),
         box((20, -30, 0), (21, 30, 8), feature=2, material="plaster"),
     )
+
+
+def test_water_mirrors_the_far_bank_and_glints_below():
+    pond = pond_before_a_bank()
     mount = Mount((0.0, 0.0, 2.0))
     cloud = scan(
         load_sensor("vlp16"),
@@ -264,6 +268,29 @@ def test_water_mirrors_the_far_bank_and_glints_below():
     assert below.intensity[water & (below.incidence < 0.05)].min() > 5 * np.median(
         below.intensity[water & (below.incidence > 0.3)]
     )
+
+
+@pytest.mark.parametrize("surface", ["glass", "water"])
+def test_rays_of_a_pulse_share_the_power_that_is_mirrored(surface):
+    if surface == "glass":
+        scene = world(plate(5.0, feature=1, material="glass"), plate(-10.0, feature=2))
+    else:
+        scene = pond_before_a_bank()
+    mirrored = []
+    for rays in (1, 7):
+        cloud = scan(
+            load_sensor("vlp16", return_mode="dual"),
+            Mount((0.0, 0.0, 2.0)),
+            trajectory=STILL,
+            world=scene,
+            frame=0,
+            seed=1,
+            settings=ScannerSettings(mirrors=True, rays=rays),
+        )
+        ahead = np.abs(np.arctan2(cloud.xyz[:, 1], cloud.xyz[:, 0])) < np.radians(5)
+        mirrored.append(cloud.intensity[ahead & (cloud.klass == Class.NOISE) & (cloud.feature == 2)])
+    assert len(mirrored[0]) > 10
+    assert np.median(mirrored[1]) == pytest.approx(np.median(mirrored[0]), rel=0.05)
 
 
 def test_a_retro_reflector_saturates_and_blooms():
