@@ -31,6 +31,7 @@ name = "fusion"
 name = "top"
 preset = "hdl32e"
 translation = [1.0, 0.0, 1.9]
+rpy_deg = [0.0, 0.0, 30.0]
 rate_hz = 10.0
 [[camera]]
 name = "image_2"

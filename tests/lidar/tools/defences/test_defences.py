@@ -323,6 +323,15 @@ def test_the_camera_confirms_a_car_that_it_sees_and_rejects_one_that_it_does_not
     assert judged(Overlay(), late).frame == 0, "a picture of another time says nothing"
 
 
+def test_a_picture_counts_until_60_ms_after_the_last_pulse_on_an_object(frame, tmp_path):
+    attacked, forged = with_car(frame, (10.0, 1.0, -0.98), points=150)
+    row = next(k for k, rows in enumerate(attacked.members) if len(rows) and forged[rows].all())
+    road, last = drawn(tmp_path / "road.png"), int(attacked.time_ns[attacked.members[row]].max())
+    for late_ns, counts in ((59_000_000, True), (61_000_000, False)):
+        shown = replace(attacked, pictures=(replace(road, time_ns=last + late_ns),))
+        assert (judged(Overlay(), shown).objects[row] > 0.45) == counts
+
+
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_blinded_camera_or_lost_rows_say_nothing_of_an_object(frame, tmp_path, level):
     attacked, _ = with_car(frame, (10.0, 1.0, -0.98), points=150)

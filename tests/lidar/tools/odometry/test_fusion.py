@@ -1,13 +1,16 @@
 """Fusion of fixes, inertial samples and odometry: known drives, wrong fixes, and outages."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.map_data import FRAME
+from pyproj import Geod
 from scipy.spatial.transform import Rotation
 
+from geoscene.geometry.frames import Frame
 from lidar.errors import DatasetError, InputError
 from lidar.options import OdometryOptions
 from lidar.sensors.navigation.measurements import NAMES, Fixes, Inertial
@@ -164,15 +167,15 @@ def test_a_vehicle_at_rest_has_no_heading():
         run(given)
 
 
-def test_fixes_with_few_satellites_state_multipath(monkeypatch):
-    """Of 32 satellites of four systems 12 are left; 7.5 m and 15 m are the errors where all are hidden."""
+def fixed_of(monkeypatch, frame, **columns):
+    """What fusion makes of three fixes in a frame, a second apart, with some of their columns."""
     count, none = 3, np.full((3, 3), np.nan)
     recorded = Fixes(
         time_ns=np.arange(count) * 10**9,
         state=np.full(count, NAMES.index("single"), np.int8),
         quality=np.ones(count, np.int8),
-        satellites=np.array([32, 12, 12], np.int8),
-        dop=np.array([[1.0, 1, 1], [1, 1, 1], [2, 3, 3]]),
+        satellites=np.full(count, 32, np.int8),
+        dop=np.ones((count, 3)),
         lonlath=np.tile([24.945, 60.167, 5.0], (count, 1)),
         speed=np.full(count, 5.0),
         course=np.zeros(count),
@@ -182,9 +185,35 @@ def test_fixes_with_few_satellites_state_multipath(monkeypatch):
         used=np.ones((count, 4), bool),
         names=np.array(["G01", "R65", "E02", "C03"]),
     )
+    recorded = replace(recorded, **columns)
     monkeypatch.setattr("lidar.tools.odometry.fusion.read_fixes", lambda *_, **__: (recorded, None))
     sensor = {"gnss": {"vehicle_from_sensor": np.eye(4).tolist()}}
-    sigma = fixes_of(SimpleNamespace(frame=FRAME, paths=None, sensors=lambda _: sensor), "gnss").sigma
+    return fixes_of(SimpleNamespace(frame=frame, paths=None, sensors=lambda _: sensor), "gnss")
+
+
+def test_fixes_in_utm_are_in_true_metres_and_their_course_is_from_true_north(monkeypatch):
+    """Two and a half degrees east of the central meridian, where grid north is 2.2 degrees from north."""
+    frame = Frame.at(23.5, 60.167, crs="utm")
+    away = np.array([0.0, 500.0, 1000.0])
+    lon, lat, back = Geod(ellps="WGS84").fwd(np.full(3, 23.5), np.full(3, 60.167), np.full(3, 30.0), away)
+    given = fixed_of(
+        monkeypatch,
+        frame,
+        lonlath=np.column_stack([lon, lat, np.full(3, 5.0)]),
+        course=np.radians(np.asarray(back) + 180.0),
+        speed=np.full(3, 500.0),
+    )
+    step = given.position[1:] - given.position[:-1]
+    assert abs(given.scale - 1) > 1e-4
+    np.testing.assert_allclose(np.linalg.norm(step, axis=1), 500.0, atol=0.01)
+    np.testing.assert_allclose(given.velocity[:-1], step, atol=0.1)
+
+
+def test_fixes_with_few_satellites_state_multipath(monkeypatch):
+    """Of 32 satellites of four systems 12 are left; 7.5 m and 15 m are the errors where all are hidden."""
+    dop = np.array([[1.0, 1, 1], [1, 1, 1], [2, 3, 3]])
+    satellites = np.array([32, 12, 12], np.int8)
+    sigma = fixed_of(monkeypatch, FRAME, dop=dop, satellites=satellites).sigma
     open_sky = np.hypot([0.3, 0.3, 0.6], [1.5, 1.5, 2.5])
     np.testing.assert_allclose(sigma[0], open_sky)
     np.testing.assert_allclose(sigma[1], np.hypot(open_sky, 0.625 * np.array([7.5, 7.5, 15])))

@@ -136,6 +136,16 @@ def test_the_range_image_of_lasers_beside_each_other_has_no_empty_rows(scene, tm
     assert (ranges[..., 3] > 0).any(axis=1).all()
 
 
+def test_columns_of_turned_scanners_are_azimuths_from_the_vehicle_s_forward():
+    """A scanner that looks to the left sees what is ahead of the vehicle to its right."""
+    xyz = np.array([[0, -10, 0], [10, 0, 0], [10, 10, 1]], np.float32)
+    table = {**dict(zip("xyz", xyz.T, strict=True)), "ring": np.zeros(3, np.uint16)}
+    for quat, expected in (((0, 0, 0, 1), [-90, 0, 45]), ((0, 0, 0.5**0.5, 0.5**0.5), [0, 90, 135])):
+        angle, title, _ = _image_sides(table, Mount((0.0, 0.0, 0.0), quat))
+        np.testing.assert_allclose(angle, expected, atol=1e-4)
+        assert "forward" in title
+
+
 def test_rows_of_scanners_that_look_down_are_times():
     table = {
         **dict(
@@ -168,6 +178,9 @@ def test_coverage_counts_every_true_return(town_drive, tmp_path):
     assert (plan[..., 3] > 0).sum() == len(cells)
     west, south, east, north = told["bounds_m"]
     assert plan.shape[:2] == (round((north - south) / 0.5), round((east - west) / 0.5))
+    row, column = np.nonzero(plan[::-1, :, 3])  # north is up, east is right
+    shown = zip((column + round(west / 0.5)).tolist(), (row + round(south / 0.5)).tolist(), strict=True)
+    assert set(shown) == cells
 
 
 def test_coverage_is_drawn_in_cells_that_fit(town_drive, tmp_path):
