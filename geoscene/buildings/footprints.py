@@ -196,8 +196,9 @@ def assign(
 ) -> Rows:
     """The row of the outline of every part (n,), -1 for parts outside any outline.
 
-    Relations of type building take precedence. Otherwise it is the outline that covers most of the part, at
-    least half of it; of several that cover over 90 %, the smallest.
+    Relations of type building take precedence, by their outline or as an outline themselves. Otherwise it is
+    the outline that covers most of the part, at least half of it; of several that cover over 90 %, the
+    smallest.
     """
     found = np.full(len(part), -1, np.int64)
     p, o, shared = overlapping(part, outline)
@@ -213,6 +214,7 @@ def assign(
             continue
         members = [(f"{kind}/{ref}", role) for kind, ref, role in relation.members]
         target = next((outline_row[m] for m, role in members if role == "outline" and m in outline_row), None)
+        target = outline_row.get(relation.osm_id) if target is None else target
         if target is None:
             continue
         for member, role in members:

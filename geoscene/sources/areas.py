@@ -82,9 +82,25 @@ class _Boundary:
     ways: list[tuple[int, bool]]
 
 
+_NO_RINGS = frozenset(
+    {"part", "building:part", "ridge", "edge", "entrance", "label", "admin_centre", "address"}
+)
+"""Roles of members that do not bound a multipolygon."""
+
+
 def is_multipolygon(tags: Tags) -> bool:
     """Whether a relation is of type multipolygon; relations of type ``boundary`` stay relations."""
     return tags.get("type") == "multipolygon"
+
+
+def _is_untagged_outline(elements: Elements, row_of: dict[int, int], *, tags: Tags, members: Members) -> bool:
+    """Whether a relation of type building has the tags of its outline, whose ways have none."""
+    if tags.get("type") != "building" or not is_building(tags):
+        return False
+    outline = [(kind, row_of.get(i, -1)) for kind, i, role in members if role in ("outline", "outer")]
+    return bool(outline) and all(
+        kind == "way" and row >= 0 and not is_building(elements.way_tags[row]) for kind, row in outline
+    )
 
 
 def _is_tagged_area(tags: Tags) -> bool:
@@ -101,7 +117,11 @@ def _boundary(
     shares any area tag and value with it; an inner way is not if it is tagged the same. A building inherits
     further tags from a single outer way.
     """
-    ways = [(row_of.get(i, -1), role == "inner") for kind, i, role in members if kind == "way"]
+    ways = [
+        (row_of.get(i, -1), role == "inner")
+        for kind, i, role in members
+        if kind == "way" and role not in _NO_RINGS
+    ]
     own = _descriptive(tags)
     outer = sorted({row for row, inner in ways if row >= 0 and not inner})
     tables = [m for row in outer if _is_tagged_area(m := _descriptive(elements.way_tags[row]))]
@@ -185,7 +205,7 @@ def multipolygon_areas(
     problems: list[Problem] = []
     claims = Claims(set(), set())
     for osm_id, tags, members in elements.relations:
-        if not is_multipolygon(tags):
+        if not (is_multipolygon(tags) or _is_untagged_outline(elements, row_of, tags=tags, members=members)):
             continue
         boundary, taken, both_tagged = _boundary(elements, row_of, osm_id=osm_id, tags=tags, members=members)
         rows = np.array([row for row, _ in boundary.ways if row >= 0], np.int64)
