@@ -6,7 +6,7 @@ import bz2
 import gzip
 import math
 from array import array
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import InputError
 from geoscene.sources.data import Bounds, Progress, Tags
+from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
 
 Members = tuple[tuple[str, int, str], ...]
@@ -29,6 +30,9 @@ UNKNOWN = 2**31 - 1
 
 OPEN: dict[str, Callable[..., Any]] = {"": open, ".gz": gzip.open, ".bz2": bz2.open}
 """How to open a file by the suffix of its compression."""
+
+LONGEST_TAG = 1024
+"""Bytes of the longest key or value that is read, as libosmium's; OpenStreetMap allows 255 characters."""
 
 RELATIONS = "building|bridge|multipolygon|restriction|site|tunnel"
 """Types of relations that are fetched; routes and boundaries extend far beyond the area and are not used."""
@@ -50,6 +54,7 @@ class Elements:
     bounds    : (west, south, east, north) degrees as stated by the source, or None
     timestamp : ISO 8601 or ""
     misplaced : ids of nodes whose coordinates were missing or out of range
+    problems  : tags that were left out
     """
 
     node_id: Ints
@@ -64,6 +69,7 @@ class Elements:
     bounds: tuple[float, float, float, float] | None
     timestamp: str
     misplaced: Ints
+    problems: tuple[Problem, ...] = ()
 
     def chain(self, way: int) -> Ints:
         """(k,) node indices of the way in row ``way``, -1 for missing nodes."""
@@ -83,11 +89,19 @@ def _last_of_each(ids: Ints) -> Ints:
     return order[last]
 
 
+def _without(ids: Ints, rows: Ints, *, deleted: set[int]) -> Ints:
+    """The rows whose ids are not deleted."""
+    return rows[~np.isin(ids[rows], np.array(sorted(deleted), np.int64))] if deleted else rows
+
+
+_KINDS = ("node", "way", "relation")
+
+
 @dataclass(slots=True)
 class Collector:
     """Collects map objects one by one, in any order; `finish` returns them as `Elements`.
 
-    Of objects with the same id the last counts.
+    Of objects with the same id the last counts; none does if that is deleted.
     """
 
     bounds: tuple[float, float, float, float] | None = None
@@ -101,18 +115,23 @@ class Collector:
     _way_tags: list[Tags] = field(default_factory=list)
     _refs: array[int] = field(default_factory=lambda: array("q"))
     _relations: dict[int, tuple[Tags, Members]] = field(default_factory=dict)
+    _deleted: dict[str, set[int]] = field(default_factory=lambda: {kind: set() for kind in _KINDS})
+    _problems: list[Problem] = field(default_factory=list)
 
     def __len__(self) -> int:
-        """Number of objects added."""
-        return len(self._node_id) + len(self._way_id) + len(self._relations)
+        """Number of objects added or deleted."""
+        deleted = sum(map(len, self._deleted.values()))
+        return len(self._node_id) + len(self._way_id) + len(self._relations) + deleted
 
     def node(self, osm_id: int, x: int, *, y: int, tags: Tags | None) -> None:
         """Add a node at ``x``, ``y`` (longitude, latitude in 1e-7 degrees, `UNKNOWN` if missing)."""
+        self._deleted["node"].discard(osm_id)
         self._node_id.append(osm_id)
         self._node_x.append(x)
         self._node_y.append(y)
+        self._node_tags.pop(osm_id, None)
         if tags:
-            self._node_tags[osm_id] = tags
+            self._node_tags[osm_id] = self._short(f"node/{osm_id}", tags)
 
     def nodes(self, ids: Ints, *, x: NDArray[np.int32], y: NDArray[np.int32]) -> None:
         """Add nodes (n,) as `node`, without tags."""
@@ -122,19 +141,39 @@ class Collector:
 
     def node_tags(self, osm_id: int, tags: Tags) -> None:
         """Add the tags of a node."""
-        self._node_tags[osm_id] = tags
+        self._node_tags[osm_id] = self._short(f"node/{osm_id}", tags)
 
     def way(self, osm_id: int, refs: Iterable[int], *, tags: Tags) -> None:
         """Add a way by its node ids."""
+        self._deleted["way"].discard(osm_id)
         before = len(self._refs)
         self._refs.extend(refs)
         self._way_id.append(osm_id)
         self._way_size.append(len(self._refs) - before)
-        self._way_tags.append(tags)
+        self._way_tags.append(self._short(f"way/{osm_id}", tags))
 
     def relation(self, osm_id: int, tags: Tags, *, members: Members) -> None:
         """Add a relation."""
-        self._relations[osm_id] = (tags, members)
+        self._deleted["relation"].discard(osm_id)
+        self._relations[osm_id] = (self._short(f"relation/{osm_id}", tags), members)
+
+    def delete(self, kind: str, osm_id: int) -> None:
+        """Leave out an object (``node``, ``way`` or ``relation``), unless it is added again afterwards."""
+        self._deleted[kind].add(osm_id)
+
+    def _short(self, name: str, tags: Tags) -> Tags:
+        """The tags without those that are too long, which become problems."""
+        if sum(map(len, tags)) + sum(map(len, tags.values())) <= LONGEST_TAG // 4:
+            return tags
+        kept = {}
+        for key, value in tags.items():
+            size = max(len(key.encode()), len(value.encode()))
+            if size <= LONGEST_TAG:
+                kept[key] = value
+                continue
+            detail = f"tag {key[:40]} of {size:,} bytes left out, maximum is {LONGEST_TAG:,}"
+            self._problems.append(Problem(name, name.partition("/")[0], "repaired", "overlong-tag", detail))
+        return kept
 
     def has_drawn_nodes(self) -> bool:
         """Whether tags or ways refer to nodes with negative ids, which are not in OpenStreetMap yet."""
@@ -176,12 +215,17 @@ class Collector:
             self._way_tags + other._way_tags,
             self._refs + other._refs,
             self._relations | other._relations,
+            {
+                kind: self._deleted[kind] - set(ids) | other._deleted[kind]
+                for kind, ids in zip(_KINDS, (other._node_id, other._way_id, other._relations), strict=True)
+            },
+            self._problems + other._problems,
         )
 
     def finish(self) -> Elements:
         """All objects, sorted by id, with resolved node references."""
         ids = np.frombuffer(self._node_id, np.int64) if self._node_id else np.empty(0, np.int64)
-        keep = _last_of_each(ids)
+        keep = _without(ids, _last_of_each(ids), deleted=self._deleted["node"])
         ids = ids[keep]
         xy = np.empty((len(ids), 2), np.int32)
         for column, values in enumerate((self._node_x, self._node_y)):
@@ -190,7 +234,7 @@ class Collector:
         misplaced, ids, xy = ids[~placed], ids[placed], xy[placed]
 
         way_id = np.array(self._way_id, np.int64)
-        rows = _last_of_each(way_id)
+        rows = _without(way_id, _last_of_each(way_id), deleted=self._deleted["way"])
         sizes = np.array(self._way_size, np.int64)
         starts = np.concatenate([[0], np.cumsum(sizes)])
         new_starts = np.concatenate([[0], np.cumsum(sizes[rows])])
@@ -203,7 +247,7 @@ class Collector:
             index = np.where(ids[place] == refs, place, -1)
         else:
             index = np.full(len(refs), -1)
-        gone = set(misplaced.tolist())
+        gone = self._deleted["node"].union(misplaced.tolist())
         return Elements(
             node_id=ids,
             node_xy=xy,
@@ -213,10 +257,13 @@ class Collector:
             way_closed=closed,
             way_tags=[self._way_tags[i] for i in rows.tolist()],
             ref=index.astype(np.int64),
-            relations=[(i, *self._relations[i]) for i in sorted(self._relations)],
+            relations=[
+                (i, *self._relations[i]) for i in sorted(self._relations.keys() - self._deleted["relation"])
+            ],
             bounds=self.bounds,
             timestamp=self.timestamp,
             misplaced=misplaced,
+            problems=tuple(dict.fromkeys(self._problems)),
         )
 
 
@@ -238,27 +285,42 @@ def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progre
     """
     try:
         with OPEN[form.removeprefix("osm")](path, "rb") as file:
-            for _, item in progress(ET.iterparse(file)):  # noqa: S314 - expat limits the expansion of entities
-                if item.tag not in {"node", "way", "relation"}:
+            deleting = False  # in the section of OsmChange for what was deleted
+            for event, item in progress(ET.iterparse(file, ("start", "end"))):  # noqa: S314 - expat limits entities
+                if item.tag == "delete":
+                    deleting = event == "start"
+                if event == "start" or item.tag not in _KINDS:
                     continue
-                tags = {tag.get("k", ""): tag.get("v", "") for tag in item.iter("tag")}
-                osm_id = int(item.get("id", ""))
-                if item.tag == "node":
-                    x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
-                    collector.node(osm_id, x, y=y, tags=tags or None)
-                elif item.tag == "way":
-                    collector.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
-                else:
-                    members = tuple(
-                        (m.get("type", ""), int(m.get("ref", "")), m.get("role", ""))
-                        for m in item.iter("member")
-                    )
-                    collector.relation(osm_id, tags, members=members)
-                if not collector.timestamp or item.get("timestamp", "") > collector.timestamp:
-                    collector.timestamp = item.get("timestamp", "")
+                _collect_element(item, collector, deleted=deleting or is_deleted(item.attrib))
                 item.clear()
     except ET.ParseError as error:
         raise ValueError(str(error)) from error
+
+
+def is_deleted(attributes: Mapping[str, Any]) -> bool:
+    """Whether an object is marked as deleted by an editor (``action``) or by OpenStreetMap (``visible``)."""
+    return attributes.get("action") == "delete" or attributes.get("visible") in ("false", False)
+
+
+def _collect_element(item: ET.Element, collector: Collector, *, deleted: bool) -> None:
+    """Add an object's XML element to ``collector``."""
+    osm_id = int(item.get("id", ""))
+    if deleted:
+        collector.delete(item.tag, osm_id)
+        return
+    tags = {tag.get("k", ""): tag.get("v", "") for tag in item.iter("tag")}
+    if item.tag == "node":
+        x, y = whole_units(item.get("lon")), whole_units(item.get("lat"))
+        collector.node(osm_id, x, y=y, tags=tags or None)
+    elif item.tag == "way":
+        collector.way(osm_id, [int(nd.get("ref", "")) for nd in item.iter("nd")], tags=tags)
+    else:
+        members = tuple(
+            (m.get("type", ""), int(m.get("ref", "")), m.get("role", "")) for m in item.iter("member")
+        )
+        collector.relation(osm_id, tags, members=members)
+    if not collector.timestamp or item.get("timestamp", "") > collector.timestamp:
+        collector.timestamp = item.get("timestamp", "")
 
 
 def query_for(box: Bounds, *, timeout: int = 180) -> str:
@@ -291,7 +353,9 @@ def collect_answer(answer: Any, collector: Collector) -> None:
     try:
         for item in answer["elements"]:
             tags, kind, osm_id = _tags(item), item["type"], int(item["id"])
-            if kind == "node":
+            if is_deleted(item) and kind in _KINDS:
+                collector.delete(kind, osm_id)
+            elif kind == "node":
                 collector.node(
                     osm_id, whole_units(item.get("lon")), y=whole_units(item.get("lat")), tags=tags or None
                 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -79,6 +80,9 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
     newest = dt.datetime.fromtimestamp(0, dt.UTC)
     kinds = {"n": "node", "w": "way", "r": "relation"}
     for item in progress(stream):
+        if item.deleted:
+            collector.delete(kinds[item.type_str()], item.id)
+            continue
         if item.is_node():
             tags = _tags(item) if item.tags else None
             if nodes is None:
@@ -88,9 +92,9 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
                 collector.node_tags(item.id, tags)
             if tags is None:
                 continue
-        elif item.is_way() and not item.deleted:
+        elif item.is_way():
             collector.way(item.id, [node.ref for node in item.nodes], tags=_tags(item))
-        elif item.is_relation() and not item.deleted:
+        elif item.is_relation():
             members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
             collector.relation(item.id, _tags(item), members=members)
         else:
@@ -120,15 +124,39 @@ def _collect(path: Path, progress: Progress) -> Collector:
     if box.valid() and box.size() > 0:
         low, high = box.bottom_left, box.top_right
         collector.bounds = (low.lon, low.lat, high.lon, high.lat)
+    if file_format.startswith("osm") and _has_deletions(path, file_format):
+        return _collected_without_libosmium(path, file_format, bounds=collector.bounds, progress=progress)
     try:
         nodes = _node_places(file) if file_format == "pbf" else None
         _stream(file, collector, nodes=nodes, progress=progress)
         if nodes is not None and collector.has_drawn_nodes():  # which libosmium's index leaves out
             collector = Collector(bounds=collector.bounds)
             _stream(file, collector, nodes=None, progress=progress)
-    except osmium.InvalidLocationError:  # the position of a node is not a number: read without libosmium
-        collector = Collector(bounds=collector.bounds)
-        collect_xml(path, file_format, collector=collector, progress=progress)
+    except (osmium.InvalidLocationError, ValueError) as error:
+        # the position of a node is not a number, or a tag is too long for libosmium
+        unread = isinstance(error, osmium.InvalidLocationError) or "too long" in str(error)
+        if not (unread and file_format.startswith("osm")):
+            raise
+        return _collected_without_libosmium(path, file_format, bounds=collector.bounds, progress=progress)
+    return collector
+
+
+def _has_deletions(path: Path, file_format: str) -> bool:
+    """Whether objects of an XML file are marked by an editor as deleted, which libosmium does not tell."""
+    mark, tail = re.compile(rb"""\baction\s*=\s*["']delete["']"""), b""
+    with OPEN[file_format.removeprefix("osm")](path, "rb") as content:
+        while block := content.read(1 << 20):
+            if mark.search(tail + block):
+                return True
+            tail = block[-32:]
+    return False
+
+
+def _collected_without_libosmium(
+    path: Path, file_format: str, *, bounds: Bounds | None, progress: Progress
+) -> Collector:
+    collector = Collector(bounds=bounds)
+    collect_xml(path, file_format, collector=collector, progress=progress)
     return collector
 
 
