@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 
@@ -12,7 +14,9 @@ from geoscene.sources.data import (
     OsmData,
     Relation,
     TaggedNode,
+    Tags,
     Way,
+    existing_tags,
     has_meaning,
     is_area,
     is_line,
@@ -148,6 +152,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     elements, extent, far = locate(elements, bounds)
     places = Places.of(elements)
     near = _intersect(elements, bounds)
+    elements, absent = _existing(elements, near, bounds=bounds)
 
     def wanted(rows: Ints) -> bool:
         return bool(near[rows].any())
@@ -156,7 +161,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
         Problem(f"node/{i}", "node", "dropped", "bad-coordinates", "missing or out of range")
         for i in elements.misplaced.tolist()
     ]
-    problems += far
+    problems += [*elements.problems, *far, *absent]
     areas, found, claims = multipolygon_areas(elements, places, extent=extent, wanted=wanted)
     problems += found
     rows = [row for row in np.flatnonzero(near).tolist() if has_meaning(elements.way_tags[row])]
@@ -197,6 +202,47 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
                 f" it covers {','.join(f'{v:.7g}' for v in covered)} (west, south, east, north)"
             )
     return data
+
+
+def _existing(elements: Elements, near: Bools, *, bounds: Bounds | None) -> tuple[Elements, list[Problem]]:
+    """The elements without tags of what is planned or gone, and these objects within the bounds.
+
+    near : (w,) bool, ways that intersect the bounds
+    """
+    problems: list[Problem] = []
+
+    def existing(name: str, tags: Tags, *, inside: bool) -> Tags:
+        kept, absent = existing_tags(tags)
+        if absent and inside:
+            problems.append(Problem(name, kind_of(tags), "dropped", "does-not-exist", absent))
+        return kept
+
+    west, south, east, north = bounds or (-np.inf, -np.inf, np.inf, np.inf)
+    ids = np.array(list(elements.node_tags), np.int64)
+    lon, lat = elements.lonlat(np.searchsorted(elements.node_id, ids)).reshape(-1, 2).T
+    inside = (lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)
+    node_tags = {
+        i: existing(f"node/{i}", elements.node_tags[i], inside=bool(here))
+        for i, here in zip(ids.tolist(), inside, strict=True)
+    }
+    way_tags = [
+        existing(f"way/{i}", tags, inside=bool(here))
+        for i, tags, here in zip(elements.way_id.tolist(), elements.way_tags, near, strict=True)
+    ]
+    shown = set(elements.way_id[near].tolist())
+    relations = [
+        (
+            i,
+            existing(
+                f"relation/{i}",
+                tags,
+                inside=any(kind == "way" and ref in shown for kind, ref, _ in members),
+            ),
+            members,
+        )
+        for i, tags, members in elements.relations
+    ]
+    return replace(elements, node_tags=node_tags, way_tags=way_tags, relations=relations), problems
 
 
 def _points(elements: Elements) -> list[TaggedNode]:

@@ -97,6 +97,39 @@ LINE_KEYS = (
 
 _NO = frozenset({"no", "false", "0"})
 
+_GONE = frozenset(
+    {
+        "cancelled",
+        "collapsed",
+        "demolished",
+        "destroyed",
+        "dismantled",
+        "planned",
+        "proposed",
+        "razed",
+        "removed",
+    }
+)
+"""States of objects that do not exist, or no longer."""
+
+_UNUSABLE = {
+    "highway": frozenset({"abandoned", "construction", "disused"}),
+    "railway": frozenset({"abandoned", "construction"}),
+    "bridge": frozenset({"construction"}),
+}
+"""Values of ways that nothing runs on; buildings under construction and abandoned ones stand."""
+
+_STANDING = frozenset({"abandoned", "disused", "ruins"})
+"""Prefixes of buildings that stand."""
+
+_STATED = (
+    "building", "building:part", "highway", "railway", "barrier", "bridge", "natural", "man_made", "power",
+    "amenity", "leisure", "waterway",
+)  # fmt: skip
+"""Keys that may have a state, as ``building=proposed`` or ``demolished:building=yes``."""
+
+_STATES = _GONE | _STANDING | {"construction"}
+
 
 @dataclass(frozen=True, slots=True)
 class Way:
@@ -220,6 +253,35 @@ class OsmData:
 def has_meaning(tags: Tags) -> bool:
     """Whether any tag describes the object itself."""
     return any(key not in NOISE for key in tags)
+
+
+def existing_tags(tags: Tags) -> tuple[Tags, str]:
+    """The tags of what exists, and the tags that say that something does not, as text; "" if none does.
+
+    Planned and removed objects are tagged ``building=proposed``, ``demolished:building=yes``, or
+    ``building=yes`` with ``demolished=yes``. Buildings that are disused, abandoned or ruined stand.
+    """
+    words = {*tags, *tags.values(), *(key.partition(":")[0] for key in tags)}
+    if words.isdisjoint(_STATES):
+        return tags, ""
+    gone = [key for key in _GONE.intersection(tags) if tags[key] == "yes"]
+    kept: Tags = {}
+    absent = []
+    for key, value in tags.items():
+        prefix, _, rest = key.partition(":")
+        if key in _STATED and (gone or value in _GONE or value in _UNUSABLE.get(key, ())):
+            absent.append(f"{key}={value}")
+        elif prefix in _STANDING and rest == "building":
+            kept.setdefault("building", value)
+        else:
+            kept[key] = value
+            if (
+                rest in _STATED
+                and rest not in tags
+                and (prefix in _GONE or prefix in _UNUSABLE.get(rest, ()))
+            ):
+                absent.append(f"{key}={value}")
+    return kept, ", ".join([*absent, *(f"{key}=yes" for key in sorted(gone) if absent)])
 
 
 def area_tags(tags: Tags) -> Tags:

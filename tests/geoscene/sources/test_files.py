@@ -449,6 +449,167 @@ def test_a_building_whose_inner_ring_is_its_outer_ring_is_dropped(tmp_path):
     assert {p.detail for p in data.problems} == {"2 member ways; the inner rings leave no area"}
 
 
+def test_members_with_the_role_of_a_part_bound_no_multipolygon(tmp_path):
+    town = Map()
+    outer, inner = town.ring(square(0, 0, 50)), town.ring(square(10, 10))
+    part = town.ring(square(5, 5), {"building:part": "yes", "min_height": "12"})
+    members = [(outer, "outer"), (inner, "inner"), (part, "part")]
+    town.relation(members, {"type": "multipolygon", "building": "yes"})
+    data = town.read(tmp_path)
+    sizes = {a.osm_id: round(square_metres(a)) for a in data.areas}
+    assert sizes == {f"way/{part}": 400, f"relation/{town.count}": 2100}
+    assert data.problems == []
+
+
+def test_a_relation_of_type_building_with_the_tags_of_its_outline_is_a_building(tmp_path):
+    town = Map()
+    outline = town.ring(square(0, 0, 50))
+    part = town.ring(square(10, 10), {"building:part": "yes", "height": "20"})
+    town.relation([(outline, "outline"), (part, "part")], {"type": "building", "building": "yes"})
+    tagged = town.ring(square(100, 0), {"building": "yes"})
+    town.relation([(tagged, "outline")], {"type": "building", "building": "yes"})
+    data = town.read(tmp_path)
+    assert {a.osm_id for a in data.areas} == {f"way/{part}", f"relation/{part + 1}", f"way/{tagged}"}
+    assert len(data.relations) == 2  # which assign parts
+    assert data.problems == []
+
+
+# --- what editors and changes mark
+
+
+MARKS = ('action="delete"', "action='delete'", 'visible="false"')
+
+
+@pytest.mark.parametrize("mark", MARKS)
+@pytest.mark.parametrize("packed", [False, True])
+def test_deleted_objects_are_not_read(tmp_path, mark, packed):
+    town = Map()
+    kept = town.ring(square(0, 0), {"building": "yes"})
+    gone = town.ring(square(50, 0), {"building": "yes"})
+    tree = town.node(80, 0, {"natural": "tree"})
+    outer = town.ring(square(100, 0))
+    forest = town.relation([(outer, "outer")], {"type": "multipolygon", "natural": "wood"})
+    text = town.xml()
+    for kind, i in (("way", gone), ("node", tree), ("relation", forest)):
+        assert f'<{kind} id="{i}"' in text
+        text = text.replace(f'<{kind} id="{i}"', f'<{kind} id="{i}" {mark}')
+    path = tmp_path / "map"
+    path.write_bytes(gzip.compress(text.encode()) if packed else text.encode())
+    data = read_osm(path)
+    assert [a.osm_id for a in data.areas] == [f"way/{kept}"]
+    assert data.points == data.problems == []
+
+
+def test_a_deleted_node_is_missing_from_its_way(tmp_path):
+    town = Map()
+    nodes = town.nodes([(0, 0), (10, 0), (20, 0), (30, 0), (40, 0)])
+    town.way(nodes, {"highway": "residential"})
+    path = tmp_path / "map.osm"
+    path.write_text(town.xml().replace(f'<node id="{nodes[2]}"', f'<node id="{nodes[2]}" action="delete"'))
+    data = read_osm(path)
+    assert [len(way.nodes) for way in data.ways] == [2, 2]
+    assert reasons(data) == [("road", "repaired", "missing-nodes")]
+
+
+def test_a_file_of_changes_changes_the_map_before_it(tmp_path):
+    town = Map()
+    house = town.ring(square(0, 0), {"building": "yes"})
+    shed = town.ring(square(50, 0), {"building": "yes"})
+    (tmp_path / "a.osm").write_text(town.xml())
+    corners = "".join(f'<nd ref="{i}"/>' for i in (1, 2, 3, 4, 1))
+    changes = (
+        f'<modify><way id="{house}">{corners}<tag k="building" v="church"/></way></modify>'
+        f'<delete><way id="{shed}"/></delete>'
+        '<create><node id="99" lat="0.0001" lon="0.0001"><tag k="natural" v="tree"/></node></create>'
+    )
+    (tmp_path / "b.osc").write_text(f'<osmChange version="0.6">{changes}</osmChange>')
+    data = read_osm([tmp_path / "a.osm", tmp_path / "b.osc"])
+    assert [(a.osm_id, a.tags["building"]) for a in data.areas] == [(f"way/{house}", "church")]
+    assert [p.osm_id for p in data.points] == ["node/99"]
+    data = read_osm([tmp_path / "b.osc", tmp_path / "a.osm"])  # the map is newer than the change
+    assert [a.osm_id for a in data.areas] == [f"way/{house}", f"way/{shed}"]
+    (tmp_path / "c.osc").write_text(
+        f'<osmChange version="0.6"><delete><way id="{house}"/></delete></osmChange>'
+    )
+    assert not [a for a in read_osm([tmp_path / "a.osm", tmp_path / "c.osc"]).areas if "church" in a.tags]
+    with pytest.raises(SourceNotFoundError):
+        read_osm(tmp_path / "c.osc")
+
+
+@pytest.mark.parametrize("form", ["xml", "json"])
+def test_a_tag_that_is_too_long_is_left_out_alone(tmp_path, form):
+    town = Map()
+    house = town.ring(square(0, 0), {"building": "yes", "note": "x" * 100_000, "name": "y" * 1024})
+    path = tmp_path / "map"
+    path.write_text(town.xml())
+    if form == "json":
+        data = read_osm(path)
+        nodes = [
+            {"type": "node", "id": i, "lat": y * METRE, "lon": x * METRE}
+            for i, (x, y) in enumerate(square(0, 0), 1)
+        ]
+        tags = data.areas[0].tags | {"note": "x" * 100_000}
+        way = {"type": "way", "id": house, "nodes": [1, 2, 3, 4, 1], "tags": tags}
+        path.write_text(json.dumps({"elements": [*nodes, way]}))
+    data = read_osm(path)
+    assert data.areas[0].tags == {"building": "yes", "name": "y" * 1024}
+    detail = "tag note of 100,000 bytes left out, maximum is 1,024"
+    assert data.problems == [Problem(f"way/{house}", "way", "repaired", "overlong-tag", detail)]
+
+
+# --- what does not exist
+
+
+@pytest.mark.parametrize(
+    ("tags", "kept"),
+    [
+        ({"building": "proposed", "height": "60"}, None),
+        ({"building": "demolished"}, None),
+        ({"building": "collapsed"}, None),
+        ({"building": "yes", "demolished": "yes"}, None),
+        ({"building:part": "razed"}, None),
+        ({"demolished:building": "yes"}, None),
+        ({"proposed:building": "house", "landuse": "grass"}, {"landuse": "grass"}),
+        ({"building": "demolished", "landuse": "brownfield"}, {"landuse": "brownfield"}),
+        ({"building": "construction"}, {"building": "construction"}),
+        ({"building": "yes", "construction": "yes"}, {"building": "yes", "construction": "yes"}),
+        ({"building": "ruins"}, {"building": "ruins"}),
+        ({"building": "yes", "abandoned": "yes"}, {"building": "yes", "abandoned": "yes"}),
+        ({"disused:building": "school"}, {"building": "school"}),
+        ({"building": "house", "was:building": "barn"}, {"building": "house", "was:building": "barn"}),
+        ({"building": "house", "demolished:building": "barn"}, {"building": "house"}),
+        ({"highway": "residential", "bridge": "proposed"}, {"highway": "residential"}),
+        ({"highway": "construction", "construction": "primary"}, None),
+        ({"highway": "proposed", "proposed": "primary"}, None),
+        ({"abandoned:highway": "residential"}, None),
+        ({"railway": "razed"}, None),
+        ({"railway": "disused"}, {"railway": "disused"}),
+        ({"barrier": "wall", "removed": "yes"}, None),
+        ({"removed:barrier": "fence"}, None),
+        ({"razed:natural": "tree"}, None),
+    ],
+)
+def test_what_is_planned_or_gone_is_left_out_and_listed(tmp_path, tags, kept):
+    town = Map()
+    town.ring(square(0, 0), tags)
+    town.node(50, 0, tags)
+    data = town.read(tmp_path)
+    stated = ("building", "building:part", "highway", "railway", "barrier", "natural", "bridge", "landuse")
+    for feature in (*data.areas, *data.ways, *data.points):
+        assert {k for k in feature.tags if k in stated} == {k for k in kept or () if k in stated}
+    absent = kept is None or "landuse" in tags or "bridge" in tags
+    assert [(p.action, p.reason) for p in data.problems] == 2 * absent * [("dropped", "does-not-exist")]
+
+
+def test_what_does_not_exist_outside_the_bounds_is_not_listed(tmp_path):
+    town = Map()
+    town.ring(square(0, 0), {"building": "yes"})
+    town.ring(square(500, 0), {"building": "proposed"})
+    town.node(500, 500, {"removed:natural": "tree"})
+    data = town.read(tmp_path, bounds=(-METRE, -METRE, 50 * METRE, 50 * METRE))
+    assert data.problems == []
+
+
 # --- bounds and errors
 
 
