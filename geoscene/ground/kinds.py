@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from geoscene.classes import Class
 from geoscene.sources.data import Tags
+from geoscene.tags import parse_length, parse_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,6 +205,19 @@ def is_underground(tags: Tags) -> bool:
         or tags.get("location") in {"underground", "roof", "rooftop", "indoor", "overhead"}
         or tags.get("parking") in {"underground", "multi-storey", "rooftop", "carports"}
     )
+
+
+def storey_tag(tags: Tags, *, least: float = 1.0) -> str:
+    """The tag that puts an object on a roof, an upper storey or below the ground, as text; "" on the ground.
+
+    least : metres, ``min_height`` from which it counts
+    """
+    low, level = parse_length(tags.get("min_height")), parse_number(tags.get("level"))
+    if low is not None and low >= least:
+        return f"min_height={tags['min_height']}"
+    if level is not None and level != 0 and "0" not in tags["level"].split(";"):
+        return f"level={tags['level']}"
+    return f"location={tags['location']}" if tags.get("location") in {"roof", "rooftop"} else ""
 
 
 def area_kind(tags: Tags) -> GroundKind | None:

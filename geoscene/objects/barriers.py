@@ -10,12 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.buildings.heights import HIGHEST
 from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh, concatenate
-from geoscene.ground.kinds import is_underground
+from geoscene.ground.kinds import is_underground, storey_tag
 from geoscene.ground.partition import PRECISION, GroundPlan
-from geoscene.sources.data import OsmData, Tags
+from geoscene.sources.data import Area, OsmData, Tags, Way, area_tags, is_building
 from geoscene.support.columns import Columns
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
@@ -32,6 +33,12 @@ _STATION = 5.0
 
 _LEAST, _HIGHEST, _WIDEST = 0.01, 30.0, 20.0
 """Metres; smaller and larger values are taken for typing errors."""
+
+_ROOF = 1.0
+"""Metres, ``min_height`` from which a barrier stands on a roof: level, not cut by roads and buildings."""
+
+_SAME = 0.1
+"""Metres within which a barrier mapped as a line is that around an area, and a gate is in it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +89,10 @@ class Barriers(Columns):
 
     polygon  : (n,) object, shapely Polygon or MultiPolygon, what it covers in plan, scene metres
     klass, material : (n,) uint8
-    height   : (n,) float64, metres above the ground
-    height_source, width_source : (n,) str: ``height``, ``width`` or ``default``; ``area`` where its shape is
-               drawn
+    min_height : (n,) float64, metres from the ground to the underside; 0 on the ground
+    height   : (n,) float64, metres from the ground to the top
+    height_source, width_source : (n,) str: ``height``, ``width``, ``est_height``, ``est_width`` or
+               ``default``; ``area`` where its shape is drawn
     osm_id   : (n,) str
     feature  : (n,) int32: as read, consecutive
     """
@@ -92,6 +100,7 @@ class Barriers(Columns):
     polygon: NDArray[np.object_]
     klass: NDArray[np.uint8]
     material: NDArray[np.uint8]
+    min_height: Float
     height: Float
     height_source: NDArray[np.str_]
     width_source: NDArray[np.str_]
@@ -102,51 +111,96 @@ class Barriers(Columns):
 def read_barriers(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Barriers, list[Problem]]:
     """Mapped barriers within an extent, and changed or dropped ones as problems.
 
-    A line has its ``width`` or the default of its kind. It is open at gates on its nodes.
+    A line has its ``width`` or the default of its kind. It is open at gates on its nodes. An area is filled
+    if it is one for its barrier alone (``area=yes``, or a multipolygon without another area tag); a barrier
+    around an area of another kind follows its outline.
     """
     box = shapely.box(*extent)
-    gates = _gates(osm)
     problems: list[Problem] = []
-    rows: list[tuple[object, BarrierKind, str, float, str, str, str]] = []
+    rows: list[_Row] = []
+    drawn: list[Any] = []
+    gates = _gates(osm)
     for way in osm.ways:
-        kind = _kind(way.tags)
+        kind = KINDS.get(way.tags.get("barrier", ""))
         if kind is None or len(way.lonlat) < 2:
             continue
         xy = np.column_stack(frame.from_geographic(*way.lonlat.T))
         line = shapely.LineString(xy)
-        if not line.intersects(box):
+        if not line.intersects(box) or not _on_ground(way, problems=problems):
             continue
-        width, width_source = _size(
-            way.tags, way.osm_id, key="width", usual=kind.width, most=_WIDEST, problems=problems
-        )
-        height, height_source = _size(
-            way.tags, way.osm_id, key="height", usual=kind.height, most=_HIGHEST, problems=problems
-        )
+        drawn.append(line)
         open_at = [
             shapely.Point(p).buffer(gates[int(node)] / 2)
             for node, p in zip(way.nodes, xy, strict=True)
             if int(node) in gates
         ]
-        if open_at:
-            line = line.difference(shapely.union_all(open_at))
-        band = line.buffer(width / 2, cap_style="flat", join_style="mitre", mitre_limit=3.0)
-        rows.append((band, kind, _material(way.tags, kind), height, height_source, width_source, way.osm_id))
+        rows.append(_band_row(way, kind, line=line, open_at=open_at, problems=problems))
+    lines = {way.osm_id for way in osm.ways}
+    rings: list[tuple[Area, BarrierKind, Any]] = []
     for area in osm.areas:
-        kind = _kind(area.tags)
+        kind = KINDS.get(area.tags.get("barrier", ""))
         if kind is None:
             continue
         shape = shapely.transform(area.geometry, lambda c: np.column_stack(frame.from_geographic(*c.T)))
-        if shape.intersects(box):
-            height, height_source = _size(
-                area.tags, area.osm_id, key="height", usual=kind.height, most=_HIGHEST, problems=problems
-            )
-            rows.append((shape, kind, _material(area.tags, kind), height, height_source, "area", area.osm_id))
+        filled = _is_filled(area.tags, kind)
+        if not shape.intersects(box) or (area.osm_id in lines and not filled):
+            continue
+        if not _on_ground(area, problems=problems):
+            continue
+        if filled:
+            rows.append(_row(area, kind, shape=shape, width_source="area", problems=problems))
+        else:
+            rings.append((area, kind, shape.boundary))
+    if rings:
+        mapped, centres = shapely.union_all(shapely.buffer(drawn, _SAME)), _gate_places(osm, frame)
+        for area, kind, ring in rings:
+            open_at = [place.buffer(width / 2) for place, width in centres if place.distance(ring) < _SAME]
+            line = shapely.difference(ring, mapped)  # ways of the ring may be barriers themselves
+            if not line.is_empty:
+                rows.append(_band_row(area, kind, line=line, open_at=open_at, problems=problems))
     return _table(rows), problems
+
+
+_Row = tuple[object, BarrierKind, str, float, float, str, str, str]
+
+
+def _band_row(
+    feature: Way | Area, kind: BarrierKind, *, line: Any, open_at: Sequence[Any], problems: list[Problem]
+) -> _Row:
+    """The row of a barrier along a line, open at some places."""
+    width, width_source = _size(
+        feature.tags, feature.osm_id, key="width", usual=kind.width, most=_WIDEST, problems=problems
+    )
+    if open_at:
+        line = line.difference(shapely.union_all(open_at))
+    band = line.buffer(width / 2, cap_style="flat", join_style="mitre", mitre_limit=3.0)
+    return _row(feature, kind, shape=band, width_source=width_source, problems=problems)
+
+
+def _row(
+    feature: Way | Area, kind: BarrierKind, *, shape: Any, width_source: str, problems: list[Problem]
+) -> _Row:
+    """The row of a barrier of a shape in plan. Its height counts from ``min_height`` unless it exceeds it."""
+    tags, osm_id = feature.tags, feature.osm_id
+    low, _ = _size(tags, osm_id, key="min_height", usual=0.0, most=HIGHEST, problems=problems)
+    height, source = _size(
+        tags, osm_id, key="height", usual=kind.height, most=_HIGHEST + low, problems=problems
+    )
+    top = height if height > low and source == "height" else low + height
+    return shape, kind, _material(tags, kind), low, top, source, width_source, osm_id
+
+
+def _is_filled(tags: Tags, kind: BarrierKind) -> bool:
+    """Whether a barrier fills its area. No fence does that bounds an area of another kind."""
+    for_itself = not area_tags(tags)
+    return for_itself or (tags.get("area") == "yes" and kind.klass != Class.FENCE)
 
 
 def open_barriers(table: Barriers, plan: GroundPlan) -> tuple[Barriers, list[Problem]]:
     """The barriers open on roads, crossings, tracks and in buildings; those of no area are left out."""
-    polygon, opened = _with_openings(table.polygon, plan)
+    low = table.min_height < _ROOF
+    polygon, opened = shapely.intersection(table.polygon, shapely.box(*plan.extent)), np.zeros(len(low), bool)
+    polygon[low], opened[low] = _with_openings(table.polygon[low], plan)
     problems = [
         Problem(str(osm_id), "barrier", "repaired", "across-road", "open where a road passes")
         for osm_id in table.osm_id[opened]
@@ -184,6 +238,9 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
         (ux, uy), (vx, vy) = ((xy[faces[:, k]] - xy[faces[:, 0]]).T for k in (1, 2))
         faces = np.where((ux * vy < uy * vx)[:, None], faces[:, ::-1], faces)
         ground = np.zeros(len(xy)) if height is None else np.asarray(height(*xy.T), float)
+        low = float(barriers.min_height[row])
+        if low >= _ROOF:
+            ground = np.full(len(xy), ground.min())  # as a building's heights
         n = len(xy)
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
         key, back = edges[:, 0] * n + edges[:, 1], edges[:, 1] * n + edges[:, 0]
@@ -192,7 +249,7 @@ def _solid(barriers: Barriers, row: int, *, height: Height | None) -> Mesh:
             Mesh.of(
                 np.concatenate(
                     [
-                        np.column_stack([xy, ground - _BELOW]),
+                        np.column_stack([xy, ground + (low or -_BELOW)]),
                         np.column_stack([xy, ground + barriers.height[row]]),
                     ]
                 ),
@@ -221,10 +278,22 @@ def _touches_itself(shape: Any) -> bool:
     return len(np.unique(np.rint(coordinates / PRECISION), axis=0)) < len(coordinates)
 
 
-def _kind(tags: Tags) -> BarrierKind | None:
-    if is_underground(tags) or tags.get("layer", "0") != "0":
-        return None
-    return KINDS.get(tags.get("barrier", ""))
+def _on_ground(feature: Way | Area, *, problems: list[Problem]) -> bool:
+    """Whether the place of a barrier is known: on the ground, or ``min_height`` above it."""
+    tags = feature.tags
+    if "building" in tags and is_building(tags):  # the building is it
+        return False
+    where = ""
+    if parse_length(tags.get("min_height")) is None:
+        where = storey_tag(tags) or next(
+            (f"{key}={tags[key]}" for key in ("layer",) if tags.get(key, "0") != "0"), ""
+        )
+    if not where and is_underground(tags):
+        keys = ("tunnel", "bridge", "indoor", "covered", "building:part", "location", "parking")
+        where = ", ".join(f"{key}={tags[key]}" for key in keys if key in tags)
+    if where:
+        problems.append(Problem(feature.osm_id, "barrier", "dropped", "off-ground", where))
+    return not where
 
 
 def _material(tags: Tags, kind: BarrierKind) -> str:
@@ -238,13 +307,15 @@ def _size(
     tags: Tags, osm_id: str, *, key: str, usual: float, most: float, problems: list[Problem]
 ) -> tuple[float, str]:
     """(metres, source) of a height or width."""
-    if key not in tags:
-        return usual, "default"
-    metres = parse_length(tags[key])
-    if metres is not None and _LEAST <= metres <= most:
-        return metres, key
-    detail = f"{key}={tags[key]!r}; took {usual} m"
-    problems.append(Problem(osm_id, "barrier", "repaired", f"unusable-{key}", detail))
+    least = 0.0 if key == "min_height" else _LEAST
+    for name in (key, f"est_{key}"):
+        if name not in tags:
+            continue
+        metres = parse_length(tags[name])
+        if metres is not None and least <= metres <= most:
+            return metres, name
+        detail = f"{name}={tags[name]!r}; took {usual} m"
+        problems.append(Problem(osm_id, "barrier", "repaired", f"unusable-{name}", detail))
     return usual, "default"
 
 
@@ -257,6 +328,15 @@ def _gates(osm: OsmData) -> dict[int, float]:
             width = parse_length(point.tags.get("width")) or usual
             gates[int(point.osm_id.removeprefix("node/"))] = width if 0.0 < width <= _WIDEST else usual
     return gates
+
+
+def _gate_places(osm: OsmData, frame: Frame) -> list[tuple[shapely.Point, float]]:
+    """Places of gates, scene metres, and the widths of their openings."""
+    gates = _gates(osm)
+    nodes = [p for p in osm.points if int(p.osm_id.removeprefix("node/")) in gates]
+    xy = np.column_stack(frame.from_geographic([p.lon for p in nodes], [p.lat for p in nodes]))
+    widths = [gates[int(p.osm_id.removeprefix("node/"))] for p in nodes]
+    return list(zip(shapely.points(xy).tolist(), widths, strict=True))
 
 
 def _with_openings(polygons: NDArray[np.object_], plan: GroundPlan) -> tuple[NDArray[np.object_], Bools]:
@@ -281,14 +361,15 @@ def _polygonal(geometry: Any) -> Any:
     return shapely.multipolygons(parts[areal])
 
 
-def _table(rows: list[tuple[object, BarrierKind, str, float, str, str, str]]) -> Barriers:
+def _table(rows: list[_Row]) -> Barriers:
     return Barriers(
         np.fromiter((row[0] for row in rows), object),
         np.array([row[1].klass for row in rows], np.uint8),
         np.array([materials()[row[2]].code for row in rows], np.uint8),
         np.array([row[3] for row in rows], float),
-        np.array([row[4] for row in rows], np.str_),
+        np.array([row[4] for row in rows], float),
         np.array([row[5] for row in rows], np.str_),
         np.array([row[6] for row in rows], np.str_),
+        np.array([row[7] for row in rows], np.str_),
         np.arange(len(rows), dtype=np.int32),
     )

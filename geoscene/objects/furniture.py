@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import ShapeInstances
-from geoscene.ground.kinds import is_underground
+from geoscene.ground.kinds import is_underground, storey_tag
 from geoscene.ground.partition import GroundPlan
 from geoscene.objects.shapes import place, shapes
 from geoscene.objects.signs import select_direction, sign_face, sign_shape
@@ -33,6 +33,9 @@ _Row = tuple[Float, float, str, str, float, str, str, str, str, Float, int]
 
 _TALLEST = 60.0
 """Metres; greater heights are taken for masts or typing errors."""
+
+_STOREY = 3.0
+"""Metres, ``min_height`` from which an object is on a storey; plates of signs begin lower."""
 
 _FARTHEST = 30.0
 """Metres within which the road that an object faces is searched for."""
@@ -129,6 +132,11 @@ def read_furniture(
     problems = [
         Problem(chosen[k][0].osm_id, "furniture", "dropped", "on-carriageway")
         for k in np.flatnonzero(~found).tolist()
+    ]
+    problems += [
+        Problem(p.osm_id, "furniture", "dropped", "off-ground", where)
+        for p in osm.points
+        if (where := storey_tag(p.tags, least=_STOREY)) and shape_of(p.tags, relief=relief) is not None
     ]
     rows: list[_Row] = []
     each = POSTS if relief == "off" else STANDS
@@ -231,6 +239,7 @@ def _off_ground(tags: Tags) -> bool:
     return (
         is_underground(tags)
         or layer not in {"0", ""}
+        or storey_tag(tags, least=_STOREY) != ""
         or tags.get("location") in {"indoor", "wall", "wall_mounted"}
         or tags.get("fire_hydrant:type") in {"underground", "wall", "pond", "pipe"}
     )

@@ -119,7 +119,7 @@ def barrier_layer(barriers: Barriers) -> Layer:
     """Layer ``barriers``: walls, fences and hedges in plan."""
     columns = _columns(
         barriers,
-        "feature osm_id class material height height_source width_source",
+        "feature osm_id class material min_height height height_source width_source",
         **{"class": class_names(barriers.klass)},
         material=material_names(barriers.material),
     )

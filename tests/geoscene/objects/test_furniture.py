@@ -332,6 +332,111 @@ def test_a_hedge_mapped_as_an_area_with_an_unusable_height():
     assert [(p.osm_id, p.reason) for p in problems] == [("way/9", "unusable-height")]
 
 
+def ground_of(shape, number=9, kind="way", **tags):
+    return Area(f"{kind}/{number}", tags, shapely.transform(shape, lonlat), None)
+
+
+YARD = shapely.box(0, 0, 30, 20)
+
+
+@pytest.mark.parametrize("around", [{"leisure": "playground"}, {"landuse": "meadow"}, {"natural": "wood"}])
+@pytest.mark.parametrize("kind", ["fence", "hedge", "wall", "retaining_wall"])
+@pytest.mark.parametrize("source", ["way", "relation"])
+def test_a_barrier_around_an_area_of_another_kind_is_a_line(source, kind, around):
+    tags = {"barrier": kind, "width": "0.5", "height": "2", **around}
+    area = ground_of(YARD, kind=source, **tags)
+    line = way(9, shapely.get_coordinates(YARD.exterior), **tags)
+    _, [mesh], problems = solids(*([area, line] if source == "way" else [area]))
+    assert volume(mesh) == pytest.approx(100 * 0.5 * 2.3, rel=0.02)
+    assert problems == []
+
+
+def test_an_area_of_a_barrier_alone_is_filled_and_a_fence_around_another_is_not():
+    for tags in (
+        {"barrier": "hedge", "area": "yes"},
+        {"barrier": "hedge", "area": "yes", "landuse": "grass"},
+    ):
+        _, [mesh], _ = solids(ground_of(YARD, **tags))
+        assert volume(mesh) == pytest.approx(600 * 1.8)
+    _, [mesh], _ = solids(ground_of(YARD, kind="relation", type="multipolygon", barrier="wall"))
+    assert volume(mesh) == pytest.approx(600 * 2.1)
+    _, [mesh], _ = solids(ground_of(YARD, barrier="fence", area="yes", leisure="pitch"))
+    assert volume(mesh) == pytest.approx(100 * 0.05 * 1.8, rel=0.02)
+
+
+def test_a_fence_around_a_multipolygon_is_open_at_gates_and_not_doubled_by_its_members():
+    area = ground_of(YARD, kind="relation", barrier="fence", leisure="pitch", type="multipolygon")
+    member = way(1, [(0, 0), (30, 0)], barrier="wall")
+    _, [wall, fence], _ = solids(area, member, node(5, (30, 10), barrier="gate", width="4"))
+    assert volume(wall) == pytest.approx(30 * 0.25 * 2.1, rel=1e-3)
+    assert volume(fence) == pytest.approx((100 - 30 - 4) * 0.05 * 1.8, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("tags", "low", "high"),
+    [
+        ({"min_height": "12", "height": "1.2"}, 12.0, 13.2),
+        ({"min_height": "12 m", "height": "13.2"}, 12.0, 13.2),
+        ({"min_height": "12"}, 12.0, 13.5),
+        ({"min_height": "12", "layer": "1", "level": "4", "est_height": "2"}, 12.0, 14.0),
+        ({"min_height": "40", "height": "41"}, 40.0, 41.0),
+        ({"min_height": "0.3", "height": "2"}, 0.3, 2.0),
+        ({"min_height": "0"}, -0.3, 1.5),
+    ],
+)
+def test_a_barrier_on_a_roof_begins_at_its_min_height(tags, low, high):
+    def hill(x, y):
+        return 5.0 + 0.0 * np.asarray(x + y)
+
+    barriers, [mesh], problems = solids(
+        way(1, [(-10, 0), (10, 0)], barrier="fence", width="0.5", **tags),
+        houses=[shapely.box(-20, -20, 20, 20)] if low > 1 else [],
+        height=hill,
+    )
+    assert (mesh.vertices[:, 2].min() - 5, mesh.vertices[:, 2].max() - 5) == pytest.approx((low, high))
+    assert volume(mesh) == pytest.approx(20 * 0.5 * (high - low))
+    assert (barriers.min_height[0], barriers.height[0]) == pytest.approx((max(low, 0), high))
+    assert problems == []
+
+
+def test_a_barrier_on_a_roof_is_level_above_the_lowest_ground_below_it():
+    def hill(x, y):
+        return 0.1 * np.asarray(x) + 0.0 * np.asarray(y)
+
+    _, [mesh], _ = solids(way(1, [(0, 0), (20, 0)], barrier="fence", min_height="12"), height=hill)
+    assert set(np.round(mesh.vertices[:, 2], 6)) == {12.0, 13.5}
+
+
+@pytest.mark.parametrize(
+    "tags", [{"level": "3"}, {"layer": "1"}, {"location": "roof"}, {"indoor": "yes"}, {"layer": "-1"}]
+)
+def test_a_barrier_off_the_ground_without_a_height_is_left_out_and_listed(tags):
+    [(key, value)] = tags.items()
+    barriers, problems = read_barriers(
+        osm_of(way(1, [(0, 0), (20, 0)], barrier="fence", **tags)), FRAME, extent=EXTENT
+    )
+    assert len(barriers) == 0
+    found = [(p.osm_id, p.action, p.reason, p.detail) for p in problems]
+    assert found == [("way/1", "dropped", "off-ground", f"{key}={value}")]
+
+
+def test_a_barrier_is_estimated_to_be_as_high_and_wide_as_its_tags_say():
+    barriers, _, _ = solids(way(1, [(0, 0), (20, 0)], barrier="wall", est_height="3", est_width="1"))
+    assert (barriers.height[0], barriers.polygon[0].area) == pytest.approx((3.0, 20.0))
+    assert (barriers.height_source[0], barriers.width_source[0]) == ("est_height", "est_width")
+
+
+def test_furniture_on_roofs_and_storeys_is_left_out_and_listed():
+    table, problems = read(
+        node(1, (0, 9), amenity="bench", min_height="12"),
+        node(2, (0, 9), amenity="bench", level="3"),
+        node(3, (0, 9), amenity="bench", level="0"),
+        node(4, (0, 9), traffic_sign="stop", min_height="2.2"),
+    )
+    assert set(table.osm_id) == {"node/3", "node/4"}
+    assert [(p.osm_id, p.reason) for p in problems] == [("node/1", "off-ground"), ("node/2", "off-ground")]
+
+
 @pytest.mark.shared
 @pytest.mark.parametrize("name", ["helsinki_center.osm.pbf", "monaco.osm.pbf"])
 def test_every_barrier_of_a_real_place_is_closed(shared_osm, name):
