@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import ShapeInstances
+from geoscene.ground.kinds import storey_tag
 from geoscene.objects.crowns import HABITS, VARIANTS, habit_of
 from geoscene.objects.shapes import place
 from geoscene.support.columns import Columns
@@ -53,8 +54,15 @@ CLOUD_TREE = "cloud:tree"
 _PLACES = {"node": "node", "cloud": "cloud"}
 """Sources of places by the kind of the id; others are rows."""
 
-_TALLEST, _WIDEST, _THICKEST = 116.0, 60.0, 36.0
-"""Metres of the tallest known tree (Hyperion), the widest crown and the greatest girth."""
+_TALLEST, _WIDEST = 116.0, 60.0
+"""Metres of the tallest known tree (Hyperion) and the widest crown."""
+
+_THICK = {"circumference": 36.0, "diameter": 2.5}
+"""Metres up to which a number without a unit is in metres; up to a hundred times that it is in centimetres,
+else in millimetres. It is the greatest known girth; trunks thicker than 2.5 m are rarer than saplings."""
+
+_THICKEST = {"circumference": 36.0, "diameter": 12.0}
+"""Metres of the thickest trunk (Árbol del Tule: 36 m in girth, 11.6 m across)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +75,8 @@ class Trees(Columns):
     trunk   : (n,) float64 metres, diameter at breast height
     form    : (n,) str: ``broadleaved``, ``needleleaved`` or ``palm``
     habit   : (n,) str, growth form, of `geoscene.objects.crowns.HABITS`; "" in scenes without relief
-    height_source : (n,) str: ``cloud``, ``height``, ``diameter_crown``, ``circumference``, ``default``
-              or ``sampled``
+    height_source : (n,) str: ``cloud``, ``height``, ``est_height``, ``diameter_crown``, ``circumference``,
+              ``diameter``, ``default`` or ``sampled``
     crown_source : (n,) str: ``cloud``, ``diameter_crown`` or ``height`` (by its ratio to the height)
     form_source : (n,) str: ``leaf_type``, ``genus`` or ``default``
     habit_source : (n,) str: ``species`` (botanical names), ``form`` (the usual one of the form) or ""
@@ -101,10 +109,11 @@ def read_trees(
 ) -> tuple[Trees, list[Problem]]:
     """The single trees and tree rows on the map, and problems: tags that could not be used.
 
-    Sizes come from ``height``, ``diameter_crown`` (metres) and ``circumference`` (metres; a value over
-    36, more than any trunk, is taken as centimetres); missing sizes are derived from the others by `CROWN`
+    Sizes come from ``height``, else ``est_height``, from ``diameter_crown`` and, of the trunk, from
+    ``circumference``, else ``diameter``. Numbers without a unit are metres, but centimetres or millimetres
+    where a trunk would be thicker than `_THICK`. Missing sizes are derived from the others by `CROWN`
     and `TRUNK`; the form comes from ``leaf_type``, else the genus. With relief, habits come from the
-    botanical names, and the crowns of some are more slender.
+    botanical names, and the crowns of some are more slender. Trees on roofs and upper storeys are left out.
 
     spacing : metres between trees of a row
     with_relief : trees have habits
@@ -115,6 +124,9 @@ def read_trees(
     ids: list[str] = []
     for point in osm.points:
         if point.tags.get("natural") == "tree":
+            if where := storey_tag(point.tags):
+                problems.append(Problem(point.osm_id, "tree", "dropped", "off-ground", where))
+                continue
             lonlat.append((point.lon, point.lat))
             tags.append(point.tags)
             ids.append(point.osm_id)
@@ -122,6 +134,9 @@ def read_trees(
     places = [np.column_stack([x, y])]
     for way in osm.ways:
         if way.tags.get("natural") == "tree_row" and len(way.lonlat) > 1:
+            if where := storey_tag(way.tags):
+                problems.append(Problem(way.osm_id, "tree", "dropped", "off-ground", where))
+                continue
             row = _along(np.column_stack(frame.from_geographic(*way.lonlat.T)), spacing)
             places.append(row)
             tags += [way.tags] * len(row)
@@ -252,18 +267,26 @@ def _sizes(tags: Tags, osm_id: str, *, problems: list[Problem]) -> tuple[float, 
     """(height, crown or NaN, trunk or NaN, height source, form, form source) of one tree's tags."""
     form, form_source = _form(tags)
     crown = _metres(tags, "diameter_crown", most=_WIDEST, osm_id=osm_id, problems=problems)
-    girth = _girth(tags, osm_id, problems=problems)
+    trunk = _trunk(tags, "circumference", osm_id=osm_id, problems=problems) / np.pi
+    by = "circumference"
+    if not np.isfinite(trunk):
+        trunk, by = _trunk(tags, "diameter", osm_id=osm_id, problems=problems), "diameter"
     height = _metres(tags, "height", most=_TALLEST, osm_id=osm_id, problems=problems)
     source = "cloud" if CLOUD_TREE in tags else "height"
     if not np.isfinite(height):
+        height, source = (
+            _metres(tags, "est_height", most=_TALLEST, osm_id=osm_id, problems=problems),
+            "est_height",
+        )
+    if not np.isfinite(height):
         if np.isfinite(crown):
             height, source = crown / CROWN[form], "diameter_crown"
-        elif np.isfinite(girth):
-            height, source = girth / np.pi / TRUNK, "circumference"
+        elif np.isfinite(trunk):
+            height, source = trunk / TRUNK, by
         else:
             height, source = HEIGHT[form], "default"
         height = float(np.clip(height, 1.5, 40.0))
-    return height, crown, girth / np.pi, source, form, form_source
+    return height, crown, trunk, source, form, form_source
 
 
 def _metres(tags: Tags, key: str, *, most: float, osm_id: str, problems: list[Problem]) -> float:
@@ -277,11 +300,14 @@ def _metres(tags: Tags, key: str, *, most: float, osm_id: str, problems: list[Pr
     return np.nan
 
 
-def _girth(tags: Tags, osm_id: str, *, problems: list[Problem]) -> float:
-    """Circumference of a trunk in metres; a bare number too large for metres is read as centimetres."""
-    number = parse_number(tags.get("circumference"))
-    if number is None or not _THICKEST < number <= 100 * _THICKEST:
-        return _metres(tags, "circumference", most=_THICKEST, osm_id=osm_id, problems=problems)
-    detail = f"circumference={tags['circumference']!r} read as centimetres"
-    problems.append(Problem(osm_id, "tree", "repaired", "circumference-in-centimetres", detail))
-    return number / 100.0
+def _trunk(tags: Tags, key: str, *, osm_id: str, problems: list[Problem]) -> float:
+    """Circumference or diameter of a trunk in metres; bare numbers too large for metres are smaller units."""
+    number = parse_number(tags.get(key))
+    if number is None or number <= _THICK[key]:
+        return _metres(tags, key, most=_THICKEST[key], osm_id=osm_id, problems=problems)
+    for unit, per_metre in (("centimetres", 100.0), ("millimetres", 1000.0)):
+        if number <= per_metre * _THICK[key]:
+            detail = f"{key}={tags[key]!r} read as {unit}"
+            problems.append(Problem(osm_id, "tree", "repaired", f"{key}-in-{unit}", detail))
+            return number / per_metre
+    return _metres(tags, key, most=_THICKEST[key], osm_id=osm_id, problems=problems)

@@ -104,6 +104,40 @@ def test_missing_sizes_are_derived_from_known_ones_with_their_source():
     }
 
 
+@pytest.mark.parametrize(
+    ("tags", "height", "trunk", "source", "reasons"),
+    [
+        ({"est_height": "9", "diameter": "40"}, 9, 0.4, "est_height", ["diameter-in-centimetres"]),
+        ({"est_height": "30 ft", "diameter": "40 cm"}, 9.144, 0.4, "est_height", []),
+        ({"height": "15", "est_height": "9", "diameter": "0.5"}, 15, 0.5, "height", []),
+        ({"height": "high", "est_height": "9 m"}, 9, 9 * 0.0284, "est_height", ["unusable-height"]),
+        ({"diameter": "0.3 m"}, 0.3 / 0.0284, 0.3, "diameter", []),
+        ({"diameter": "350 mm"}, 0.35 / 0.0284, 0.35, "diameter", []),
+        ({"diameter": "350"}, 0.35 / 0.0284, 0.35, "diameter", ["diameter-in-millimetres"]),
+        ({"height": "10", "diameter": "12''"}, 10, 0.3048, "height", []),
+        ({"height": "10", "circumference": "94 cm"}, 10, 0.94 / np.pi, "height", []),
+        ({"height": "10", "circumference": "1.2", "diameter": "90"}, 10, 1.2 / np.pi, "height", []),
+        ({"height": "10", "circumference": "940 mm"}, 10, 0.94 / np.pi, "height", []),
+        ({"height": "10", "diameter": "thick"}, 10, 0.284, "height", ["unusable-diameter"]),
+    ],
+)
+def test_heights_and_trunks_are_read_in_the_units_of_mappers(tags, height, trunk, source, reasons):
+    trees, problems = read_trees(osm_of([((11.0, 50.0), tags)]), FRAME)
+    assert (trees.height[0], trees.trunk[0]) == pytest.approx((height, trunk))
+    assert trees.height_source[0] == source
+    assert [p.reason for p in problems] == reasons
+
+
+def test_trees_on_roofs_are_left_out_and_listed():
+    tags = [{"min_height": "12"}, {"level": "2"}, {"location": "roof"}, {"level": "0;1"}, {"min_height": "0"}]
+    row = Way("way/5", {"natural": "tree_row", "level": "1"}, np.arange(2), lonlat_of((0, -40), (0, 40)))
+    trees, problems = read_trees(osm_of([((11.0, 50.0), t) for t in tags], [row]), FRAME)
+    assert trees.osm_id.tolist() == ["node/3", "node/4"]
+    assert [(p.osm_id, p.reason) for p in problems] == [
+        (name, "off-ground") for name in ("node/0", "node/1", "node/2", "way/5")
+    ]
+
+
 def test_the_genus_decides_the_form():
     tags = [
         {"genus": "Picea"},
