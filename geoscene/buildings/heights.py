@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.buildings.appearance import read_roof_tags
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.sources.data import Tags
 from geoscene.tags import Quantities, parse_length, parse_number
@@ -115,9 +116,13 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     """Tagged heights: ``height``, else ``building:height``, ``est_height`` or ``building:levels``.
 
     A height by storeys is storeys x level height, plus the roof's height or storeys (Simple 3D Buildings:
-    building:levels leaves out the storeys of the roof). Ignored are values that are no lengths or numbers,
-    tops below 1 cm or above 1,000 m, undersides below -50 m, more than 200 storeys, and roofs of more than
-    300 m or 20 storeys.
+    building:levels leaves out the storeys of the roof). Storeys count from the ground, with those that
+    building:min_level skips: as many as are skipped leave the roof alone. Of a part without a roof, or with
+    fewer storeys than it skips, they count from its underside. A storey is as high as the tagged heights make
+    it (``height`` without ``roof:height``, else ``min_height``).
+
+    Ignored are values that are no lengths or numbers, tops below 1 cm or above 1,000 m, undersides below
+    -50 m, more than 200 storeys, and roofs of more than 300 m or 20 storeys.
     """
     read = Quantities(tags)
     levels = read.first("building:levels", "levels", parse=parse_number, low=0, high=_MOST_LEVELS)
@@ -126,28 +131,33 @@ def read_heights(tags: Tags, *, options: BuildingOptions) -> Tagged:
     roof_source = ("cloud" if CLOUD_ROOF in tags else "tag") if np.isfinite(roof) else ""
     height, source, sigma = _tagged_height(read)
 
-    step = options.level_height
-    storeys = levels + (roof_levels if np.isfinite(roof_levels) else 0.0)
-    if np.isfinite(height) and storeys > 0:
-        step = float(np.clip(height / storeys, 2.0, 6.0))  # storey height of this building
-    if not np.isfinite(roof) and roof_levels > 0:
-        roof, roof_source = roof_levels * step, "levels"
-    if not np.isfinite(height) and (levels > 0 or roof_levels > 0):
-        height = (levels if np.isfinite(levels) else 0.0) * step + (roof if np.isfinite(roof) else 0.0)
-        source, sigma = "levels", max(SIGMA_STOREYS * height, 1.0)
-    elif not np.isfinite(height) and levels == 0:
-        read.refused.append("building:levels=0 gives no height")
-
     minimum = read.first(
         "min_height", "building:min_height", parse=parse_length, low=LOWEST, high=HIGHEST - THINNEST
     )
     minimum_source = "tag" if np.isfinite(minimum) else ""
-    if not minimum_source:
-        skipped = read.first("building:min_level", "min_level", parse=parse_number, low=0, high=_MOST_LEVELS)
-        if np.isfinite(skipped):
-            minimum, minimum_source = skipped * step, "levels"
-            if source == "levels" and levels <= skipped:  # levels are counted from the part's underside
-                height += minimum
+    skipped = read.first("building:min_level", "min_level", parse=parse_number, low=0, high=_MOST_LEVELS)
+
+    walls, storeys = height, levels + np.nan_to_num(roof_levels)
+    if np.isfinite(roof):
+        walls, storeys = height - roof, levels
+    step = options.level_height  # storey height of this building
+    if np.isfinite(walls) and storeys > 0:
+        step = float(np.clip(walls / storeys, 2.0, 6.0))
+    elif minimum > 0 and skipped > 0:
+        step = float(np.clip(minimum / skipped, 2.0, 6.0))
+    if not np.isfinite(roof) and roof_levels > 0:
+        roof, roof_source = roof_levels * step, "levels"
+    if not minimum_source and np.isfinite(skipped):
+        minimum, minimum_source = skipped * step, "levels"
+    if not np.isfinite(height) and (levels > 0 or roof_levels > 0):
+        body = float(np.nan_to_num(levels)) * step
+        if body < minimum + THINNEST:
+            roofed = roof > 0 or read_roof_tags(tags).shape != "flat"
+            body = minimum if levels == skipped and roofed else body + minimum
+        height = body + float(np.nan_to_num(roof))
+        source, sigma = "levels", max(SIGMA_STOREYS * height, 1.0)
+    elif not np.isfinite(height) and levels == 0:
+        read.refused.append("building:levels=0 gives no height")
     return Tagged(
         height, source, sigma, minimum, minimum_source, roof, roof_source, levels, tuple(read.refused)
     )

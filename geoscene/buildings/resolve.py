@@ -96,7 +96,7 @@ def resolve_heights(
     # a single storey of a hall is as high as the hall, not 3 m
     hall = np.isin(use, _HALLS) & (h.source == "levels") & (np.array([t.levels for t in tagged]) <= 1)
     h.high[hall], h.sigma[hall], h.source[hall] = np.nan, np.nan, ""
-    _resolve_roofs(rows, h=h, options=options)
+    _resolve_roofs(rows, h=h, options=options, problems=problems)
     is_part = np.array([r.is_part for r in rows], np.bool_)
     outline = np.array([r.outline for r in rows], np.int64)
     _resolve_buildings(rows, is_part, outline=outline, h=h, options=options)
@@ -135,10 +135,17 @@ def _repair_undersides(rows: Sequence[BuildingRow], h: BuildingHeights, *, probl
         problems.append(Problem(rows[k].osm_id, "building", "repaired", reason, detail))
 
 
-def _resolve_roofs(rows: Sequence[BuildingRow], *, h: BuildingHeights, options: BuildingOptions) -> None:
-    """Set missing roof heights, in place."""
+def _resolve_roofs(
+    rows: Sequence[BuildingRow], *, h: BuildingHeights, options: BuildingOptions, problems: list[Problem]
+) -> None:
+    """Set missing roof heights, in place. A flat roof has none: walls reach up to its top."""
     for k, row in enumerate(rows):
         if row.roof.shape == "flat":
+            if h.roof[k] > 0 and h.roof_source[k] == "tag" and not (row.roof.assumed or row.is_remainder):
+                detail = f"flat roof of {h.roof[k]:g} m"
+                if h.source[k] == "levels":
+                    detail += f"; walls of {h.high[k]:g} m, with it"
+                problems.append(Problem(row.osm_id, "building", "repaired", "flat-roof-height", detail))
             h.roof[k], h.roof_source[k] = 0.0, "assumed" if row.roof.assumed else h.roof_source[k] or "tag"
         elif not np.isfinite(h.roof[k]):
             by_storeys = h.source[k] == "levels"

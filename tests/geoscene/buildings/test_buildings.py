@@ -547,6 +547,57 @@ def test_contradictory_heights_of_parts_are_repaired_and_reported():
     }
 
 
+@pytest.mark.parametrize(
+    ("tags", "low", "top", "roof"),
+    [
+        # storeys, storeys that are skipped and storeys in the roof
+        ("levels=2 min_level=2 roof:levels=1 roof:shape=gabled", 6, 9, 3),
+        ("levels=2 min_level=2 roof:height=4 roof:shape=hipped", 6, 10, 4),
+        ("levels=2 min_level=2 roof:shape=gabled", 6, 6 + 5 / 3**0.5, 5 / 3**0.5),
+        ("levels=5 min_level=2 roof:levels=1 roof:shape=gabled", 6, 18, 3),
+        ("levels=5 min_level=2", 6, 15, 0),
+        ("levels=2 min_level=2", 6, 12, 0),
+        ("levels=1 min_level=2 roof:levels=1 roof:shape=gabled", 6, 12, 3),
+        ("roof:levels=1 min_level=2 roof:shape=gabled", 6, 9, 3),
+        # with heights
+        ("height=20 levels=5 min_level=2", 8, 20, 0),
+        ("height=20 levels=4 min_level=2 roof:levels=1 roof:shape=gabled", 8, 20, 4),
+        ("height=20 levels=4 min_level=2 roof:height=4 roof:shape=gabled", 8, 20, 4),
+        ("height=9 levels=2 min_level=2 roof:height=3 roof:shape=gabled", 6, 9, 3),
+        ("min_height=8 levels=3 min_level=2", 8, 12, 0),
+        ("min_height=7 levels=2 min_level=2 roof:height=3 roof:shape=gabled", 7, 10, 3),
+        ("min_height=10 levels=2", 10, 16, 0),
+        ("min_height=10 levels=5", 10, 15, 0),
+        ("min_height=4.5 levels=2 roof:levels=1 roof:shape=gabled", 4.5, 9, 3),
+    ],
+)  # fmt: skip
+def test_storeys_count_from_the_ground_with_those_that_a_part_skips(tags, low, top, roof):
+    tagged = dict(tag.replace(":", "__").split("=") for tag in tags.split())
+    below = part(2, box(0, 0, 10, 10), height=str(low))
+    table, mesh, _, _ = built(house(1, box(0, 0, 10, 10)), below, part(3, box(0, 0, 10, 10), **tagged))
+    assert (table.min_height[2], table.height[2], table.roof_height[2]) == pytest.approx((low, top, roof))
+    assert mesh.vertices[:, 2].max() == pytest.approx(top, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("tags", "top", "detail"),
+    [({"levels": "3"}, 10.5, "; walls of 10.5 m, with it"), ({"height": "9"}, 9, "")],
+)
+def test_walls_reach_up_to_the_top_of_a_flat_roof_with_a_height(tags, top, detail):
+    roof = {"roof__shape": "flat", "roof__height": "1.5"}
+    table, mesh, _, problems = built(house(1, box(0, 0, 10, 10), **tags, **roof))
+    assert (table.height[0], table.roof_height[0]) == (top, 0)
+    assert mesh.vertices[:, 2].max() == top
+    assert [(p.reason, p.detail) for p in problems] == [("flat-roof-height", f"flat roof of 1.5 m{detail}")]
+
+
+def test_a_part_of_a_multipolygon_belongs_to_its_building_by_relation():
+    outline = area("relation/5", box(0, 0, 10, 10), building="yes", height="10")
+    relation = Relation("relation/5", {"type": "building"}, (("way", 9, "outline"), ("way", 2, "part")))
+    table, _, _, _ = built(outline, part(2, box(9, 0, 10, 10), height="12"), relations=[relation])
+    assert table.outline.tolist() == [0, 0, 0]
+
+
 def test_the_order_of_the_map_does_not_matter():
     rng = np.random.default_rng(3)
     shapes = [affinity.rotate(box(*rng.uniform(0, 60, 2), *rng.uniform(4, 15, 2)), 30) for _ in range(40)]
