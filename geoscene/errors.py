@@ -20,6 +20,10 @@ class InputError(GeosceneError, ValueError):
     """Invalid input or options; the command line exits with code 2."""
 
 
+class DamagedFileError(InputError):
+    """A point cloud that does not hold what its header states; the command line exits with code 1."""
+
+
 class SourceNotFoundError(InputError):
     """A file, place or area that does not exist or has no features."""
 

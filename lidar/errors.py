@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import geoscene.errors
+
 
 class LidarError(Exception):
     """Base class of this package's errors; the command line shows one line and exits with code 1."""
@@ -33,6 +35,10 @@ class RigError(InputError):
 
 class FormatError(InputError):
     """A file that cannot be read as the format of its name."""
+
+
+class DamagedFileError(FormatError, geoscene.errors.DamagedFileError):
+    """A LAS, LAZ or COPC file that does not hold what it states; the command line exits with code 1."""
 
 
 class DatasetError(InputError):

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from pyproj.exceptions import CRSError, ProjError
 
-from geoscene.errors import InputError, SourceNotFoundError, reading
+from geoscene.errors import DamagedFileError, InputError, SourceNotFoundError, reading
 from geoscene.geometry.frames import Frame
 from geoscene.support.columns import Columns
+from geoscene.support.las_files import open_las
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Bools, Float
 
@@ -80,7 +81,7 @@ class SurveyFile:
 
     def chunks(self) -> Iterator[Chunk]:
         """The points in the order of the file; withheld ones and those of class noise have class 7."""
-        with reading(self.path, InputError, remedy=_REMEDY):
+        with reading(self.path, DamagedFileError, remedy=_REMEDY):
             yield from (_las_chunks if self.path.suffix.lower() != ".ply" else _ply_chunks)(self.path)
 
 
@@ -100,7 +101,7 @@ def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> SurveyFile:
         raise InputError(f"{path}: not one of {', '.join(_SUFFIXES)}; {_REMEDY}")
     if unit and unit not in _UNITS:
         raise InputError(f"`cloud_unit` {unit}: give m, ft or us-ft")
-    with reading(path, InputError, remedy=_REMEDY):
+    with reading(path, DamagedFileError, remedy=_REMEDY):
         stated, count = (_ply_header if path.suffix.lower() == ".ply" else _las_header)(path)
     if not count:
         raise InputError(f"{path}: holds no points")
@@ -141,16 +142,12 @@ def open_cloud(path: Path, *, crs: str = "", unit: str = "") -> SurveyFile:
 
 
 def _las_header(path: Path) -> tuple[CRS | None, int]:
-    import laspy  # noqa: PLC0415  (0.4 s)
-
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as source:
+    with open_las(path) as source:
         return source.header.parse_crs(), int(source.header.point_count)
 
 
 def _las_chunks(path: Path) -> Iterator[Chunk]:
-    import laspy  # noqa: PLC0415
-
-    with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as source:
+    with open_las(path) as source:
         for points in source.chunk_iterator(AT_ONCE):
             klass = np.asarray(points.classification, np.uint8)
             klass[np.asarray(points.withheld, bool)] = NOISE[0]

@@ -22,7 +22,7 @@ from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter, Token
 
-from geoscene.errors import InputError
+from geoscene.errors import DamagedFileError, InputError
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import url_of
 
@@ -146,7 +146,7 @@ def main(
     """Run a program and exit with its code.
 
     roots   : exceptions printed as one line, exit code 1
-    usage   : those of them caused by input or options, exit code 2
+    usage   : those of them caused by input or options, exit code 2; DamagedFileError has 1
     removed : what to write instead of former options, by flag
     """
     logging.basicConfig(
@@ -171,7 +171,8 @@ def main(
         sys.exit(USAGE)
     except roots as error:
         _print_error(app, error)
-        sys.exit(USAGE if isinstance(error, usage) else FAILURE)
+        failed = isinstance(error, DamagedFileError) or not isinstance(error, usage)
+        sys.exit(FAILURE if failed else USAGE)
     except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_BROKEN_PIPE)

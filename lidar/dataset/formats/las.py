@@ -7,7 +7,6 @@ import functools
 import io
 import os
 import shutil
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -19,26 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 
+import geoscene.errors
 from geoscene.classes import class_codes
+from geoscene.support import las_files
 from geoscene.support.compiled import njit
 from geoscene.support.files import atomic_path
 from lidar.dataset.formats.table import Table, rows
-from lidar.errors import FormatError
+from lidar.errors import DamagedFileError, FormatError
 
 SCALE = 0.001
 """Metres per count of a coordinate by default; the rounding error is at most half of it along each axis."""
 
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
-
-_RATIO = 10**4
-"""Greatest compression of LAZ that is read: clouds are compressed to a tenth, equal points by a thousand."""
-
-_CHUNK_POINTS = 10**6
-"""Points per chunk of LAZ that are read even if the file holds fewer; writers state 50,000."""
-
-_LONGEST = 4096
-"""Bytes of a point record in LAZ, at most: memory is reserved for 50,000 of them."""
 
 _FULL = 2**20
 """Bytes of free space below which the disk counts as full: the compressor writes in large pieces."""
@@ -267,109 +259,34 @@ def write(path: Path, table: Table, *, info: LasInfo) -> None:
 
 
 def count(path: Path) -> int:
-    """Number of points of a file: an entry of the header, at byte 247 of LAS 1.4 (R15, table 3)."""
-    with path.open("rb") as file:
-        head = file.read(255)
-    at, end = (247, 255) if head[25] >= 4 else (107, 111)
-    return int.from_bytes(head[at:end], "little")
-
-
-def _states_what_it_holds(path: Path) -> bool:
-    """Whether records and points that a file's header and chunk table state fit into the file.
-
-    Readers trust these numbers: they run out of memory or read for hours. Byte offsets as in LAS 1.4 R15.
-    """
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        head = file.read(375).ljust(375, b"\0")
-        header, start, records = struct.unpack_from("<HII", head, 94)
-        kind, length, points = struct.unpack_from("<BHI", head, 104)
-        more, extended = 0, 0
-        if head[25] >= 4:
-            more, extended, points = struct.unpack_from("<QIQ", head, 235)
-        if not header + 54 * records <= start <= size or (extended and more + 60 * extended > size):
-            return False
-        for _ in range(extended):  # records with a length each
-            file.seek(more + 20)
-            more += 60 + int.from_bytes(file.read(8), "little")
-            if more > size:
-                return False
-        if kind < 128:
-            return bool(start + length * points <= size)
-        if points == 0:
-            return True
-        file.seek(start)
-        table = int.from_bytes(file.read(8), "little", signed=True)
-        if table == -1:  # written without going back: stated at the end
-            file.seek(-8, os.SEEK_END)
-            table = int.from_bytes(file.read(8), "little", signed=True)
-        if not start <= table <= size - 8:
-            return False
-        file.seek(table + 4)
-        return bool(int.from_bytes(file.read(4), "little") <= size and length * points <= _RATIO * size)
-
-
-def _check_layers(path: Path, header: Any) -> None:
-    """Raise ValueError for sizes of chunks and of their layers that cannot be: the decompressor trusts them.
-
-    A chunk of point formats 6 to 10 holds its first point as it is, the number of its points, the sizes of
-    its layers, and the layers: nine of the point, one each of colour, infrared, wave packets and extra bytes.
-    """
-    import lazrs  # noqa: PLC0415
-
-    compressed, point = header.vlrs.get("LasZipVlr"), header.point_format
-    if not compressed or not header.point_count:
-        return
-    packed = lazrs.LazVlr(compressed[0].record_data).item_size()
-    if packed != point.size or packed > _LONGEST:
-        raise ValueError(f"records of {point.size} bytes, of which {packed} are compressed")
-    if point.id < 6:
-        return
-    layers = 9 + {6: 0, 7: 1, 8: 2, 9: 1, 10: 3}[point.id] + point.num_extra_bytes
-    with path.open("rb") as file:
-        file.seek(header.offset_to_point_data)
-        for count, size in lazrs.read_chunk_table(file, lazrs.LazVlr(compressed[0].record_data)):
-            if count > max(header.point_count, _CHUNK_POINTS):
-                raise ValueError(f"a chunk of {count} points")
-            start = file.tell()
-            file.seek(start + point.size)
-            sizes = np.frombuffer(file.read(4 + 4 * layers), "<u4")[1:]
-            if sizes.sum(dtype=np.int64) > size:
-                raise ValueError("layers larger than their chunk")
-            file.seek(start + size)
+    """Number of points of a file, as its header states it."""
+    return las_files.point_count(path)
 
 
 @contextmanager
-def _open_las(path: Path) -> Iterator[Any]:
-    import laspy  # noqa: PLC0415
-    import lazrs  # noqa: PLC0415
-
-    if path.is_file() and not _states_what_it_holds(path):
-        raise FormatError(f"{path}: not a readable LAS or LAZ file (its header states more than it holds)")
+def _opened(path: Path) -> Iterator[Any]:
+    """Yield a reader of a LAS or LAZ file; raises DamagedFileError or FormatError as `read`."""
     try:
-        with laspy.open(path) as reader:
-            _check_layers(path, reader.header)
+        with las_files.open_las(path, parallel=True) as reader:
             yield reader
-    except (laspy.errors.LaspyException, lazrs.LazrsError, OSError, ValueError, ArithmeticError) as error:
-        raise FormatError(f"{path}: not a readable LAS or LAZ file ({error})") from error
-    except BaseException as error:
-        if type(error).__name__ != "PanicException":  # of the decompressor; no Exception, and not importable
-            raise
-        raise FormatError(f"{path}: not a readable LAS or LAZ file (the decompressor failed)") from error
+    except geoscene.errors.DamagedFileError as error:
+        raise DamagedFileError(str(error)) from error
+    except OSError as error:
+        raise FormatError(f"{path}: not a readable LAS or LAZ file ({error.strerror})") from error
 
 
 def read(path: Path) -> Table:
     """The table of a LAS or LAZ file, coordinates in its CRS.
 
-    Raises FormatError for a file that laspy cannot read.
+    Raises DamagedFileError for a damaged file, and FormatError for one that is missing or no file.
     """
-    with _open_las(path) as reader:
+    with _opened(path) as reader:
         return _table(reader.read_points(reader.header.point_count))
 
 
 def read_chunks(path: Path, *, chunk: int = 1_000_000) -> Iterator[Table]:
     """The tables of a LAS or LAZ file, ``chunk`` points at a time; see `read`."""
-    with _open_las(path) as reader:
+    with _opened(path) as reader:
         for points in reader.chunk_iterator(chunk):
             yield _table(points)
 

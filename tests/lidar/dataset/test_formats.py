@@ -312,7 +312,7 @@ def test_counts_that_a_file_cannot_hold_are_refused(tmp_path, suffix, at, size):
     las.write(path, table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     whole = path.read_bytes()
     path.write_bytes(whole[:at] + b"\xf0" * size + whole[at + size :])
-    with pytest.raises(FormatError, match="states more than it holds"):
+    with pytest.raises(FormatError, match=r"damaged LAS or LAZ file \(its header"):
         read_table(path)
 
 
@@ -322,7 +322,7 @@ def test_a_chunk_table_that_a_file_cannot_hold_is_refused(tmp_path):
     whole = path.read_bytes()
     at = int.from_bytes(whole[(start := int.from_bytes(whole[96:100], "little")) : start + 8], "little") + 4
     path.write_bytes(whole[:at] + b"\xf0" * 4 + whole[at + 4 :])
-    with pytest.raises(FormatError, match="states more than it holds"):
+    with pytest.raises(FormatError, match="states more than the file holds"):
         read_table(path)
 
 
@@ -334,7 +334,7 @@ def test_layers_that_a_chunk_cannot_hold_are_refused(tmp_path):
     length, start = int.from_bytes(whole[105:107], "little"), int.from_bytes(whole[96:100], "little")
     sizes = start + 8 + length + 4  # after the place of the chunk table, the first point and their number
     path.write_bytes(whole[:sizes] + b"\xf0" * 4 + whole[sizes + 4 :])
-    with pytest.raises(FormatError, match="layers larger than their chunk"):
+    with pytest.raises(FormatError, match="layers of another length than their chunk"):
         read_table(path)
 
 
@@ -345,7 +345,7 @@ def test_chunks_of_more_points_than_a_file_can_hold_are_refused(tmp_path):
     whole = path.read_bytes()
     at = whole.index((50_000).to_bytes(4, "little"))
     path.write_bytes(whole[:at] + (1_879_088_695).to_bytes(4, "little") + whole[at + 4 :])
-    with pytest.raises(FormatError, match="a chunk of 1879088695 points"):
+    with pytest.raises(FormatError, match="chunks of 1879088695 points"):
         read_table(path)
 
 
@@ -353,12 +353,12 @@ def test_a_panic_of_the_decompressor_names_the_file(tmp_path, monkeypatch):
     class PanicException(BaseException):
         """As pyo3 raises it."""
 
-    def fails(path):
+    def fails(path, **_):
         raise PanicException(path)
 
     las.write(tmp_path / "a.laz", table(500), info=replace(INFO, offset=(0.0, 0.0, 0.0)))
     monkeypatch.setattr(laspy, "open", fails)
-    with pytest.raises(FormatError, match=r"a\.laz: not a readable"):
+    with pytest.raises(FormatError, match=r"a\.laz: damaged LAS or LAZ file \(the decompressor"):
         read_table(tmp_path / "a.laz")
 
 
@@ -405,7 +405,7 @@ def test_extended_records_that_a_file_cannot_hold_are_refused(tmp_path):
     whole = path.read_bytes()
     at = int.from_bytes(whole[235:243], "little") + 20
     path.write_bytes(whole[:at] + b"\xf0" * 5 + whole[at + 5 :])
-    with pytest.raises(FormatError, match="states more than it holds"):
+    with pytest.raises(FormatError, match="a record is longer than the file"):
         read_table(path)
 
 
