@@ -18,8 +18,8 @@ from geoscene.pipeline.build import build
 from geoscene.scene import SceneFiles
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
-from geoscene.support.console import progress_bar
 from geoscene.support.kernels import compile_ahead
+from geoscene.support.progress import progress_bar
 from geoscene.view import view_scene
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from geoscene.scene import open_scene as open_scene
     from geoscene.sources import demo_path as demo_path
     from geoscene.sources import read_osm as read_osm
+    from geoscene.support.progress import show_progress as show_progress
+    from geoscene.support.progress import silent as silent
     from geoscene.view import view_scene as view_scene
 
 __version__ = "0.1.0"
@@ -30,6 +32,8 @@ _HOMES = {
     "export_scene": "export",
     "open_scene": "scene",
     "read_osm": "sources",
+    "show_progress": "support.progress",
+    "silent": "support.progress",
     "view_scene": "view",
 }
 __all__ = list(_HOMES)

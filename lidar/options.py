@@ -20,6 +20,7 @@ from geoscene.options import KINDS, BuildOptions, Degrees
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.digests import recipe_digest
 from geoscene.support.registry import unknown_name
+from geoscene.support.urls import redacted
 from geoscene.uses import RELIEFS
 from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
@@ -494,7 +495,7 @@ class DriveOptions:
         if stages := self.all_stages:
             resolved["stages"] = [stage.to_json() for stage in stages]
             resolved["settings"] = with_stage_settings(self.settings, stages)
-        return recipe | resolved
+        return dict(redacted(recipe | resolved))
 
 
 PERCENTS = (50.0, 68.0, 90.0, 95.0, 99.0, 99.9)
@@ -621,6 +622,9 @@ class PlaceOptions:
     place: str = ""
     """Name of a place instead of SCENE, found by Nominatim and downloaded from Overpass (needs a network;
     answers are cached)."""
+
+    refresh: bool = False
+    """Ask map servers for the place again, and replace their answers in the cache."""
 
     bbox: Annotated[Degrees | None, degrees("W,S,E,N")] = None
     """W,S,E,N in degrees: only this part of the map."""

@@ -22,10 +22,10 @@ from geoscene.support.console import (
     degrees,
     note_new_folder,
     print_json,
-    progress_bar,
     whole,
 )
-from geoscene.support.progress import Progress
+from geoscene.support.progress import Progress, progress_bar, silent
+from geoscene.support.urls import without_secrets
 
 _SCENE = Group("Scene", sort_key=2)
 _CLOUD = Group("Point clouds", sort_key=3)
@@ -60,6 +60,9 @@ class MapSource:
     """NAME=FILE of another source, whose features replace those of the map: overture=FILE for buildings of
     Overture Maps in GeoParquet. Without a map, the scene has only these. May be given several times."""
 
+    refresh: bool = False
+    """Ask map servers again, and replace their answers in the cache."""
+
     cache: Path | None = None
     """Directory for answers of map servers and elevation tiles; ~/.cache/geoscene by default."""
 
@@ -90,11 +93,11 @@ def read_elevation(
     from geoscene.sources import TileServer, with_elevation  # noqa: PLC0415
 
     url = source.dem_server
-    server = TileServer(url, credit=f"elevation tiles: {url}") if url else None
+    server = TileServer(url, credit=f"elevation tiles: {without_secrets(url)}") if url else None
     return with_elevation(options, data, cache_dir=cache_of(source), server=server, progress=progress)
 
 
-def read_map(source: MapSource) -> Any:
+def read_map(source: MapSource, *, progress: Progress = silent) -> Any:
     """The map of the options, merged with the features of other sources."""
     from geoscene import sources  # noqa: PLC0415
 
@@ -112,7 +115,8 @@ def read_map(source: MapSource) -> Any:
         servers = replace(servers, nominatim=source.nominatim)
     if source.overpass:
         servers = replace(servers, overpass=tuple(source.overpass.split(",")))
-    fetched: dict[str, Any] = {"cache_dir": cache_of(source), "servers": servers}
+    fetched: dict[str, Any] = {"cache_dir": cache_of(source), "refresh": source.refresh}
+    fetched |= {"servers": servers, "progress": progress}
     data = None
     if local:
         data = sources.read_osm(source.osm or sources.demo_path(), bounds=source.bbox)
@@ -190,7 +194,7 @@ def build(
         bar() as progress,
     ):
         progress("reading the map", 0, total=0)
-        data = read_map(source)
+        data = read_map(source, progress=progress)
         options = read_elevation(source, data, options=options, progress=progress)
         many = workers or os.cpu_count() or 1
         if clouds.cloud:

@@ -9,7 +9,8 @@ from cyclopts import Parameter, validators
 
 from geoscene.cli.program import Out, Reporting, print_file, print_scene
 from geoscene.options import ExportOptions, ViewOptions
-from geoscene.support.console import FAILURE, Report, note_new_folder, print_json, progress_bar
+from geoscene.support.console import FAILURE, Report, note_new_folder, print_json
+from geoscene.support.progress import progress_bar
 
 
 def info(

@@ -14,7 +14,7 @@ from geoscene.errors import InputError
 from geoscene.options import ExportOptions
 from geoscene.scene import Scene
 from geoscene.support.files import exclusive
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import Registry, load
 
 
@@ -88,13 +88,14 @@ def kind_of(out: Path) -> str:
     raise InputError(f"{out}: unknown suffix; give `kind` ({', '.join(KINDS)}) or {known}")
 
 
+@shows_progress
 def export_scene(
     scene: Scene,
     out: str | Path,
     *,
     options: ExportOptions = ExportOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Summary:
     """Write a scene to a file, or to a folder for 3D Tiles, and return a summary.
 

@@ -32,7 +32,7 @@ from geoscene.sources import SOURCES, OsmData, credits_of
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.digests import file_digest, sources_digest, value_digest
 from geoscene.support.problems import Problem, summarise
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.uses import USES
 
 _NOT_IN_TILES = frozenset({"name", "along", "reach", "use"})
@@ -45,6 +45,7 @@ STEEP = 0.2
 """Gradient above which roads are counted as steep; few streets exceed it."""
 
 
+@shows_progress
 def build(
     osm: OsmData,
     out: str | Path,
@@ -55,7 +56,7 @@ def build(
     cluster: DaskCluster | None = None,
     needed: AreaOf | None = None,
     former: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Scene:
     """Build a scene of a map extract and write it to a directory.
 

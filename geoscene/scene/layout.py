@@ -140,8 +140,8 @@ class Scene(Previewed):
 
     @property
     def location(self) -> str:
-        """Path or URL of the scene, as it was opened."""
-        return str(self.path) if self.stored is None else self.stored.url
+        """Path or URL of the scene, as it was opened, without secrets."""
+        return str(self.path) if self.stored is None else self.stored.name
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

@@ -26,6 +26,7 @@ from geoscene.support.columns import write_columns
 from geoscene.support.digests import file_digest
 from geoscene.support.files import exclusive, write_json
 from geoscene.support.problems import Problem
+from geoscene.support.urls import redacted
 from geoscene.typing import Ints
 from geoscene.uses import USES, Needed, Use
 
@@ -156,7 +157,7 @@ class SceneWriter:
         tables = (self.files.features, self.files.road_graph, self.files.shapes, self.files.problems)
         document = {
             "schema": SCHEMA,
-            **manifest,
+            **redacted(manifest),
             "frame": frame.to_json(),
             "layers": {name: list(ends) for name, ends in ranges.items()},
             "rows": {layer.name: len(layer) for layer in numbered},

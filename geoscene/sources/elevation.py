@@ -5,11 +5,9 @@ from __future__ import annotations
 import hashlib
 import io
 import math
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +17,11 @@ from geoscene.errors import InputError, NetworkError
 from geoscene.geometry.frames import Frame, beside, rim_of, wrap_longitude
 from geoscene.options import BuildOptions
 from geoscene.sources.data import Bounds, OsmData
-from geoscene.sources.network import BUSY, RefusedError, cause, open_session
+from geoscene.sources.network import BUSY, RefusedError, cause, check_address, host_of, open_session, wait
 from geoscene.sources.registry import SOURCES
 from geoscene.support.files import write_atomically
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress, silent
+from geoscene.support.urls import without_secrets
 from geoscene.typing import Float
 
 DATUM = "the geoids of the tiles' sources, mixed (EGM96, EGM2008, NAVD88, national)"
@@ -63,9 +62,12 @@ class TileServer:
     most: int = 2000
 
     def __post_init__(self) -> None:
-        """Raise InputError for an address without the placeholders of a tile."""
+        """Raise InputError for an address that is none, or without the placeholders of a tile."""
+        check_address(self.template)
         if not all(part in self.template for part in ("{z}", "{x}", "{y}")):
-            raise InputError(f"{self.template}: give the address of a tile with {{z}}, {{x}} and {{y}} in it")
+            raise InputError(
+                f"{without_secrets(self.template)}: give the address of a tile with {{z}}, {{x}} and {{y}}"
+            )
 
 
 def zoom_at(lat_deg: float, *, deepest: int = 15) -> int:
@@ -94,6 +96,7 @@ def with_elevation(
     return replace(options, dem=(str(found),))
 
 
+@shows_progress
 def fetch_elevation(
     osm: OsmData,
     *,
@@ -101,7 +104,7 @@ def fetch_elevation(
     crs: str = "local",
     server: TileServer | None = None,
     zoom: int | None = None,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Path:
     """A GeoTIFF of the ground under a map, made from elevation tiles; for `ground.terrain.open_terrain`.
 
@@ -137,7 +140,7 @@ def fetch_elevation(
     if path.exists():
         return path
     heights = np.empty(((y1 - y0 + 1) * _SIDE, (x1 - x0 + 1) * _SIDE))
-    tiles = zip(names, _tiles(names, z, cache_dir=cache_dir, server=server), strict=True)
+    tiles = zip(names, _tiles(names, z, cache_dir=cache_dir, server=server, progress=progress), strict=True)
     for done, ((x, y), tile) in enumerate(tiles, 1):
         row, column = (y - y0) * _SIDE, (x - x0) * _SIDE
         heights[row : row + _SIDE, column : column + _SIDE] = tile
@@ -178,7 +181,9 @@ def _pixels(lonlat: Float, z: int) -> Float:
     return pixels
 
 
-def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: TileServer) -> Any:
+def _tiles(
+    names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: TileServer, progress: Progress
+) -> Any:
     """Yields the heights (256, 256) of each tile, from the cache or the server."""
     folder = cache_dir / "tiles" / hashlib.sha256(server.template.encode()).hexdigest()[:16] / str(z)
     folder.mkdir(parents=True, exist_ok=True)
@@ -189,10 +194,12 @@ def _tiles(names: list[tuple[int, int]], z: int, *, cache_dir: Path, server: Til
             heights_of_tile = _heights(path.read_bytes()) if path.exists() else None
             if heights_of_tile is None:
                 url = server.template.format(z=z, x=x, y=y)
-                content = _download(session, url, server=server)
+                content = _download(session, url, server=server, progress=progress)
                 heights_of_tile = _heights(content)
                 if heights_of_tile is None:
-                    raise NetworkError(f"{url}: no elevation tile (a PNG of 256 x 256 pixels) but other data")
+                    raise NetworkError(
+                        f"{without_secrets(url)}: no elevation tile (PNG, 256 x 256 pixels) but other data"
+                    )
                 write_atomically(path, content)
             yield heights_of_tile
 
@@ -211,12 +218,12 @@ def _heights(content: bytes) -> Float | None:
     return np.where(rgb.any(axis=2), decode_terrarium(rgb), np.nan)
 
 
-def _download(session: Any, url: str, *, server: TileServer) -> bytes:
+def _download(session: Any, url: str, *, server: TileServer, progress: Progress) -> bytes:
     """The bytes at an address; the request is repeated while the server fails or is busy."""
-    pause = server.wait
+    pause, failure = server.wait, ""
     for attempt in range(server.attempts):
         if attempt:
-            time.sleep(pause)
+            wait(pause, f"{host_of(url)}: {failure}", progress=progress)
             pause *= 2
         try:
             return bytes(session.get(url, timeout=server.timeout).content)
@@ -229,7 +236,7 @@ def _download(session: Any, url: str, *, server: TileServer) -> bytes:
         except OSError as error:
             failure = cause(error)
     raise NetworkError(
-        f"no elevation tile from {urlsplit(url).netloc} ({url}: {failure});"
+        f"no elevation tile from {host_of(url)} ({without_secrets(url)}: {failure});"
         " without a network, give an elevation file (`dem` FILE) or build on level ground (no `dem`)"
     )
 
@@ -273,5 +280,5 @@ def _geotiff(heights: Float, z: int, *, column: int, row: int, server: TileServe
     with rasterio.Env(), MemoryFile() as file:
         with file.open(**profile) as target:
             target.write(heights.astype(np.float32), 1)
-            target.update_tags(TIFFTAG_COPYRIGHT=server.credit, VERTICAL_DATUM=server.datum)
+            target.update_tags(TIFFTAG_COPYRIGHT=without_secrets(server.credit), VERTICAL_DATUM=server.datum)
         return bytes(file.read())

@@ -12,7 +12,6 @@ import re
 import shlex
 import signal
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -23,8 +22,8 @@ from typing import Annotated, Any, NoReturn
 from cyclopts import App, CycloptsError, Parameter, Token
 
 from geoscene.errors import DamagedFileError, InputError
-from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import url_of
+from geoscene.support.urls import without_secrets
 
 DONE, FAILURE, USAGE = 0, 1, 2
 """Exit codes: success, failure, unusable input or options."""
@@ -149,9 +148,9 @@ def main(
     usage   : those of them caused by input or options, exit code 2; DamagedFileError has 1
     removed : what to write instead of former options, by flag
     """
-    logging.basicConfig(
-        level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
-    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
     gc.set_threshold(*_COLLECTED)
     atexit.register(gc.freeze)  # the end of a process need not search what is left: 0.5 s of a drive
     os.environ.setdefault(_THREADS, "1")
@@ -186,6 +185,14 @@ def main(
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
+
+
+class _Formatter(logging.Formatter):
+    """Formats log messages without secrets of addresses."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The text of a message."""
+        return without_secrets(super().format(record))
 
 
 @contextmanager
@@ -257,7 +264,7 @@ def with_flags(app: App, text: str) -> str:
 
 
 def _print_error(app: App, message: object) -> None:
-    text = " ".join(with_flags(app, str(message)).split())
+    text = without_secrets(" ".join(with_flags(app, str(message)).split()))
     print(f"{app.name[0]}: {text}", file=sys.stderr)
 
 
@@ -278,41 +285,8 @@ def note_new_folder(out: Path) -> None:
     """
     if url := url_of(out):
         raise InputError(
-            f"`out` {url}: only geoscene build and lidar drive write to object storage; give a path of this"
-            " machine"
+            f"`out` {without_secrets(url)}: only geoscene build and lidar drive write to object storage;"
+            " give a path of this machine"
         )
     if not (folder := out.absolute().parent).exists():
         print(f"{folder}: this folder does not exist and is made", file=sys.stderr)
-
-
-@contextmanager
-def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
-    """Yield a `Progress` that draws bars on standard error, or a silent one if that is not a terminal.
-
-    A bar appears once its stage has taken about a second, at once if its length is unknown.
-    """
-    if quiet or not sys.stderr.isatty():
-        yield silent
-        return
-    from rich.console import Console  # noqa: PLC0415
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn  # noqa: PLC0415
-    from rich.progress import Progress as Bars  # noqa: PLC0415
-
-    columns = (TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-        yield _bar_callback(bars)
-
-
-def _bar_callback(bars: Any) -> Progress:
-    tasks: dict[str, Any] = {}
-    started: dict[str, float] = {}
-
-    def update(stage: str, done: int, *, total: int) -> None:
-        now = time.monotonic()
-        if stage not in tasks:
-            if total and now - started.setdefault(stage, now) < 1.0:
-                return
-            tasks[stage] = bars.add_task(stage, total=total or None)
-        bars.update(tasks[stage], completed=done, total=total or None)
-
-    return update

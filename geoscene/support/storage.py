@@ -25,6 +25,7 @@ from geoscene.errors import GeosceneError, InputError, MissingExtraError, Storag
 from geoscene.support.digests import digest, file_digest
 from geoscene.support.files import atomic_path, exclusive
 from geoscene.support.progress import Progress, silent
+from geoscene.support.urls import without_secrets
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):(?:/+(.*))?")
 _PACKAGES = {"gs": "gcsfs", "gcs": "gcsfs"}
@@ -51,8 +52,8 @@ def url_of(path: str | Path) -> str:
 
 
 def shown(path: Path) -> str:
-    """A path or URL as it is given on the command line."""
-    return url_of(path) or str(path)
+    """A path or URL as it is given on the command line, without secrets."""
+    return without_secrets(url_of(path) or str(path))
 
 
 def cache_folder() -> Path:
@@ -70,6 +71,11 @@ class StoredFolder:
 
     url: str
     digests: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The URL without secrets, for messages and records."""
+        return without_secrets(self.url)
 
     def read(self, name: str) -> bytes:
         """Contents of a file."""
@@ -98,7 +104,7 @@ class StoredFolder:
             with self._reached() as (system, root):
                 system.get_file(f"{root}/{name}", str(part))
             if self.digests.get(name) not in (None, file_digest(part)):
-                raise StorageError(f"{self.url}/{name}: differs from what the build wrote; publish it again")
+                raise StorageError(f"{self.name}/{name}: differs from what the build wrote; publish it again")
 
     def local(self, name: str, folder: Path) -> Path:
         """Path of a file in a cache folder, fetched if it is one of the `digests` and not there yet.
@@ -209,7 +215,7 @@ class StoredFolder:
         except ImportError as error:
             install = _PACKAGES.get(scheme, "'geoscene[cloud]'")
             raise MissingExtraError(
-                f"{self.url}: {scheme}:// needs a package that is not installed; pip install {install}"
+                f"{self.name}: {scheme}:// needs a package that is not installed; pip install {install}"
             ) from error
         except (GeosceneError, MemoryError):
             raise
@@ -218,13 +224,13 @@ class StoredFolder:
                 raise
             if isinstance(error, ValueError) and "Protocol not known" in str(error):
                 raise InputError(
-                    f"{self.url}: unknown storage; there are s3://, gs:// and file://"
+                    f"{self.name}: unknown storage; there are s3://, gs:// and file://"
                 ) from error
-            text = " ".join(str(error).split())[:160] or type(error).__name__
+            text = without_secrets(" ".join(str(error).split()))[:160] or type(error).__name__
             if isinstance(error, FileNotFoundError):
-                raise StorageError(f"{self.url}: is not there ({text})") from error
+                raise StorageError(f"{self.name}: is not there ({text})") from error
             raise StorageError(
-                f"{self.url}: cannot be reached ({text}); check the address, the network and the credentials"
+                f"{self.name}: cannot be reached ({text}); check the address, the network and the credentials"
             ) from error
 
 
@@ -253,15 +259,15 @@ def publish(
     if not (url := url_of(out)):
         yield out
         return
-    stored, name = StoredFolder(url), url.rsplit("/", 1)[-1]
-    folder = cache_folder() / "spool" / digest(url.encode()) / name
+    stored = StoredFolder(url)
+    folder = cache_folder() / "spool" / digest(url.encode()) / url.rsplit("/", 1)[-1]
     stored.check_writable()
     with exclusive(folder.parent):
         listed = stored.listed()
         if last in listed and not replaces:
-            raise InputError(f"{url}: holds {last}; set `overwrite` to replace it")
+            raise InputError(f"{stored.name}: holds {last}; set `overwrite` to replace it")
         if listed and not {last, f"{last}.part"} & set(listed):
-            raise InputError(f"{url}: is not empty and holds no {last}; give another folder")
+            raise InputError(f"{stored.name}: is not empty and holds no {last}; give another folder")
         before: list[str] = []
         if last in listed:
             before = [name for name in listed if name != f"{last}.part"]
@@ -272,7 +278,9 @@ def publish(
         except Exception as error:
             if before:  # it will be fetched again
                 shutil.rmtree(folder.parent, ignore_errors=True)
-            error.args = tuple(a.replace(str(folder), url) if isinstance(a, str) else a for a in error.args)
+            error.args = tuple(
+                a.replace(str(folder), stored.name) if isinstance(a, str) else a for a in error.args
+            )
             raise
         with bar() as progress:
             stored.publish(folder, last=last, before=before, progress=progress)

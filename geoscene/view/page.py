@@ -14,7 +14,7 @@ from geoscene.export.objects import attribution
 from geoscene.options import ViewOptions
 from geoscene.scene import Scene
 from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Ints
 from geoscene.view.assembly import check_page, write_blob, write_page
 from geoscene.view.contents import ACCURACY, PageContents, tiles_within
@@ -24,13 +24,14 @@ _SCRIPTS = ("data.js", "facades.js", "shaders.js", "draw.js", "panel.js")
 """The viewer's own scripts, in the order in which they are joined; then that of loading and ``main.js``."""
 
 
+@shows_progress
 def view_scene(
     scene: Scene,
     out: str | Path,
     *,
     options: ViewOptions = ViewOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Summary:
     """Write a scene as one web page that a browser opens from disk; returns its contents.
 

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from geoscene.support.console import Report, note_new_folder, print_json, progress_bar
+from geoscene.support.console import Report, note_new_folder, print_json
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, print_effects, show
 from lidar.dataset.formats import map_suffixes
 from lidar.options import OUTPUT, ApplyOptions, ConvertOptions, DenoiseOptions, MapOptions, OdometryOptions

@@ -20,9 +20,9 @@ from geoscene.support.console import (
     command_line,
     note_new_folder,
     print_json,
-    progress_bar,
     whole,
 )
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, print_effects
 from lidar.errors import InputError, LidarError
 from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions

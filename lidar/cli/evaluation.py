@@ -9,7 +9,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from geoscene.errors import need
-from geoscene.support.console import Report, command_line, note_new_folder, progress_bar
+from geoscene.support.console import Report, command_line, note_new_folder
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from operator import add
 from typing import Annotated, Any
 
-from geoscene.support.console import FAILURE, WORDS, progress_bar
+from geoscene.support.console import FAILURE, WORDS
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, QuietFlag, show
 
 

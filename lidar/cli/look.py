@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from geoscene.support.console import Report, note_new_folder, progress_bar, with_flags
+from geoscene.support.console import Report, note_new_folder, with_flags
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions

@@ -13,9 +13,9 @@ from geoscene.support.console import (
     Report,
     command_line,
     note_new_folder,
-    progress_bar,
     whole,
 )
+from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, DefendOptions, SignOptions

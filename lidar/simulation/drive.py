@@ -20,7 +20,7 @@ from geoscene.errors import GeosceneError
 from geoscene.scene import Scene
 from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.files import exclusive, json_bytes, write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Aside, Progress, displayed, shows_progress
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
@@ -81,13 +81,14 @@ class DriveSummary:
     effects: Counts = field(default_factory=dict)
 
 
+@shows_progress
 def drive(
     scene: Scene,
     out: str | Path,
     *,
     options: DriveOptions,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
     notes: Mapping[str, Any] | None = None,
     check: Callable[[DrivePlan], Mapping[str, Any]] | None = None,
     plan: DrivePlan | None = None,
@@ -171,7 +172,7 @@ class _CompilationProgress(Listener):
 
     def on_start(self, event: Event) -> None:  # noqa: ARG002
         """A function begins to compile."""
-        self._progress("compiling, once", self._compiled, total=0)
+        self._progress(Aside("compiling, once"), self._compiled, total=0)
 
     def on_end(self, event: Event) -> None:  # noqa: ARG002
         """Count a compiled function."""

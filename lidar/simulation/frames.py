@@ -13,7 +13,7 @@ import numpy as np
 
 from geoscene.drawing.previews import card
 from geoscene.scene import Scene
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
@@ -150,7 +150,8 @@ class Simulation:
             since_ns = end_ns
 
 
-def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = silent) -> Simulation:
+@shows_progress
+def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = displayed) -> Simulation:
     """A drive through a scene whose frames are made one by one and not written.
 
     They are those that `lidar.drive` records with the same options, of which formats and labels do not count.

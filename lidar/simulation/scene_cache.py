@@ -40,7 +40,7 @@ from geoscene.scene.layout import OVERHANG, SCHEMA, SceneFiles, changed_files
 from geoscene.sources import OsmData, Servers, fetch_place, read_osm, with_elevation
 from geoscene.support.digests import file_digest, sources_digest, value_digest
 from geoscene.support.files import exclusive, write_atomically
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Aside, Progress, silent
 from geoscene.support.storage import cache_folder
 from geoscene.typing import Float
 from lidar.errors import InputError, LidarError
@@ -128,7 +128,13 @@ class _Map:
         if self._path is not None:
             return read_osm(self._path, bounds=self.place.bbox)
         try:
-            return fetch_place(self.place.place, cache_dir=cache_folder(), servers=self._servers)
+            return fetch_place(
+                self.place.place,
+                cache_dir=cache_folder(),
+                refresh=self.place.refresh,
+                servers=self._servers,
+                progress=self._progress,
+            )
         except NetworkError as error:
             cause = str(error).split("; without a network")[0]
             raise NetworkError(f"{cause}; without a network, give a map file instead of `place`") from error
@@ -169,7 +175,7 @@ def _turn(folder: Path, progress: Progress) -> Iterator[None]:
                 stack.enter_context(exclusive(folder))
                 break
             except SceneInputError:
-                progress("waiting for another build", 0, total=0)
+                progress(Aside("waiting for another build"), 0, total=0)
                 time.sleep(_PAUSE_S)
         try:
             yield

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.support.files import write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import (
     check_target,
@@ -93,13 +93,14 @@ class ApplySummary:
     sight: str = ""
 
 
+@shows_progress
 def apply_stages(
     source: str | Path,
     out: str | Path,
     *,
     options: ApplyOptions,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> ApplySummary:
     """Write recorded data after stages to ``out``, with truth files of the changes.
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from geoscene.support.console import command_line
 from geoscene.support.files import write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import unknown_name
 from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
@@ -44,8 +44,9 @@ _NEAR = 1e-6
 _SEQUENCE = ("calib.txt", "times.txt", "poses.txt")
 
 
+@shows_progress
 def convert(
-    source: str | Path, out: str | Path, *, to: str, overwrite: bool = False, progress: Progress = silent
+    source: str | Path, out: str | Path, *, to: str, overwrite: bool = False, progress: Progress = displayed
 ) -> ExportSummary:
     """Write a recorded drive to the folder ``out``, which appears when it is complete.
 

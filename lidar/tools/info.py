@@ -15,7 +15,7 @@ import numpy as np
 
 from geoscene.classes import Class
 from geoscene.scene.layout import SceneFiles
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.storage import shown, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
@@ -63,7 +63,8 @@ class _Sizes:
         }
 
 
-def describe(path: str | Path, *, full: bool = False, progress: Progress = silent) -> dict[str, Any]:
+@shows_progress
+def describe(path: str | Path, *, full: bool = False, progress: Progress = displayed) -> dict[str, Any]:
     """Describe a dataset, or a folder with clouds of KITTI or nuScenes, as a JSON document.
 
     Only metadata and sizes are read.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.support.files import delete_leftovers, exclusive, write_atomically, write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.dataset.checksums import add_to_checksums, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset, derived_from
@@ -57,6 +57,7 @@ def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> WatermarkCells:
     return WatermarkCells(sensor, frame, cloud.ring, cloud.column, cloud.echo)
 
 
+@shows_progress
 def sign_dataset(
     source: str | Path,
     out: str | Path | None,
@@ -64,7 +65,7 @@ def sign_dataset(
     watermark: WatermarkKey | None = None,
     signer: Signer | None = None,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> SignSummary:
     """Write a dataset with a watermark, a signed hash chain or both to ``out``.
 

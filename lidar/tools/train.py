@@ -15,7 +15,7 @@ from geoscene import __version__
 from geoscene.errors import need
 from geoscene.support.columns import Columns
 from geoscene.support.processes import run_tasks
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Bools, Float, Ints
 from lidar.dataset.layout import Dataset, open_dataset
 from lidar.dataset.recorded import Stream, cloud_points, instance_clouds
@@ -85,6 +85,7 @@ class Trained:
         return rows
 
 
+@shows_progress
 def train(
     datasets: Sequence[str | Path],
     out: str | Path,
@@ -93,7 +94,7 @@ def train(
     trees: int = 60,
     every: int = 1,
     workers: int = 1,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Trained:
     """Train a detector on the labelled clouds of datasets and write its model to ``out``.
 

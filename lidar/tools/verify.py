@@ -10,7 +10,7 @@ import numpy as np
 
 from geoscene.scene.layout import SceneFiles
 from geoscene.support.digests import digest
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
 from lidar.dataset.checksums import CHECKSUMS, differences, read_checksums
 from lidar.dataset.layout import Dataset, Paths, open_dataset
@@ -156,6 +156,7 @@ def _findings(found: tuple[Finding, ...]) -> str:
     return f"{len(found):,} finding{'s' * (len(found) > 1)}" if found else ""
 
 
+@shows_progress
 def verify_dataset(
     path: str | Path,
     *,
@@ -163,7 +164,7 @@ def verify_dataset(
     signer: Signer | None = None,
     noise: float = NOISE,
     false_alarms: float = 0.01,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> VerifyReport:
     """Find changes since a folder was written or, with keys, tampering since `sign_dataset`.
 

@@ -1,5 +1,6 @@
 """Scenes, road graphs, programs and a browser for tests."""
 
+import os
 from pathlib import Path
 
 DEMO_BOX = (24.9405, 60.1655, 24.9475, 60.1690)
@@ -7,3 +8,5 @@ DEMO_BOX = (24.9405, 60.1655, 24.9475, 60.1690)
 
 ROOT = Path(__file__).resolve().parents[2]
 """The repository."""
+
+os.environ["GEOSCENE_PROGRESS"] = "off"  # lines of slow stages are not what tests of messages count

@@ -17,7 +17,7 @@ from geoscene.drawing.report import Column, ReportTable, table_of
 from geoscene.scene import Scene, open_scene
 from geoscene.support.columns import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset
@@ -115,6 +115,7 @@ class Defended:
         return {"frames": self.frames, "false_alarms": FALSE_ALARMS, "defences": rows}
 
 
+@shows_progress
 def defend(
     datasets: Sequence[Dataset],
     defences: Sequence[NamedDefence],
@@ -126,7 +127,7 @@ def defend(
     out: Path | None = None,
     overwrite: bool = False,
     seed: int = 0,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Defended:
     """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
 
@@ -222,6 +223,7 @@ def _with_interval(values: tuple[float, float, float]) -> str:
     return f"{value:.3g}" if np.isnan(low) else f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
+@shows_progress
 def calibrate(
     datasets: Sequence[Dataset],
     defences: Sequence[NamedDefence],
@@ -230,7 +232,7 @@ def calibrate(
     detector: Detector = RULES,
     scene: Scene | None = None,
     seed: int = 0,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Calibration:
     """Write the calibration of defences on datasets without attacks to a TOML file.
 

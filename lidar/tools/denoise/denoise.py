@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.drawing.report import Column, ReportTable, table_of
 from geoscene.support.files import write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import (
@@ -148,13 +148,14 @@ def _fixed(value: float) -> str:
     return "-" if isnan(value) else f"{value:.3f}"
 
 
+@shows_progress
 def denoise(
     source: str | Path,
     methods: Mapping[str, Filter],
     *,
     out: str | Path | None = None,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Denoised:
     """Scores of filters on recorded clouds; with ``out`` the clouds that the only filter leaves.
 

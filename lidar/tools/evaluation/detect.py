@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.support.files import atomic_folder, write_atomically, write_json
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.layout import Dataset
 from lidar.dataset.layouts.kitti import CORNERS, OBJECTS, outline
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
@@ -43,6 +43,7 @@ class _Cloud:
     xyz: NDArray[np.floating[Any]]
 
 
+@shows_progress
 def detect(
     dataset: Dataset,
     out: Path,
@@ -50,7 +51,7 @@ def detect(
     layout: str,
     detector: Detector,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> dict[str, int]:
     """Write what a detector finds in the clouds of a dataset; return the numbers of frames and of boxes.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
 from lidar.options import EvaluateOptions, MapOptions
@@ -127,13 +127,14 @@ class Compared:
     dataset: Dataset | None
 
 
+@shows_progress
 def evaluate_trajectory(
     estimate: Path,
     against: Path,
     *,
     options: EvaluateOptions = EvaluateOptions(),
     out: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Compared:
     """Compare a trajectory with the truth.
 

@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from geoscene.errors import need
 from geoscene.support.files import atomic_path
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Images, Stream, frames_within, images_of, scanner_clouds
@@ -66,13 +66,14 @@ class FilmSummary:
     notes: list[str]
 
 
+@shows_progress
 def film(
     dataset: Dataset,
     out: str | Path,
     *,
     options: FilmOptions = FilmOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> FilmSummary:
     """Write a film of a dataset as MP4 or GIF, by the suffix of ``out``.
 

@@ -14,7 +14,7 @@ from geoscene.classes import class_codes
 from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.scene import open_scene
 from geoscene.support.files import atomic_folder, exclusive
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.derived import write_map_provenance
 from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
@@ -87,13 +87,14 @@ class MapSummary:
         return card(f"Map {self.path.name}", rows, picture=self._repr_png_())
 
 
+@shows_progress
 def aggregate(
     dataset: Dataset,
     out: str | Path,
     *,
     options: MapOptions = MapOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> MapSummary:
     """Write the map of a dataset in the format of the suffix of ``out`` (see `map_suffixes`).
 

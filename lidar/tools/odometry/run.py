@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.support.files import replaced_folder
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Ints
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, open_dataset
@@ -167,13 +167,14 @@ class OdometrySummary:
         return self.estimate.report | {"length_m": self.length_m, "seconds": round(self.seconds, 3)}
 
 
+@shows_progress
 def estimate_motion(
     path: str | Path,
     out: str | Path,
     *,
     options: OdometryOptions,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> OdometrySummary:
     """Estimate the motion of a dataset's vehicle from its measurements, and write it into a folder.
 

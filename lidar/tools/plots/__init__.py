@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from geoscene.errors import need
 from geoscene.support.files import write_atomically
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import Registry, load
 from lidar.errors import InputError
 from lidar.options import PlotOptions
@@ -79,6 +79,7 @@ FIGURES: Registry[Figure] = Registry("figure", {row.name: row for row in _FIGURE
 """The figures of a dataset by name."""
 
 
+@shows_progress
 def plot(
     dataset: Dataset,
     what: str,
@@ -86,7 +87,7 @@ def plot(
     out: str | Path,
     options: PlotOptions = PlotOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> Drawn:
     """Write a figure of a dataset as PNG or SVG, by the suffix of ``out``.
 

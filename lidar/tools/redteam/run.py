@@ -10,7 +10,7 @@ from typing import Any
 from geoscene.errors import need
 from geoscene.support.files import exclusive
 from geoscene.support.processes import run_tasks
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.tools.detection import RULES
 from lidar.tools.detection.learned import read_detector
 from lidar.tools.redteam.evaluate import Figures, evaluate
@@ -35,13 +35,14 @@ class RedTeamSummary:
     matrix: Matrix
 
 
+@shows_progress
 def redteam(
     file: str | Path,
     out: str | Path,
     *,
     workers: int = 1,
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> RedTeamSummary:
     """Record the drives of a matrix with and without attacks, judge them by defences, and write the results.
 

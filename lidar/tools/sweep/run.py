@@ -22,7 +22,7 @@ from geoscene.support.columns import write_columns
 from geoscene.support.digests import digest, file_digest
 from geoscene.support.files import exclusive, write_json
 from geoscene.support.processes import run_tasks
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress, silent
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError, LidarError
@@ -85,6 +85,7 @@ class SweepSummary:
         return [row for row in self.rows if row.state == "failed"]
 
 
+@shows_progress
 def sweep(
     file: str | Path,
     out: str | Path,
@@ -92,7 +93,7 @@ def sweep(
     workers: int = 1,
     scheduler: str = "",
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> SweepSummary:
     """Record all drives of a grid; finished ones of the same options whose files are unchanged are kept.
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.scene import Scene
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
@@ -39,13 +39,14 @@ class DriveTradeoff:
     georeferencing: dict[str, float]
 
 
+@shows_progress
 def compare_settings(
     scene: Scene,
     options: DriveOptions,
     *,
     compared: TradeoffOptions = TradeoffOptions(),
     others: Sequence[Scene] = (),
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> DriveTradeoff:
     """Errors and costs of settings on a drive; the drive is planned once, in the first scene.
 

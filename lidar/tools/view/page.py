@@ -12,7 +12,7 @@ from tempfile import SpooledTemporaryFile
 from typing import IO, Any
 
 from geoscene.support.files import atomic_file, exclusive, spool
-from geoscene.support.progress import Progress, silent
+from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.view.assembly import check_page, write_blob, write_page
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError, LidarError
@@ -49,13 +49,14 @@ class PageSummary:
     notes: tuple[str, ...]
 
 
+@shows_progress
 def view_drive(
     dataset: Dataset,
     out: str | Path,
     *,
     options: PlaybackOptions = PlaybackOptions(),
     overwrite: bool = False,
-    progress: Progress = silent,
+    progress: Progress = displayed,
 ) -> PageSummary:
     """Write a drive as one web page that a browser opens from disk and plays; returns its contents.
 

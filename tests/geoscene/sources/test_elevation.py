@@ -18,6 +18,7 @@ from PIL import Image
 from geoscene.errors import InputError, NetworkError
 from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
+from geoscene.scene import open_scene
 from geoscene.sources import OsmData, TileServer, Way, demo_path, fetch_elevation, read_osm
 from geoscene.sources.elevation import decode_terrarium, zoom_at
 
@@ -56,7 +57,7 @@ class Handler(BaseHTTPRequestHandler):
     def do_GET(self):
         self.server.asked.append((self.path, self.headers["User-Agent"]))
         status = self.server.refuse.pop(0) if self.server.refuse else 200
-        names = self.path.removesuffix(".png").split("/")[1:]
+        names = self.path.partition("?")[0].removesuffix(".png").split("/")[1:]
         body = self.server.tile(*map(int, names)) if status == 200 else b"<Error/>"
         self.send_response(status)
         self.send_header("Content-Length", str(len(body)))
@@ -303,3 +304,17 @@ def test_program_without_a_network_fails_with_one_line(tmp_path):
     assert "Connection refused" in done.stderr
     assert "--dem FILE" in done.stderr
     assert not (tmp_path / "s").exists()
+
+
+def test_a_scene_of_tiles_of_a_server_with_a_key_does_not_record_the_key(serve, tmp_path):
+    url = serve(hills).template.replace("//", "//me:pa55word@") + "?key=pa55word"
+    words = ["build", "--demo", "--bbox", "24.942,60.166,24.945,60.168", "--lod", "0", "--only", "buildings"]
+    words += ["--dem", "tiles", "--dem-server", url, "--cache", tmp_path / "cache", "--workers", "1"]
+    done = run_program("geoscene", *words, "-o", tmp_path / "scene", "--json")
+    assert done.returncode == 0, done.stderr
+    recorded = json.dumps(open_scene(tmp_path / "scene").manifest)
+    assert "elevation tiles: http://127.0.0.1" in recorded
+    assert "key=***" in recorded
+    everything = done.stdout + done.stderr + recorded
+    everything += "".join(p.read_text("latin-1") for p in tmp_path.rglob("*") if p.is_file())
+    assert "pa55word" not in everything

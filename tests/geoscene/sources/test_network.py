@@ -1,5 +1,6 @@
 """Map servers over HTTP: a server on the loopback interface answers from the demo extract."""
 
+import gzip
 import json
 import re
 import socket
@@ -113,6 +114,8 @@ class MapServer(ThreadingHTTPServer):
 
     asked   : requests as (path, user agent)
     refuse  : HTTP statuses of the next requests for data, in order
+    remark  : of Overpass, beside its answer
+    body    : sent with status 200 instead of an answer, if not None, with the headers
     status  : text of the status page, with the time of the next free slot
     """
 
@@ -122,6 +125,8 @@ class MapServer(ThreadingHTTPServer):
         self.asked: list[tuple[str, str]] = []
         self.refuse: list[int] = []
         self.remark = ""
+        self.body: bytes | None = None
+        self.headers: dict[str, str] = {}
         self.status = "Connected as: 1\nCurrent time: x\nRate limit: 2\n2 slots available now.\n"
 
     @property
@@ -138,7 +143,9 @@ class Handler(BaseHTTPRequestHandler):
     def _send(self, status: int, body: bytes, kind: str = "application/json") -> None:
         self.send_response(status)
         self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(body)))
+        headers = {"Content-Length": str(len(body)), **(self.server.headers if "json" in kind else {})}
+        for name, value in headers.items():
+            self.send_header(name, value)
         if status == 429:
             self.send_header("Retry-After", "0")
         self.end_headers()
@@ -157,12 +164,16 @@ class Handler(BaseHTTPRequestHandler):
             self._send(200, self.server.status.encode(), "text/plain")
         elif not self._refused():
             name = urllib.parse.parse_qs(url.query)["q"][0]
-            self._send(200, json.dumps(PLACES.get(name, [])).encode())
+            found = json.dumps(PLACES.get(name, [])).encode()
+            self._send(200, found if self.server.body is None else self.server.body)
 
     def do_POST(self) -> None:
         self.server.asked.append((self.path, self.headers["User-Agent"]))
         body = self.rfile.read(int(self.headers["Content-Length"])).decode()
         if self._refused():
+            return
+        if self.server.body is not None:
+            self._send(200, self.server.body)
             return
         answer = self.server.extract.answer(urllib.parse.parse_qs(body)["data"][0])
         if self.server.remark:
@@ -245,10 +256,12 @@ def test_answers_are_cached_and_damaged_ones_fetched_again(server, tmp_path):
 
 
 def test_large_area_fetched_in_parts_equals_one_request(server):
-    parts = []
+    reports = []
     servers = replace(servers_at(server), max_query_km2=0.05)
-    data = fetch_bbox(BOX, servers=servers, progress=lambda items: [parts.append(i) or i for i in items])
-    assert server.asked_for("/api/interpreter") == len(parts) >= 4
+    data = fetch_bbox(BOX, servers=servers, progress=lambda *a, total: reports.append((*a, total)))
+    parts = server.asked_for("/api/interpreter")
+    assert parts >= 4
+    assert reports == [("fetching the map", done, parts) for done in range(parts + 1)]
     assert_is_the_box(data)
 
 
@@ -306,6 +319,114 @@ def test_failed_server_is_named_and_no_answer_is_cached(server, tmp_path):
     with pytest.raises(NetworkError, match="out of memory"):
         fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
     assert list(tmp_path.iterdir()) == []
+
+
+WHOLE = json.dumps({"elements": [{"type": "node", "id": k, "lat": 60.1, "lon": 24.9} for k in range(99)]})
+CUT = gzip.compress(WHOLE.encode())[:-40]
+
+
+@pytest.mark.parametrize(
+    ("body", "headers", "words"),
+    [
+        (b"<html><title>Too busy</title></html>", {}, r"HTTP 200, but a web page \(Too busy\)"),
+        (b"<html><p>dispatcher <b>timeout</b></p></html>", {}, r"a web page \(dispatcher timeout\)"),
+        (WHOLE[: len(WHOLE) // 2].encode(), {}, "cut short after [0-9,]+ characters"),
+        (WHOLE[: len(WHOLE) // 2].encode(), {"Content-Length": "9999"}, "an answer that is cut short"),
+        (CUT, {"Content-Encoding": "gzip"}, "cut short"),
+        (b"no gzip", {"Content-Encoding": "gzip"}, "damaged or cut short"),
+        (b"", {}, "an empty answer"),
+        (b"busy", {}, r"no JSON \(busy\)"),
+        (b"{}", {}, "no (map objects|list of places)"),
+        (b"7", {}, "no (map objects|list of places)"),
+        (b'{"elements": [7]}', {}, "cannot be read|no list of places"),
+    ],
+)
+def test_an_unusable_answer_is_one_line_and_not_kept(server, tmp_path, body, headers, words):
+    server.body, server.headers = body, headers
+    for fetch in (lambda **of: fetch_bbox(BOX, **of), lambda **of: locate("Esplanadi, Helsinki", **of)):
+        with pytest.raises(NetworkError, match=words) as caught:
+            fetch(cache_dir=tmp_path, servers=servers_at(server))
+        text = str(caught.value)
+        assert "\n" not in text
+        assert not re.search("Expecting|JSONDecode|IncompleteRead|Connection broken|Error -", text)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "remark",
+    [
+        'runtime error: Query timed out in "query" at line 3 after 26 seconds.',
+        'runtime error: Query run out of memory in "recurse" using about 512 MB of RAM.',
+        "runtime remark: Timeout: the answer is incomplete",
+    ],
+)
+def test_a_remark_on_an_incomplete_answer_is_an_error(server, tmp_path, remark):
+    server.remark = remark
+    with pytest.raises(NetworkError, match=r"127.0.0.1.*runtime"):
+        fetch_bbox(BOX, cache_dir=tmp_path, servers=servers_at(server))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("found", [{}, {"boundingbox": ["1", "2"]}, {"boundingbox": list("abcd")}, 7])
+def test_a_place_without_a_box_is_refused(server, tmp_path, found):
+    server.body = json.dumps([found]).encode()
+    with pytest.raises(NetworkError, match="without a box"):
+        locate("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_empty_answers_are_not_kept_and_asked_for_again(server, tmp_path):
+    servers = servers_at(server)
+    server.body = b"[]"
+    with pytest.raises(SourceNotFoundError, match=rf"no place.*kept in {tmp_path}, `refresh` asks again"):
+        fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers)
+    server.body = b'{"elements": []}'
+    with pytest.raises(SourceNotFoundError, match=rf"nothing there.*kept in {tmp_path}, `refresh` asks"):
+        fetch_bbox(BOX, cache_dir=tmp_path, servers=servers)
+    assert list(tmp_path.iterdir()) == []
+    server.body = None
+    assert_is_the_box(fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers))
+    for path in tmp_path.iterdir():  # as former versions kept them
+        places = isinstance(json.loads(gzip.decompress(path.read_bytes())), list)
+        path.write_bytes(gzip.compress(b"[]" if places else b'{"elements": []}'))
+    assert_is_the_box(fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers))
+
+
+def test_refresh_asks_again_and_replaces_what_is_kept(server, tmp_path):
+    servers = servers_at(server)
+    fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers)
+    kept = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    for name in kept:
+        (tmp_path / name).write_bytes(gzip.compress(json.dumps({"elements": [1]}).encode()))
+    asked = len(server.asked)
+    fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, refresh=True, servers=servers)
+    assert len(server.asked) == 2 * asked
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
+
+
+def test_a_wait_for_a_busy_server_is_said_with_its_reason(server):
+    server.refuse = [504]
+    reports = []
+    servers = replace(servers_at(server), wait=1.5)
+    fetch_bbox(BOX, servers=servers, progress=lambda *a, total: reports.append((*a, total)))
+    stage = f"waiting 2 s (127.0.0.1:{server.server_port}: HTTP 504, Gateway Timeout)"
+    assert [report for report in reports if report[0] == stage] == [(stage, k, 2) for k in range(3)]
+
+
+def test_neither_user_nor_key_of_an_address_is_in_errors(server):
+    address = server.url.replace("//", "//me:pa55word@")
+    server.refuse = [500, 500]
+    servers = Servers(nominatim=f"{address}?key=pa55word", overpass=(f"{address}/api",), wait=0.0)
+    with pytest.raises(NetworkError, match=r"127\.0\.0\.1:\d+: HTTP 500") as caught:
+        fetch_bbox(BOX, servers=servers)
+    assert "pa55word" not in str(caught.value)
+    for wrong in (nowhere().replace("//", "//me:pa55word@"), "http://me:pa55word@:x/?key=pa55word"):
+        with pytest.raises(NetworkError) as caught:
+            locate("Esplanadi, Helsinki", servers=replace(servers, nominatim=wrong))
+        assert "pa55word" not in str(caught.value)
+    for wrong in ("me:pa55word@nowhere", "ftp://me:pa55word@nowhere"):
+        with pytest.raises(InputError, match="'nowhere': give one that begins with https://") as caught:
+            Servers(nominatim=wrong)
 
 
 def test_a_query_waits_for_a_free_slot(server):
