@@ -12,6 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from geoscene.typing import Float, Ints
 
+_LEVEL = 1e-3
+"""Metres in height by which a line without a vertex may be off."""
+
 _UNITS = 2.0**30
 """Units of stations per metre in which they are summed: a nanometre each."""
 
@@ -122,6 +125,8 @@ def parallel(line: Float, offset: float) -> Float:
 def offset_curve(line: Float, offset: float) -> Float:
     """The line (k, 3) offset to the left without loops inside bends; heights are those of the nearest points.
 
+    Of vertices on a straight those at which the gradient changes are kept.
+
     If the offset line would be shorter than half the line, each vertex is moved instead, loops included.
     """
     centre = shapely.linestrings(line[:, :2])
@@ -134,8 +139,17 @@ def offset_curve(line: Float, offset: float) -> Float:
         left = np.stack([-unit[:, 1], unit[:, 0]], axis=1)
         return np.column_stack([line[:, :2] + offset * left, line[:, 2]])
     xy = shapely.get_coordinates(moved)
-    z = np.interp(shapely.line_locate_point(centre, shapely.points(xy)), stations(line), line[:, 2])
-    return np.column_stack([xy, z])
+    along, height = stations(line), line[:, 2]
+    near = shapely.line_locate_point(centre, shapely.points(xy))
+    # GEOS leaves out vertices on straights, and with them their heights.
+    kept = np.unique(near)
+    between = np.interp(along, kept, np.interp(kept, along, height))
+    lost = (along > kept[0]) & (along < kept[-1]) & ~np.isin(along, kept)
+    if (np.abs(between - height)[lost] > _LEVEL).any():
+        added = shapely.line_locate_point(moved, shapely.points(line[lost, :2]))
+        xy = points_at(xy, np.union1d(stations(xy), added))
+        near = shapely.line_locate_point(centre, shapely.points(xy))
+    return np.column_stack([xy, np.interp(near, along, height)])
 
 
 def unit(vector: Float) -> Float:

@@ -73,3 +73,15 @@ def test_parts_are_those_cut_one_by_one(line):
     for part, start, end in zip(found, cuts[:-1], cuts[1:], strict=True):
         expected = polylines.cut(line, start, end=end)[:, :2]
         assert np.array_equal(shapely.get_coordinates(part), expected)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.02, np.pi / 2])
+@pytest.mark.parametrize("offset", [1.75, -3.5])
+def test_an_offset_line_keeps_the_heights_of_vertices_on_straights(turn, offset):
+    along = np.array([0.0, 40, 90, 100, 110, 160, 200])
+    height = np.array([0.0, 0, 5, 5.5, 5, 0, 0])
+    line = np.column_stack([along * np.cos(turn), along * np.sin(turn), height])
+    moved = polylines.offset_curve(line, offset)
+    at = np.linspace(0.0, 200.0, 401)
+    found = np.interp(at, moved[:, :2] @ [np.cos(turn), np.sin(turn)], moved[:, 2])
+    np.testing.assert_allclose(found, np.interp(at, along, height), atol=2e-3)
