@@ -92,11 +92,8 @@ class Carriageways:
 
     @property
     def place(self) -> NDArray[np.int8]:
-        """0 on the ground, 1 on a bridge (or an upper storey), 2 in a tunnel."""
-        return np.array(
-            [place_of(s.layer, s.layer_source, bridge=s.bridge, tunnel=s.tunnel) for s in self.street],
-            np.int8,
-        )
+        """0 on the ground, 1 on a bridge, 2 in a tunnel."""
+        return np.array([place_of(bridge=s.bridge, tunnel=s.tunnel) for s in self.street], np.int8)
 
     @property
     def importance(self) -> Ints:

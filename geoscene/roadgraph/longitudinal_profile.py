@@ -55,8 +55,8 @@ class Obstacles:
 
 
 # Weights of the least-squares terms, per metre of road. Ground far from any bridge or tunnel holds a road
-# more firmly than a ramp does; violated bounds cost a hundred thousand times more than either.
-_FIRM, _RAMP, _LOOSE = 100.0, 1.0, 1e-6
+# more firmly than a ramp does, and those that no ramp leads to do not give way; violated bounds cost more.
+_FIXED, _FIRM, _RAMP, _LOOSE = 1e4, 100.0, 1.0, 1e-6
 _RAMP_REACH = 150.0
 # Over more than this length (metres) a bridge or tunnel behaves as a taut string rather than as a beam.
 _TAUT = 30.0
@@ -88,7 +88,8 @@ def profile(
 
     Constrained least squares over all stations at once. Minimised: the squared distance from the ground, plus
     the squared curvature in height times ``smooth`` to the fourth; bridges and tunnels have the second term
-    only, so they continue their ramps. Bounds: a road is above one that it crosses by clearance and deck;
+    only, so they continue their ramps. Bounds: a road is above one that it crosses by clearance and deck,
+    if one of them is a bridge or a tunnel, and else, without a common node, as high;
     bridges and tunnels that overlap a road beside them have its height or that distance over or under it;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
     its mouth, and if gradients allow entirely so after 15 m; gradients; changes of gradient. Bounds that
@@ -133,7 +134,8 @@ def _weights(graph: RoadGraph, stations: Stations) -> Float:
     ends = np.zeros(count, np.bool_)
     ends[a[structure]] = ends[b[structure]] = True
     far = _distance(count, (a[~structure], b[~structure], metres[~structure]), start=ends, limit=_RAMP_REACH)
-    per_metre = _RAMP + (_FIRM - _RAMP) * np.clip(far / _RAMP_REACH, 0.0, 1.0) ** 2
+    per_metre = _RAMP + (_FIRM - _RAMP) * (far / _RAMP_REACH) ** 2
+    per_metre[far >= _RAMP_REACH] = _FIXED
     share = np.where(structure, 0.0, metres / 2)
     held = np.bincount(a, share, count) + np.bincount(b, share, count)
     return np.maximum(held * per_metre, _LOOSE)
@@ -200,6 +202,13 @@ def _bounds(
         place = stations.xy[k] * (1 - s)[:, None] + stations.xy[m] * s[:, None]
         i, j, t = stations.at(lower, _nearest(graph, lower, xy=place, along=on_lower))
         rows.add([(k, 1 - s), (m, s), (i, t - 1), (j, -t)], np.full(len(upper), high), weight=_HARDEST)
+
+    one, on_one, two, on_two, _ = find_crossings(graph, stations, level=True)
+    k, m, s = stations.at(one, on_one)
+    i, j, t = stations.at(two, on_two)
+    for sign in (1.0, -1.0):
+        equal = [(k, sign * (1 - s)), (m, sign * s), (i, sign * (t - 1)), (j, -sign * t)]
+        rows.add(equal, np.zeros(len(one)), weight=_HARDEST)
 
     room, parting = _parting(high, options)
     beside = find_overlaps(graph, stations, crossing=(upper, lower), room=room)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.layers import rank_ways
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.support.columns import nth
 from geoscene.typing import Bools, Float, Ints
@@ -133,17 +134,22 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     )
 
 
-def find_crossings(graph: RoadGraph, stations: Stations) -> tuple[Ints, Float, Ints, Float, Float]:
+def find_crossings(
+    graph: RoadGraph, stations: Stations, *, level: bool = False
+) -> tuple[Ints, Float, Ints, Float, Float]:
     """Grade-separated crossings: (upper edge, metres along it, lower edge, metres along it, margin).
 
-    These are lines that cross in plan without a common node and differ in layer or in bridge or tunnel. The
-    margin is the length in metres along the upper road that half the lower road's width takes up.
+    These are lines that cross in plan without a common node and differ in rank
+    (`geoscene.roadgraph.layers.rank_ways`). The margin is the length in metres along the upper road that half
+    the lower road's width takes up.
+
+    level : those of equal rank instead, whose roads have the same height
     """
     once = np.unique(stations.edge)
     lines = edge_lines(graph)[once]
-    rank = graph.layer[once] * 2.0 + graph.bridge[once] - graph.tunnel[once]
+    rank = rank_ways(graph.layer, bridge=graph.bridge, tunnel=graph.tunnel)[once]
     one, two = shapely.STRtree(lines).query(lines, predicate="intersects")
-    over = rank[one] > rank[two]
+    over = (rank[one] == rank[two]) & (one < two) if level else rank[one] > rank[two]
     one, two = one[over], two[over]
     points, pair = shapely.get_parts(shapely.intersection(lines[one], lines[two]), return_index=True)
     point = shapely.get_type_id(points) == shapely.GeometryType.POINT
@@ -226,7 +232,7 @@ def find_overlaps(
         column[keep] for column in (row, edge, other, along, metres, length, both)
     )
     deep = metres < np.minimum(graph.width[edge], graph.width[other]) / 2
-    rank = graph.layer * 2 + np.where(graph.tunnel, -1, graph.bridge.astype(np.int64))
+    rank = rank_ways(graph.layer, bridge=graph.bridge, tunnel=graph.tunnel)
     side = np.sign(rank[edge] - rank[other]).astype(np.int64)
     fork = _from_fork(graph, stations, row=row, edge=edge, other=other, along=along, length=length)
     roomy = fork >= room

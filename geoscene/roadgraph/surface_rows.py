@@ -32,7 +32,7 @@ class SurfaceRows(Columns):
                ``cycleway``, ``busway``, ``maxspeed`` (tags),
                ``area``, ``crossing`` (tag), ``control`` (a signal or sign); material is ``surface`` or
                ``default``
-    place    : (n,) int8, 0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement
+    place    : (n,) int8, 0 on the ground, 1 on a bridge, 2 in a tunnel
     level    : (n,) int8, OSM layer
     edge     : (n,) int32, the edge of the road graph on it, -1 for none
     number   : (n,) int32, of the shape that the polygon is a part of, -1 for none

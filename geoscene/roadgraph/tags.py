@@ -237,21 +237,18 @@ def read_layer(tags: Tags, unread: list[str]) -> tuple[int, str]:
     return (-1, "tunnel") if is_tunnel(tags) else (0, "default")
 
 
-def place_of(layer: int, layer_source: str, *, bridge: bool, tunnel: bool) -> int:
-    """0 on the ground, 1 on a bridge or an upper storey, 2 in a tunnel or a basement.
+def place_of(*, bridge: bool, tunnel: bool) -> int:
+    """0 on the ground, 1 on a bridge, 2 in a tunnel.
 
-    ``layer`` alone is not enough: a road of layer -1 without a tunnel tag runs in a cutting, on the ground.
+    ``layer`` and ``level`` alone do not count: a road of layer -1 without a tunnel tag runs in a cutting, on
+    the ground.
     """
-    storey = layer if layer_source == "level" else 0
-    if bridge or storey > 0:
-        return 1
-    return 2 if tunnel or storey < 0 else 0
+    return 1 if bridge else 2 if tunnel else 0
 
 
 def place_and_layer(tags: Tags) -> tuple[int, int]:
     """Place of a way, as of `place_of`, and its layer."""
-    layer, source = read_layer(tags, [])
-    return place_of(layer, source, bridge=is_bridge(tags), tunnel=is_tunnel(tags)), layer
+    return place_of(bridge=is_bridge(tags), tunnel=is_tunnel(tags)), read_layer(tags, [])[0]
 
 
 def _direction(tags: Tags) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import shapely
@@ -14,6 +13,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.geometry.polylines import unit
 from geoscene.roadgraph import find_obstacles
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.layers import rank_ways
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
@@ -335,14 +335,14 @@ def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Floa
     graph, options = crossed.graph, crossed.options
     obstacles = find_obstacles(crossed.osm, crossed.frame)
     roads = edge_lines(graph)
-    rank = _rank(graph.layer, graph.bridge, tunnel=graph.tunnel)
+    rank = rank_ways(graph.layer, bridge=graph.bridge, tunnel=graph.tunnel)
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
     least, most = np.full((2, len(net.xy)), np.nan)
     columns = (paths.tunnel.tolist(), paths.level.tolist(), paths.body.tolist())
     for rows, below, layer, thick in zip(net.rows, *columns, strict=True):
         way = shapely.LineString(net.xy[rows])
-        own = int(_rank(layer, not below, tunnel=below))
+        own = int(rank_ways(layer, bridge=not below, tunnel=below))
         for other in tree.query(way, predicate="crosses").tolist():
             is_road = other < len(roads)
             over = own > rank[other] if is_road else not below
@@ -365,11 +365,6 @@ def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Floa
                 else:
                     most[at] = np.fmin(most[at], need)
     return least, most
-
-
-def _rank(layer: Any, bridge: Any, *, tunnel: Any) -> Any:
-    """Rank in height where ways cross: by layer, then a bridge over the ground over a tunnel."""
-    return np.asarray(layer, np.int64) * 2 + np.where(tunnel, -1, np.asarray(bridge, np.int64))
 
 
 def _cones(net: _Net, bound: Float) -> Float:

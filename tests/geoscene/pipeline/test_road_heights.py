@@ -1,0 +1,164 @@
+"""Streets of built scenes have the heights of their graph, and nothing stands on them: measured by rays."""
+
+import importlib
+
+import numpy as np
+import pytest
+import rasterio
+from helpers import ROOT
+
+from geoscene.geometry.frames import Frame
+from geoscene.options import BuildOptions
+from geoscene.pipeline.build import build
+from geoscene.sources import read_osm
+
+FRAME = Frame.at(10.0, 50.0)
+STREET = {"highway": "residential"}
+ROAD = {"highway": "tertiary"}
+BRIDGE = ROAD | {"bridge": "yes", "layer": "1"}
+
+
+@pytest.fixture
+def bench(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("road_heights")
+
+
+def write_map(path, places, ways, *, reach=250.0):
+    """A map of ways through places in metres around 50 N 10 E."""
+    lon, lat = FRAME.to_geographic(*np.array(list(places.values()), float).T)
+    nodes = [
+        f'<node id="{n}" version="1" lat="{v:.9f}" lon="{u:.9f}"/>'
+        for n, u, v in zip(places, lon, lat, strict=True)
+    ]
+    lines = [
+        f'<way id="{100 + k}" version="1">'
+        + "".join(f'<nd ref="{n}"/>' for n in line)
+        + "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        + "</way>"
+        for k, (tags, line) in enumerate(ways)
+    ]
+    (west, east), (south, north) = FRAME.to_geographic(np.array([-reach, reach]), np.array([-reach, reach]))
+    box = f'<bounds minlat="{south:.7f}" minlon="{west:.7f}" maxlat="{north:.7f}" maxlon="{east:.7f}"/>'
+    path.write_text(f'<osm version="0.6">{box}{"".join(nodes + lines)}</osm>')
+    return path
+
+
+def write_terrain(path, height, *, step=25.0, reach=400.0):
+    """A GeoTIFF of the heights at x, y around 50 N 10 E."""
+    count = int(2 * reach / step) + 1
+    lon, lat = FRAME.to_geographic(np.array([-reach, reach]), np.array([-reach, reach]))
+    across, down = (lon[1] - lon[0]) / (count - 1), (lat[1] - lat[0]) / (count - 1)
+    x, y = np.meshgrid(np.linspace(-reach, reach, count), np.linspace(reach, -reach, count))
+    transform = rasterio.Affine(across, 0.0, lon[0] - across / 2, 0.0, -down, lat[1] + down / 2)
+    profile = {"driver": "GTiff", "width": count, "height": count, "count": 1, "dtype": "float32"}
+    with rasterio.open(path, "w", **profile, crs="EPSG:4326", transform=transform) as out:
+        out.write(height(x, y).astype(np.float32), 1)
+    return str(path)
+
+
+def built(folder, places, ways, *, terrain=None, **options):
+    osm = read_osm(write_map(folder / "map.osm", places, ways))
+    dem = (write_terrain(folder / "dem.tif", terrain),) if terrain else ()
+    return build(osm, folder / "scene", options=BuildOptions(relief="off", dem=dem, **options))
+
+
+def faults(bench, scene):
+    """Numbers of samples with a fault, those without any left out."""
+    counts = bench.report(scene, worst=0)["counts"]
+    assert sum(row["samples"] for row in counts.values()) > 1000
+    return {
+        (kind, fault): n
+        for kind, row in counts.items()
+        for fault, n in row.items()
+        if fault != "samples" and n
+    }
+
+
+def heights(scene, way):
+    """Heights of the vertices of a way's edges."""
+    graph = scene.road_graph()
+    chosen = [edge for edge, ids in enumerate(graph.osm_id) if f"way/{way}" in ids.split(";")]
+    assert chosen
+    return np.concatenate([graph.geometry[edge][:, 2] for edge in chosen])
+
+
+def problems(scene):
+    return scene.files.problems.read_text().splitlines()[1:]
+
+
+# A street over or under another without a common node.
+CROSSING = {
+    1: (-120, 0), 2: (-30, 0), 3: (30, 0), 4: (120, 0),
+    5: (0, -120), 6: (0, -20), 7: (0, 20), 8: (0, 120),
+}  # fmt: skip
+
+
+def crossing(upper, lower):
+    return [
+        (ROAD, [1, 2]),
+        (ROAD | upper, [2, 3]),
+        (ROAD, [3, 4]),
+        (STREET, [5, 6]),
+        (STREET | lower, [6, 7]),
+        (STREET, [7, 8]),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower"),
+    [
+        ({"layer": "1"}, {}),
+        ({"layer": "-1"}, {}),
+        ({}, {"layer": "-1"}),
+        ({"layer": "5"}, {"layer": "-5"}),
+        ({"level": "1"}, {}),
+        ({"level": "-1"}, {"level": "2"}),
+        ({"layer": "0.5"}, {}),
+    ],
+)
+def test_layers_without_a_structure_have_no_effect(upper, lower, bench, tmp_path):
+    scene = built(tmp_path, CROSSING, crossing(upper, lower))
+    assert not faults(bench, scene)
+    assert all(not heights(scene, way).any() for way in (101, 104))
+    odd = [tags for tags in (upper, lower) if tags and tags != {"layer": "0.5"}]
+    assert sum(",layer-without-structure," in row for row in problems(scene)) == len(odd)
+
+
+@pytest.mark.parametrize("layer", ["-1", "-5", "0", "1", "0.5", None])
+def test_a_bridge_passes_over_a_street_whatever_its_layer(layer, bench, tmp_path):
+    tags = {"bridge": "yes"} | ({} if layer is None else {"layer": layer})
+    scene = built(tmp_path, CROSSING, crossing(tags, {"layer": "0"}))
+    assert not faults(bench, scene)
+    assert heights(scene, 101).max() > 5.4
+    assert np.abs(heights(scene, 104)).max() < 0.03
+    assert any(",odd-layer," in row for row in problems(scene)) == (layer in ("-1", "-5"))
+
+
+@pytest.mark.parametrize("layer", ["1", "-1", "0", None])
+def test_a_tunnel_passes_under_a_street_whatever_its_layer(layer, bench, tmp_path):
+    tags = {"tunnel": "yes"} | ({} if layer is None else {"layer": layer})
+    scene = built(tmp_path, CROSSING | {2: (-60, 0), 3: (60, 0)}, crossing(tags, {}))
+    assert not faults(bench, scene)
+    assert heights(scene, 101).min() < -5.4
+    assert np.abs(heights(scene, 104)).max() < 0.03
+    assert any(",odd-layer," in row for row in problems(scene)) == (layer == "1")
+
+
+def test_streets_that_cross_on_terrain_without_a_node_have_one_height(bench, tmp_path):
+    scene = built(tmp_path, CROSSING, crossing({"layer": "1"}, {}), terrain=HILLS)
+    assert not faults(bench, scene)
+
+
+def HILLS(x, y):  # noqa: N802 - a constant
+    return 300.0 + 12.0 * np.sin(x / 40.0) * np.cos(y / 55.0) + 0.1 * x
+
+
+GRID = {10 * i + j: (60.0 * i - 150.0 + 7.0 * j, 60.0 * j - 150.0) for i in range(6) for j in range(6)}
+GRID_WAYS = [(STREET, [10 * i + j for j in range(6)]) for i in range(6)]
+GRID_WAYS += [(ROAD, [10 * i + j for i in range(6)]) for j in range(6)]
+
+
+def test_streets_on_steep_terrain_lie_on_the_ground(bench, tmp_path):
+    scene = built(tmp_path, GRID, GRID_WAYS, terrain=HILLS)
+    assert not faults(bench, scene)
