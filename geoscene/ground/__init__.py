@@ -16,6 +16,7 @@ from geoscene.ground.landcover import landcover as landcover
 from geoscene.ground.layers import Layers as Layers
 from geoscene.ground.layers import building_pads as building_pads
 from geoscene.ground.partition import GroundPlan as GroundPlan
+from geoscene.ground.partition import cut_along as cut_along
 from geoscene.ground.partition import partition_tile as partition_tile
 from geoscene.ground.partition import plan_ground as plan_ground
 from geoscene.ground.partition import tile_box as tile_box

@@ -10,7 +10,7 @@ same whole segments there, they find the same vertices on it, whichever other ti
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,7 @@ class GroundPlan:
     base      : (class, material code) where no polygon lies
     start, end : (m, 2) float64 segments of all outlines, on the grid
     string    : (m,) int32: segments of one outline that follow each other have the same number
+    creases   : number of the first string that is no outline but a line along which the ground bends
     order, offset : segments by square, (k,) int32 and (t + 1,) int64: those of square (i, j) are
                 ``order[offset[k]:offset[k + 1]]``, k its place in `tiles`
     tiles     : (t, 2) int64, all squares of the extent with the tile size, by row; each is a tile unless
@@ -92,6 +93,7 @@ class GroundPlan:
     start: Float
     end: Float
     string: NDArray[np.int32]
+    creases: int
     order: NDArray[np.int32]
     offset: Ints
     tiles: Ints
@@ -183,6 +185,7 @@ def plan_ground(
         start,
         end,
         string,
+        int(string.max(initial=-1)) + 1,
         order,
         offset,
         np.stack([i, j], axis=1) + low,
@@ -190,6 +193,22 @@ def plan_ground(
         kerbs,
         raised,
     )
+
+
+def cut_along(plan: GroundPlan, creases: Float) -> GroundPlan:
+    """The plan with segments (c, 2, 2), scene metres, along which cells are cut, so that the ground can bend.
+
+    A segment that ends within a cell is cut back to where it enters it.
+    """
+    box, low = np.array(plan.extent), plan.tiles[0]
+    start, end = _snap(creases).swapaxes(0, 1)
+    kept = (start != end).any(axis=1) & _near_box(start, end, box=box)
+    string = plan.creases + np.arange(int(kept.sum()), dtype=np.int32)
+    start, end = np.concatenate([plan.start, start[kept]]), np.concatenate([plan.end, end[kept]])
+    count = plan.tiles[-1] - low + 1
+    order, offset = _by_tile(start, end, low=low, count=count, tile_size=plan.tile_size)
+    string = np.concatenate([plan.string, string])
+    return replace(plan, start=start, end=end, string=string, order=order, offset=offset)
 
 
 def partition_tile(plan: GroundPlan, i: int, *, j: int) -> Partition:
@@ -314,17 +333,31 @@ def _outlines(polygons: NDArray[np.object_], box: Float) -> tuple[Float, Float, 
         coords, ring = shapely.get_coordinates(rings, return_index=True)
         coords = _snap(coords)
         start, end = coords[:-1], coords[1:]
-        low, high = np.minimum(start, end), np.maximum(start, end)
-        keep = (
-            (ring[:-1] == ring[1:])
-            & (start != end).any(axis=1)
-            & (low <= box[2:] + _REACH).all(axis=1)
-            & (high >= box[:2] - _REACH).all(axis=1)
-        )
+        keep = (ring[:-1] == ring[1:]) & (start != end).any(axis=1) & _near_box(start, end, box=box)
         found.append((start[keep], end[keep], (ring[:-1][keep] + count).astype(np.int32)))
         count += len(rings)
     start, end, string = (np.concatenate(column) for column in zip(*found, strict=True))
     return start, end, string
+
+
+def _along(creases: NDArray[np.object_], ends: tuple[Float, Float]) -> Bools:
+    """Whether segments (m,) between points are pieces of creases, which snap rounding moves a little."""
+    tree, middle = shapely.STRtree(creases), shapely.points((ends[0] + ends[1]) / 2)
+    piece, crease = tree.query(middle, predicate="dwithin", distance=PRECISION)
+    for end in ends:
+        near = np.asarray(shapely.dwithin(shapely.points(end[piece]), creases[crease], PRECISION))
+        piece, crease = piece[near], crease[near]
+    on = np.zeros(len(middle), np.bool_)
+    on[piece] = True
+    return on
+
+
+def _near_box(start: Float, end: Float, *, box: Float) -> Bools:
+    """Whether boxes around segments (m,) are near a box."""
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    return np.asarray(
+        (low <= box[2:] + _REACH).all(axis=1) & (high >= box[:2] - _REACH).all(axis=1), np.bool_
+    )
 
 
 def _rings(polygons: NDArray[np.object_]) -> tuple[NDArray[np.object_], Ints]:
@@ -454,7 +487,11 @@ def _cells(
     row = rows_at(plan, cells.inner_points())
     row, slivers = _without_slivers(cells, row=row)
     level = np.isin(values_at(plan.layers.body, row, base=""), ("sea", "standing"))
-    joined, row = _dissolve(cells, row, box=box, lines=_spacing(plan, i, j=j), level=level)
+    bent = outlines[plan.string[outlines] >= plan.creases]
+    creases = shapely.linestrings(np.stack([plan.start[bent], plan.end[bent]], axis=1))
+    joined, row = _dissolve(
+        cells, row, box=box, lines=_spacing(plan, i, j=j), creases=np.atleast_1d(creases), level=level
+    )
     return shapely.coverage_simplify(joined.polygons(), BEND, simplify_boundary=False), row, slivers
 
 
@@ -508,17 +545,26 @@ def _without_slivers(edges: GroundFaces, *, row: Ints) -> tuple[Ints, int]:
 
 
 def _dissolve(
-    edges: GroundFaces, row: Ints, *, box: tuple[float, float, float, float], lines: float, level: Bools
+    edges: GroundFaces,
+    row: Ints,
+    *,
+    box: tuple[float, float, float, float],
+    lines: float,
+    creases: NDArray[np.object_],
+    level: Bools,
 ) -> tuple[GroundFaces, Ints]:
-    """Cells of one row joined, over the terrain's lines only where they are level, and their rows.
+    """Cells of one row joined, over creases and the terrain's lines only where they are level; their rows.
 
     Vertices on what remains of the borders all stay.
     """
-    kept = (edges.other < 0) | (row[edges.cell] != row[edges.other])
+    kept: Bools = (edges.other < 0) | (row[edges.cell] != row[edges.other])
     if lines > 0:
         p, q = edges.points[edges.a], edges.points[edges.b]
         on_line = (p == q) & (p == np.round(p / lines) * lines)
-        kept |= on_line.any(axis=1) & ~level[edges.cell]
+        kept[on_line.any(axis=1) & ~level[edges.cell]] = True
+    if len(creases):
+        inner = np.flatnonzero(~kept & ~level[edges.cell])
+        kept[inner] = _along(creases, (edges.points[edges.a[inner]], edges.points[edges.b[inner]]))
     drawn = np.flatnonzero(kept & ((edges.a < edges.b) | (edges.other < 0)))
     ends = np.stack([edges.a[drawn], edges.b[drawn]])
     joined = faces(edges.points, ends, rank=np.arange(2 * len(drawn)).reshape(-1, 2).T, box=box)

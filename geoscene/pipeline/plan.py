@@ -20,6 +20,7 @@ from geoscene.ground import (
     Layers,
     WaterLevels,
     building_pads,
+    cut_along,
     join_tiles,
     landcover,
     plan_ground,
@@ -55,9 +56,11 @@ from geoscene.pipeline.features import (
 from geoscene.pipeline.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
 from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
+from geoscene.roadgraph.creases import crease_lines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import Side
 from geoscene.roadgraph.lanes import driving_side as found_side
+from geoscene.roadgraph.layers import find_odd_layers
 from geoscene.roadgraph.relief import (
     camber_of,
     crown_rows,
@@ -340,6 +343,7 @@ def _plan_roads(
     """Road graph with heights, and carriageways."""
     mapped = _only_roads(osm, options)
     graph = _collect(problems, build_road_graph(mapped, frame))
+    problems += find_odd_layers(mapped.ways)
     surveyed = 0.0 < terrain.spacing <= _SURVEYED
     obstacles = find_obstacles(osm, frame)
     graph = profile(graph, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))
@@ -492,7 +496,14 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     covers = Layers.concatenate([cover, surfaces, pads, low, *extra])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
     ground = _plan_ground(
-        covers, roads, extent=extent, terrain=terrain, options=options, kerbs=kerbs, raised=raised
+        covers,
+        roads,
+        extent=extent,
+        terrain=terrain,
+        options=options,
+        creases=None if height is None else crease_lines(roads.graph, height, area=area),
+        kerbs=kerbs,
+        raised=raised,
     )
     trees, furniture, barriers = (
         replace(table, feature=table.feature + np.int32(ranges[name][0]))
@@ -559,13 +570,14 @@ def _plan_ground(
     extent: Bounds,
     terrain: Terrain,
     options: BuildOptions,
+    creases: Float | None,
     kerbs: Kerbs | None,
     raised: Raised | None,
 ) -> GroundPlan:
     size, tolerance = options.tile_size, options.dem_tolerance
     if tolerance is None:
         tolerance = _TOLERANCE * terrain.spacing
-    return plan_ground(
+    ground = plan_ground(
         extent,
         layers,
         tile_size=size,
@@ -578,6 +590,7 @@ def _plan_ground(
         kerbs=kerbs,
         raised=raised,
     )
+    return ground if creases is None else cut_along(ground, creases)
 
 
 def _surfaces(

@@ -20,7 +20,7 @@ from geoscene.support.columns import squares_between
 from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Height, Ints
 
-_SHARP = 0.05
+_SHARP = 0.002
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
 
 _CUT = 0.5
