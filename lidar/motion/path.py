@@ -132,10 +132,11 @@ def plan_path(
         turns_back = last < len(line.edge)
         if turns_back:
             part = _shorten(part, vehicle)
-        tracks = [_clear_track(part, setting, pose=pose)]
+        track = _clear_track(part, setting, pose=pose)
+        tracks = [track] if len(track.row) > 1 else []  # a U-turn may end where its leg ends
         if turns_back:
-            tracks += turning_manoeuvre(tracks[-1].end, part, setting=setting)
-        pose = tracks[-1].end
+            tracks += turning_manoeuvre(track.end, part, setting=setting)
+        pose = tracks[-1].end if tracks else pose
         legs += tracks
         lines += [part] * len(tracks)
     return _join(legs, lines, setting=setting, ground=ground)

@@ -12,6 +12,7 @@ from geoscene.roadgraph import build_road_graph
 from geoscene.sources import read_osm
 from lidar.errors import BlockedError, RouteError
 from lidar.geometry.attitude import matrix_from_quat, quat_from_euler
+from lidar.motion.motion import legs_of, motion_along
 from lidar.motion.path import plan_path
 from lidar.motion.road_drive import plan_route_and_path
 from lidar.motion.route import RouteOptions, free_route, lane_route, plan_route
@@ -174,6 +175,36 @@ def test_at_a_dead_end_the_vehicle_turns_round_in_three_moves():
     closed = [shapely.box(80, 3.6, 110, 20), shapely.box(80, -20, 110, -3.6)]
     with pytest.raises(BlockedError, match="no room to turn round"):
         plan_path(route, CAR, frame=FRAME, obstacles=closed)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]))
+@settings(max_examples=40, deadline=None)
+def test_routes_that_end_in_or_right_after_a_turn_round_are_driven(seed, name):
+    """Short streets with dead ends: legs of all lengths between turns, also none."""
+    vehicle = load_vehicle(name)
+    rng = np.random.default_rng(seed)
+    length = rng.uniform(8.0, 40.0)
+    graph = road_graph([(0, 0), (length, 0)], [(0, 1)])
+    edges = np.arange(rng.integers(2, 6)) % 2
+    end = length * rng.uniform(0.0, 1.0)
+    route = lane_route(graph, edges, ends=(rng.uniform(0.0, 0.8) * length, end))
+    try:
+        path = plan_path(route, vehicle, frame=FRAME)
+    except RouteError as error:
+        assert "too short to drive" in str(error) or isinstance(error, BlockedError)
+        return
+    assert_drivable(path, vehicle)
+    assert min(last - first for first, last in legs_of(path)) >= 2
+    motion = motion_along(path, vehicle)
+    assert motion.s[-1] == pytest.approx(path.length)
+
+
+def test_a_route_that_ends_where_the_vehicle_has_turned_round_ends_with_that_turn():
+    """After three moves the rear axle is past the end of the way back."""
+    graph = road_graph([(0, 0), (100, 0)], [(0, 1)])
+    path = plan_path(lane_route(graph, [0, 1], ends=(0.0, 1.5)), CAR, frame=FRAME)
+    assert path.gear[[first for first, _ in legs_of(path)]].tolist() == [1, 1, -1, 1]
+    assert_drivable(path, CAR)
 
 
 def test_on_a_slope_the_vehicle_stands_on_the_ground():
