@@ -17,6 +17,17 @@ class RouteError(InputError):
     """A route that cannot be driven on the scene's road graph."""
 
 
+class OffStreetError(RouteError):
+    """Waypoints without a drivable street nearby.
+
+    places : scene metres (x, y) of waypoints that the message names and that nothing explains yet
+    """
+
+    def __init__(self, message: str, places: list[list[float]]) -> None:
+        super().__init__(message)
+        self.places = places
+
+
 class BlockedError(RouteError):
     """A route that bends too tightly for the vehicle, or on which its body would touch an obstacle.
 

@@ -23,6 +23,10 @@ from geoscene.typing import Bools, Float
 
 HEADING_REACH = 5.0
 """Scene metres over which the heading of a street at a junction is taken."""
+_NEAR_MAP = 10_000.0
+"""Scene metres from the graph to places that are meant to lie in it."""
+SWAPPED = "latitude and longitude look swapped: write LAT,LON"
+"""What to do about places that `looks_swapped` finds."""
 _U_TURN = np.radians(150.0)
 """Smallest change of direction at a node, in radians, that needs a U-turn."""
 
@@ -81,6 +85,19 @@ def nearest_edge(
     plan = np.maximum(shapely.length(lines), 1e-9)  # nodes may share a place
     along = shapely.line_locate_point(lines, points) / plan
     return first.astype(np.int32), along * graph.length[first], shapely.distance(lines, points)
+
+
+def looks_swapped(graph: RoadGraph, frame: Frame, *, lat: Float, lon: Float) -> bool:
+    """Whether places (n,) in degrees lie near the graph if their latitudes and longitudes are exchanged.
+
+    For messages about places that lie far from it as they are.
+    """
+    if (np.abs(lon) > 90).any() or (np.abs(lat) > 180).any() or not len(graph):
+        return False
+    with np.errstate(all="ignore"):
+        xy = np.column_stack(frame.from_geographic(lat, lon))
+    low, high = graph.node_xyz[:, :2].min(axis=0), graph.node_xyz[:, :2].max(axis=0)
+    return bool(((xy > low - _NEAR_MAP) & (xy < high + _NEAR_MAP)).all())
 
 
 def turn_table(graph: RoadGraph, *, u_turns: bool = False) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -345,14 +362,18 @@ def route_line(words: Sequence[str], graph: RoadGraph, *, frame: Frame) -> Any:
     except ValueError:
         raise InputError(f"`along` {' '.join(given)}: a file, or two or more LAT,LON") from None
     if not ((np.abs(lat) <= 90) & (np.abs(lon) <= 180)).all():
-        raise InputError(f"`along` {' '.join(given)}: not latitudes and longitudes in degrees")
+        swapped = f"; {SWAPPED}" if looks_swapped(graph, frame, lat=lat, lon=lon) else ""
+        raise InputError(f"`along` {' '.join(given)}: not latitudes and longitudes in degrees{swapped}")
     if len(lat) < 2:
         raise InputError(f"`along` {given[0]}: one waypoint is no route; give two or more, or a file")
     xy = np.column_stack(frame.from_geographic(lon, lat))
     edges, offsets, distances = nearest_edge(graph, xy)
     if distances.max() > 100.0:
         far = int(distances.argmax())
-        raise InputError(f"`along` {given[far]}: {distances[far]:.0f} m from the nearest road; at most 100")
+        swapped = f"; {SWAPPED}" if looks_swapped(graph, frame, lat=lat, lon=lon) else ""
+        raise InputError(
+            f"`along` {given[far]}: {distances[far]:,.0f} m from the nearest road; at most 100{swapped}"
+        )
     places = list(zip(edges.tolist(), offsets.tolist(), strict=True))
     lines = []
     for a, b in pairwise(places):

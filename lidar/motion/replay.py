@@ -27,6 +27,12 @@ _LATEST_NS = 10**15
 _FASTEST = 1000.0  # m/s
 _STAMP = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 _QUAT = ("qx", "qy", "qz", "qw")
+_POSE = ("timestamp", "lon", "lat", "h", *_QUAT)
+_SHOWN = 100
+_WANTED = (
+    f"a CSV file is a drive to repeat: a poses.csv with the columns {', '.join(_POSE)}, or the trajectory.csv"
+    " of a dataset; give waypoints as LAT,LON LAT,LON ..., GPX or GeoJSON"
+)
 
 
 def read_replay(path: Path, frame: Frame) -> Trajectory:
@@ -42,18 +48,19 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
     if not path.is_file():
         raise RouteError(f"{path} does not exist")
     try:
-        with path.open(encoding="utf-8") as file:
+        with path.open(encoding="utf-8-sig") as file:
             names = file.readline().strip().split(",")
     except UnicodeDecodeError as error:
-        raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset") from error
+        raise FormatError(f"{path}: not text in UTF-8; {_WANTED}") from error
     manifest = path.with_name(MANIFEST)
     recorded = _recorded_frame(manifest) if manifest.is_file() else frame
     if names[0] == "time_ns":
         found = read_trajectory(path)
         _check_speed(path, found.time_ns, position=found.position)
         return found if recorded == frame else _move(found, recorded, frame=frame)
-    if not {"timestamp", "lon", "lat", "h", *_QUAT} <= set(names):
-        raise FormatError(f"{path}: neither a poses.csv nor a trajectory.csv of a dataset")
+    if missing := [name for name in _POSE if name not in names]:
+        has = ", ".join(names)[:_SHOWN] or "no columns"
+        raise FormatError(f"{path}: has {has}; no {', '.join(missing)}; {_WANTED}")
     return _from_poses(path, recorded, frame=frame)
 
 
@@ -68,7 +75,7 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     from scipy.interpolate import CubicSpline  # noqa: PLC0415
     from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415
 
-    with path.open(encoding="utf-8", newline="") as file:
+    with path.open(encoding="utf-8-sig", newline="") as file:
         rows = list(csv.DictReader(file))
     if len(rows) < 2:
         raise RouteError(f"{path}: {len(rows)} poses; a drive needs two or more")

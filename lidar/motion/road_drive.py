@@ -17,14 +17,16 @@ from geoscene.classes import GROUND, Class
 from geoscene.geometry.frames import Frame
 from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
-from lidar.errors import BlockedError, RouteError
+from lidar.errors import BlockedError, OffStreetError, RouteError
 from lidar.geometry.time_scales import check_duration
 from lidar.motion.path import Path, Surface, plan_path
 from lidar.motion.route import Route, RouteOptions, Side, Spec, plan_route
 from lidar.motion.vehicle import Vehicle, load_vehicle
+from lidar.motion.waypoints import TOLERANCE
 from lidar.world.world import World
 
 _RANDOM_SECONDS = 60.0
@@ -35,6 +37,7 @@ It covers the braking distance at any speed that streets allow."""
 _HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
+_ON_ROAD = 5.0  # metres from a waypoint to a road that is meant
 _DRIVEN = [*map(int, GROUND), int(Class.BRIDGE)]
 
 
@@ -166,7 +169,7 @@ def plan_road_drive(
     whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
-    obstacles = _obstacles(*_buildings(scene))
+    footprints, min_height = _buildings(scene)
     progress("planning", 0, total=0)
     try:
         _, path = plan_route_and_path(
@@ -175,16 +178,41 @@ def plan_road_drive(
             spec=spec,
             vehicle=load_vehicle(options.vehicle),
             options=options.route_options(spec),
-            obstacles=obstacles,
+            obstacles=_obstacles(footprints, min_height),
+            roofs=shapely.STRtree(footprints),
             ground=road_surface(scene),
         )
     except RouteError as error:
+        if isinstance(error, OffStreetError) and (reason := _street_there(scene, whole, places=error.places)):
+            raise RouteError(f"{error}; {reason}") from None
         if scene.route is None:
             raise
         raise RouteError(f"{error}; the scene has only what lies along the route it was built for") from None
     number = np.append(np.flatnonzero(kept), -1).astype(np.int32)
     path = replace(path, edge=number[path.edge])
     return RoadPlan(whole, path, *options.record(spec))
+
+
+def _street_there(scene: Scene, graph: RoadGraph, *, places: Sequence[Sequence[float]]) -> str:
+    """Why a street of the map at one of the places (x, y) is none to drive on; "" without such a street.
+
+    graph : of the scene, with what lies on no tile
+    """
+    points = shapely.points(np.asarray(places, float).reshape(-1, 2))
+    if shapely.STRtree(edge_lines(graph)).query(points, predicate="dwithin", distance=TOLERANCE).size:
+        return (
+            "the street there leaves the scene; choose a place further inside, or build a scene that holds"
+            " all of it"
+        )
+    if scene.table_length("road_surfaces"):
+        layer = scene.features("road_surfaces")
+        road = layer.geometry[layer.columns["class"] == Class.ROAD.name.lower()]
+        if shapely.STRtree(road).query(points, predicate="dwithin", distance=_ON_ROAD).size:
+            return (
+                "the road there is not connected to drivable streets: it is closed to the public, or not for"
+                " cars"
+            )
+    return ""
 
 
 def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tuple[Float, list[Float]]:
@@ -200,6 +228,7 @@ def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tup
         vehicle=load_vehicle(options.vehicle),
         options=options.route_options(spec),
         obstacles=_obstacles(roads.footprints, roads.min_height),
+        roofs=shapely.STRtree(roads.footprints),
         tried=lambda route: tried.append(route.line[:, :2]),
     )
     return path.position[:, :2], tried
@@ -217,6 +246,7 @@ def plan_route_and_path(
     vehicle: Vehicle,
     options: RouteOptions | None = None,
     obstacles: Sequence[Any] | NDArray[np.object_] | shapely.STRtree | None = None,
+    roofs: shapely.STRtree | None = None,
     ground: Surface | None = None,
     tried: Callable[[Route], None] = lambda _: None,
 ) -> tuple[Route, Path]:
@@ -236,7 +266,7 @@ def plan_route_and_path(
     blocked: BlockedError
     for _ in range(_ATTEMPTS):
         try:
-            route = plan_route(graph, frame, spec=spec, options=options, avoid=avoid)
+            route = plan_route(graph, frame, spec=spec, options=options, avoid=avoid, roofs=roofs)
         except RouteError:
             if avoid:
                 break

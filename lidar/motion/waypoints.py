@@ -13,15 +13,24 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry.frames import Frame
-from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.routing import edge_lines, nearest_edge, permitted_turns, turns_back
+from geoscene.roadgraph.graph import RoadGraph, find_components
+from geoscene.roadgraph.routing import (
+    SWAPPED,
+    edge_lines,
+    looks_swapped,
+    nearest_edge,
+    permitted_turns,
+    turns_back,
+)
 from geoscene.sources.tracks import read_track as read_points
 from geoscene.typing import Float
-from lidar.errors import RouteError
+from lidar.errors import OffStreetError, RouteError
 
 Place = tuple[int, float]
 """An edge and the true metres from its tail."""
 
+_ABOVE = 5.0
+"""Scene metres by which a street above a tunnel may be farther from a waypoint than the tunnel."""
 _NAMED = 3
 """Maximum number of waypoints that an error names."""
 
@@ -87,27 +96,32 @@ def route_through(
 
     One-way streets and turn restrictions hold; the vehicle passes waypoints without turning round.
 
-    Raises RouteError naming waypoints that are farther than `TOLERANCE` metres from a street, or the first
-    that cannot be reached.
+    A waypoint is on the nearest street; of a tunnel and a street above it, on the street.
+
+    Raises OffStreetError naming waypoints that are farther than `TOLERANCE` metres from a street, and
+    RouteError naming the first that cannot be reached.
     """
     if len(points) < 2:
         raise RouteError("a route needs two waypoints or more, each as LAT,LON")
     lat, lon = np.array(points, float).T
+    swapped = f"; {SWAPPED}" if looks_swapped(graph, frame, lat=lat, lon=lon) else ""
     if not ((np.abs(lat) <= 90).all() and (np.abs(lon) <= 180).all()):
-        raise RouteError("waypoints are LAT,LON in degrees: latitudes within 90, longitudes within 180")
+        raise RouteError(
+            f"waypoints are LAT,LON in degrees: latitudes within 90, longitudes within 180{swapped}"
+        )
     x, y = frame.from_geographic(lon, lat)
     xy = np.column_stack([x, y])
-    edge, offset, distance = nearest_edge(graph, xy)
+    edge, offset, distance = _nearest_in_the_open(graph, xy)
     scale = frame.scale(lon, lat)
     far = np.flatnonzero(~(distance <= TOLERANCE * scale))
     if len(far):
         named = [
-            f"waypoint {k + 1} ({lat[k]:.6f}, {lon[k]:.6f}) is {distance[k]:.0f} m from the nearest"
+            f"waypoint {k + 1} ({lat[k]:.6f}, {lon[k]:.6f}) is {distance[k]:,.0f} m from the nearest"
             f" drivable street, more than {TOLERANCE:.0f} m"
             for k in far[:_NAMED]
         ]
         rest = [f"and so are {len(far) - _NAMED} more"] if len(far) > _NAMED else []
-        raise RouteError("; ".join(named + rest))
+        raise OffStreetError("; ".join(named + rest) + swapped, [] if swapped else xy[far[:_NAMED]].tolist())
     candidates = [_both_sides(graph, int(e), offset=float(o)) for e, o in zip(edge, offset, strict=True)]
     chain = _Search(graph, graph.travel_time, avoid=avoid, u_turn=_U_TURN_S)
 
@@ -116,11 +130,28 @@ def route_through(
 
     best = chain.best(candidates, [np.zeros(len(c)) for c in candidates], score=score)
     if isinstance(best, int):
+        part = find_components(graph).weak[graph.tail[edge]]
+        why = "along one-way streets and permitted turns"
+        if part[best] != part[best - 1]:
+            why = "because the streets at the two are not connected in the map"
         raise RouteError(
             f"waypoint {best + 1} ({lat[best]:.6f}, {lon[best]:.6f}) cannot be reached from waypoint {best}"
-            " along one-way streets and permitted turns"
+            f" {why}"
         )
     return best
+
+
+def _nearest_in_the_open(graph: RoadGraph, xy: Float) -> tuple[NDArray[np.int32], Float, Float]:
+    """As `nearest_edge`; of a tunnel and a street above it, the street."""
+    edge, offset, distance = nearest_edge(graph, xy)
+    under = graph.tunnel[edge]
+    if under.any() and not graph.tunnel.all():
+        number = np.flatnonzero(~graph.tunnel).astype(np.int32)
+        other, along, away = nearest_edge(graph.take(number), xy)
+        above = under & (away < distance + _ABOVE)
+        edge, offset = np.where(above, number[other], edge), np.where(above, along, offset)
+        distance = np.where(above, away, distance)
+    return edge, offset, distance
 
 
 def _both_sides(graph: RoadGraph, edge: int, *, offset: float) -> list[Place]:

@@ -262,7 +262,9 @@ def test_a_replay_that_never_comes_near_the_scene_is_refused(scene, plain_drive,
 
 def test_tables_without_poses_are_refused(scene, tmp_path):
     (tmp_path / "x.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(InputError, match=r"neither a poses.csv nor a trajectory.csv"):
+    with pytest.raises(
+        InputError, match=r"has a, b; no timestamp, lon, lat, h, qx, qy, qz, qw; a CSV file is"
+    ):
         read_replay(tmp_path / "x.csv", scene.frame)
     with pytest.raises(RouteError, match="does not exist"):
         read_replay(tmp_path / "y.csv", scene.frame)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from geoscene.roadgraph import build_road_graph
 from geoscene.roadgraph.routing import turn_table, turns_back
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
-from lidar.motion.route import RouteOptions, lane_route, plan_route, random_edges
+from lidar.motion.random_route import random_edges
+from lidar.motion.route import RouteOptions, lane_route, plan_route
 
 FRAME = Frame.at(-76.3, 36.88)
 
@@ -70,13 +72,56 @@ def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
         assert graph.length[edges].sum() - begin - (graph.length[edges[-1]] - end) >= 300.0
 
 
-def test_service_roads_are_a_tenth_as_likely_to_start_on():
-    nodes = [(0, 0), (100, 0), (100, 100), (0, 100)]
-    kinds = np.repeat(["service", "residential"], [2, 6])
-    graph = dataclasses.replace(road_graph(nodes, [(0, 1), (1, 2), (2, 3), (3, 0)]), highway=kinds)
-    first = [int(random_edges(graph, seed=seed, metres=150.0)[0][0]) for seed in range(2000)]
-    minor = (graph.highway[first] == "service").mean()
-    assert minor == pytest.approx(0.2 / 6.2, abs=0.015)  # 4 sigma
+@given(st.integers(0, 2**64 - 1))
+@settings(max_examples=20, deadline=None)
+def test_seeds_that_follow_each_other_start_far_apart(seed):
+    """Eight starts on 2.4 km of streets, all on other blocks."""
+    graph = grid(4, 4)
+    places = []
+    for k in range(8):
+        edges, (begin, _) = random_edges(graph, seed=seed + k, metres=300.0)
+        line = shapely.LineString(graph.geometry[edges[0]][:, :2])
+        places.append(line.interpolate(begin))
+    gaps = [one.distance(other) for one, other in combinations(places, 2)]
+    assert min(gaps) > 20.0
+
+
+OTHERS = [
+    {"highway": "service"},
+    {"highway": "track"},
+    {"highway": "living_street"},
+    {"tunnel": True},
+    {"width": 1.5},
+]
+
+
+@pytest.mark.parametrize("other", OTHERS)
+def test_random_drives_start_and_end_on_public_streets_in_the_open(other):
+    """One street of the block is of another kind; where all are, drives start there all the same."""
+    nodes, pairs = [(0, 0), (100, 0), (100, 100), (0, 100)], [(0, 1), (1, 2), (2, 3), (3, 0)]
+    ((name, value),) = other.items()
+    plain = road_graph(nodes, pairs)
+    for count in (2, len(plain)):
+        column = getattr(plain, name).copy().astype(object)
+        column[:count] = value
+        typed = np.str_ if name == "highway" else getattr(plain, name).dtype
+        graph = dataclasses.replace(plain, **{name: column.astype(typed)})
+        walks = [random_edges(graph, seed=s, metres=150.0, body_width=1.8)[0] for s in range(50)]
+        first, last = ({int(walk[k]) for walk in walks} for k in (0, -1))
+        allowed = set(range(len(plain) if count == len(plain) else 2, len(plain))) or set(range(len(plain)))
+        assert first == allowed
+        assert last <= allowed
+
+
+def test_random_drives_do_not_start_below_roofs():
+    graph = grid(3, 3)
+    roofs = shapely.STRtree([shapely.box(-10, -10, 190, 30), shapely.box(60, 90, 90, 110)])
+    for seed in range(60):
+        edges, (begin, _) = random_edges(graph, seed=seed, metres=300.0, roofs=roofs)
+        place = shapely.LineString(graph.geometry[edges[0]][:, :2]).interpolate(begin)
+        assert not len(roofs.query(place, predicate="intersects"))
+    everywhere = shapely.STRtree([shapely.box(-1000, -1000, 1000, 1000)])
+    assert len(random_edges(graph, seed=1, metres=300.0, roofs=everywhere)[0])
 
 
 def test_a_random_drive_starts_where_the_map_is_left_after_it():
@@ -161,6 +206,36 @@ def test_waypoints_may_lie_on_one_street():
     assert len(route.edges) == 1
     np.testing.assert_allclose(route.line[[0, -1], 0], [80.0, 20.0], atol=0.01)
     assert (route.line[:, 1] > 1.0).all()  # westward, on the northern side
+
+
+def test_of_a_tunnel_and_a_street_above_it_a_waypoint_is_on_the_street():
+    nodes = [(0, 0), (200, 0), (0, 3), (200, 3), (0, 60), (200, 60)]
+    graph = road_graph(nodes, [(0, 1), (2, 3), (4, 5)])
+    graph = dataclasses.replace(graph, tunnel=np.repeat([True, False, True], 2))
+    above = plan_route(graph, FRAME, spec=[lat_lon(20, 0), lat_lon(180, 0)])
+    assert not graph.tunnel[above.edges].any()
+    far = plan_route(graph, FRAME, spec=[lat_lon(20, 60), lat_lon(180, 60)])
+    assert graph.tunnel[far.edges].all()
+
+
+def test_streets_that_are_not_connected_are_named_as_the_reason():
+    graph = road_graph([(0, 0), (200, 0), (0, 100), (200, 100)], [(0, 1), (2, 3)])
+    with pytest.raises(
+        RouteError, match=r"waypoint 2 .* the streets at the two are not connected in the map"
+    ):
+        plan_route(graph, FRAME, spec=[lat_lon(50, 0), lat_lon(50, 100)])
+
+
+def test_swapped_latitudes_and_longitudes_are_named_as_the_reason():
+    swapped = [lat_lon(50, 0)[::-1], lat_lon(200, 50)[::-1]]
+    with pytest.raises(RouteError, match=r"look swapped: write LAT,LON"):
+        plan_route(grid(3, 2), FRAME, spec=swapped)
+    east = Frame.at(139.7, 35.6)  # longitudes over 90 are no latitudes at all
+    lon, lat = east.to_geographic([0.0, 50.0], [0.0, 0.0])
+    with pytest.raises(RouteError, match=r"within 180; latitude and longitude look swapped"):
+        plan_route(grid(3, 2), east, spec=list(zip(lon, lat, strict=True)))
+    with pytest.raises(RouteError, match=r"m from the nearest drivable street, more than 50 m$"):
+        plan_route(grid(3, 2), FRAME, spec=[lat_lon(50, 0), lat_lon(50, 5000)])
 
 
 def test_waypoints_respect_one_way_streets_and_forbidden_turns():

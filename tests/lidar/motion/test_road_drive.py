@@ -1,0 +1,51 @@
+"""Drives on the roads of a scene: what is said about places that no drive reaches."""
+
+import pytest
+
+from geoscene.pipeline.build import build
+from geoscene.sources import read_osm
+from lidar.errors import RouteError
+from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
+
+NODES = {1: (0, 0), 2: (300, 0), 3: (0, 200), 4: (300, 200), 5: (150, -400), 6: (150, 600)}
+"""Metres east and north of 8° E, 50° N."""
+WAYS = {
+    (1, 2): {"highway": "residential"},
+    (3, 4): {"highway": "service", "access": "private"},
+    (5, 6): {"highway": "tertiary"},  # it leaves the scene at both ends
+}
+
+
+def lat_lon(x, y):
+    return 50 + y / 111_200, 8 + x / 71_700
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("roads")
+    parts = []
+    for number, (x, y) in NODES.items():
+        lat, lon = lat_lon(x, y)
+        parts.append(f'<node id="{number}" lat="{lat:.7f}" lon="{lon:.7f}" version="1"/>')
+    for number, (ends, tags) in enumerate(WAYS.items(), 1):
+        inner = "".join(f'<nd ref="{end}"/>' for end in ends)
+        inner += "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        parts.append(f'<way id="{number}" version="1">{inner}</way>')
+    (folder / "map.osm").write_text(f'<osm version="0.6">{"".join(parts)}</osm>', "utf-8")
+    south, west = lat_lon(-50, -50)
+    north, east = lat_lon(350, 300)
+    osm = read_osm(folder / "map.osm", bounds=(west, south, east, north))
+    return build(osm, folder / "scene")
+
+
+@pytest.mark.parametrize(
+    ("place", "says"),
+    [
+        ((50, 200), "road there is not connected to drivable streets: it is closed to the public, or"),
+        ((150, 250), "the street there leaves the scene; choose a place further inside"),
+        ((30, 100), r", more than 50 m$"),
+    ],
+)
+def test_a_waypoint_on_a_road_that_cannot_be_driven_says_why(scene, place, says):
+    with pytest.raises(RouteError, match=rf"waypoint 2 .* m from the nearest drivable street.*{says}"):
+        plan_road_drive(scene, [lat_lon(50, 0), lat_lon(*place)], options=RoadDriveOptions("car"))
