@@ -44,6 +44,8 @@ class Needed:
 
 _DRIVEN: Mapping[str, Needed] = {
     "buildings": Needed(("min_height",)),
+    "building_parts": Needed(("building", "min_height")),
+    "passages": Needed(("height",)),
     "landcover": Needed(("class",), ("parking",)),
     "road_surfaces": Needed(("class",), ("road", "lane_marking", "crossing", "parking", "sidewalk")),
     "structures": Needed(()),

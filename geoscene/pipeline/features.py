@@ -19,7 +19,7 @@ from geoscene.objects.wires import Wires
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene.geopackage import Layer
-from geoscene.structures import Structures
+from geoscene.structures import Passages, Structures
 
 
 def _columns(table: Any, names: str, **computed: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -135,6 +135,13 @@ def structure_layer(structures: Structures) -> Layer:
         piers=np.array([len(shape.geoms) for shape in structures.pier], np.int64),
     )
     return Layer("structures", structures.polygon, columns)
+
+
+def passage_layer(passages: Passages) -> Layer:
+    """Layer ``passages``: openings of buildings in plan, where ways run through them on the ground."""
+    return Layer(
+        "passages", passages.polygon, _columns(passages, "osm_id building width height height_source")
+    )
 
 
 def wire_layer(wires: Wires) -> Layer:

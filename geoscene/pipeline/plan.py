@@ -29,6 +29,7 @@ from geoscene.ground import (
 )
 from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
 from geoscene.ground.landcover import paved_fabric
+from geoscene.ground.partition import PRECISION
 from geoscene.ground.relief import Kerbs, Raised
 from geoscene.ground.standing import foundation_heights, standing_height
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
@@ -48,6 +49,7 @@ from geoscene.pipeline.features import (
     building_layers,
     furniture_layer,
     ground_layer,
+    passage_layer,
     road_layer,
     structure_layer,
     tree_layer,
@@ -75,15 +77,20 @@ from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
 from geoscene.structures import (
+    Passages,
     StructureOptions,
     Structures,
     buildings_over,
     find_openings,
+    find_passages,
     ground_below,
+    mark_passages,
     opening_layers,
+    passage_cuts,
     read_structures,
     within_extent,
 )
+from geoscene.structures.sheets import areal
 from geoscene.support.columns import squares_between
 from geoscene.support.problems import Problem
 from geoscene.support.progress import Progress
@@ -194,6 +201,7 @@ def make_plan(
     Raises FrameError or InputError if the CRS or the elevation files cannot be used.
     """
     problems: list[Problem] = list(osm.problems)
+    osm = _collect(problems, mark_passages(osm))
     frame = Frame.at(*_checked_centre(osm), crs=options.crs)
 
     progress("buildings", 0, total=0)
@@ -209,6 +217,7 @@ def make_plan(
 
     progress("roads", 0, total=0)
     roads = _plan_roads(osm, frame, options=options, terrain=terrain, problems=problems)
+    passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
     reach, area = Reach.of(options, roads.graph, frame=frame), None
     route = None if reach is None else reach.line
     if needed is not None:
@@ -218,15 +227,17 @@ def make_plan(
                 frame,
                 extent,
                 roads.graph if len(roads.graph) else None,
-                buildings.footprint[: buildings.count],
-                buildings.min_height[: buildings.count],
+                buildings.footprint[buildings.drawn],
+                buildings.min_height[buildings.drawn],
+                passages.polygon,
+                passages.height,
                 left_hand=roads.side == "left",
             )
         )
         reach = Reach.within(area)
 
     progress("ground", 0, total=0)
-    place = _Place(osm, frame, extent, terrain, buildings, roads, options)
+    place = _Place(osm, frame, extent, terrain, buildings, passages, roads, options)
     local = _collect(problems, _in_reach(place, reach))
     cover, surfaces, structures = local.cover, local.surfaces, local.structures
     trees, furniture, barriers = local.trees, local.furniture, local.barriers
@@ -237,6 +248,7 @@ def make_plan(
         kept = reach.rows(local.shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
         if needed is not None:
             kept["roads"] = np.arange(len(roads.graph))
+        kept["passages"] = np.flatnonzero(np.isin(passages.building, kept["buildings"]))
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
     base[standing] = base_heights(footprints[standing], local.height)
@@ -244,7 +256,8 @@ def make_plan(
     foot[standing] = foundation_heights(
         footprints[standing], base[standing], height=local.height, layers=ground.layers, levels=local.levels
     )
-    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures))
+    cuts = _collect(problems, passage_cuts(passages, buildings, base=base, height=local.height))
+    buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures, cuts=cuts))
 
     rooftops = None
     if options.relief == "full":
@@ -267,6 +280,8 @@ def make_plan(
     ]
     if len(local.wires):
         layers.append(wire_layer(local.wires))
+    if len(passages):
+        layers.append(passage_layer(passages))
     plan = BuildPlan(
         frame=frame,
         terrain=terrain,
@@ -373,6 +388,7 @@ class _Place:
     extent: Bounds
     terrain: Terrain
     buildings: Buildings
+    passages: Passages
     roads: _Roads
     options: BuildOptions
 
@@ -453,7 +469,16 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     openings = find_openings(structures, height, area=area)
 
     cover, surfaces, pads = _collect(
-        problems, _surfaces(osm, frame, extent=extent, buildings=buildings, made=made, only=options.only)
+        problems,
+        _surfaces(
+            osm,
+            frame,
+            extent=extent,
+            buildings=buildings,
+            passages=place.passages,
+            made=made,
+            only=options.only,
+        ),
     )
     found = _collect(problems, _objects(osm, frame, extent=extent, options=options))
     strung = options.relief != "off" and "furniture" in options.only
@@ -468,6 +493,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             **{name: count for name, (_, _, count) in found.items()},
             "structures": len(structures),
             **({"wires": len(wires)} if len(wires) else {}),
+            **({"passages": len(place.passages)} if len(place.passages) else {}),
         }
     )
     cover, surfaces = (
@@ -599,6 +625,7 @@ def _surfaces(
     *,
     extent: Bounds,
     buildings: Buildings,
+    passages: Passages,
     made: RoadSurfaces,
     only: Collection[str],
 ) -> tuple[tuple[Layers, Layers, Layers], list[Problem]]:
@@ -622,13 +649,31 @@ def _surfaces(
         source=surfaces.source,
         feature=surfaces.number,
     )
-    on_ground = footprints.copy()
-    on_ground[buildings.min_height[:count] >= _RAISED] = None
     pads = building_pads(
-        on_ground, osm_id=buildings.osm_id[:count].astype(str), feature=np.arange(count, dtype=np.int32)
+        _on_ground(buildings, passages),
+        osm_id=buildings.osm_id[:count].astype(str),
+        feature=np.arange(count, dtype=np.int32),
     )
     cover = Layers.concatenate(parts)
     return (replace(cover, feature=np.arange(len(cover), dtype=np.int32)), paved, pads), problems
+
+
+def _on_ground(buildings: Buildings, passages: Passages) -> NDArray[np.object_]:
+    """What buildings (count,) take of the ground, or None: not what is below raised parts or in passages."""
+    shapes = buildings.footprint[: buildings.count].copy()
+    low = buildings.drawn & (buildings.min_height < _RAISED)
+    raised = np.unique(buildings.outline[buildings.drawn & ~low])
+    of_low = np.flatnonzero(low)
+    of_low = of_low[np.argsort(buildings.outline[of_low], kind="stable")]
+    first, last = (np.searchsorted(buildings.outline[of_low], raised, side=s) for s in ("left", "right"))
+    for k, a, b in zip(raised.tolist(), first.tolist(), last.tolist(), strict=True):
+        whole = shapely.union_all(buildings.footprint[of_low[a:b]], grid_size=PRECISION)
+        shapes[k] = areal(shapely.intersection(shapes[k], whole, grid_size=PRECISION))
+    for k in np.unique(passages.building).tolist():
+        taken = shapely.union_all(passages.polygon[passages.building == k])
+        shapes[k] = areal(shapely.difference(shapes[k], taken, grid_size=PRECISION))
+    shapes[shapely.is_empty(shapes)] = None
+    return shapes
 
 
 def _together(polygons: NDArray[np.object_], first: NDArray[np.int64]) -> NDArray[np.object_]:

@@ -45,8 +45,10 @@ class RoadMap:
     frame      : frame of the scene
     bounds     : (xmin, ymin, xmax, ymax) of its ground in scene metres
     graph      : road graph with heights; None without drivable roads
-    footprints : polygons (k,) of the buildings, scene metres
+    footprints : polygons (k,) of the buildings and their parts, scene metres
     min_height : (k,) metres from the ground to the underside of each
+    passages   : polygons (p,) of passages through buildings
+    passage_height : (p,) metres of free height in each
     left_hand  : traffic keeps left
     """
 
@@ -56,6 +58,8 @@ class RoadMap:
     graph: RoadGraph | None
     footprints: NDArray[np.object_]
     min_height: Float
+    passages: NDArray[np.object_]
+    passage_height: Float
     left_hand: bool
 
 

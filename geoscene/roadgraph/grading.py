@@ -38,11 +38,12 @@ _CLEAR = {
 
 def find_obstacles(osm: OsmData, frame: Frame) -> Obstacles:
     """Railways and waterways on the ground that bridges must clear."""
-    ways, lines = way_lines([way for way in osm.ways if _required_clearance(way.tags) is not None], frame)
-    return Obstacles(lines, np.array([_required_clearance(way.tags) for way in ways], float))
+    ways, lines = way_lines([way for way in osm.ways if required_clearance(way.tags) is not None], frame)
+    return Obstacles(lines, np.array([required_clearance(way.tags) for way in ways], float))
 
 
-def _required_clearance(tags: Tags) -> float | None:
+def required_clearance(tags: Tags) -> float | None:
+    """Metres of free height that a railway or waterway on the ground requires; None for other ways."""
     if place_and_layer(tags)[0] != 0:
         return None
     for key, heights in _CLEAR.items():

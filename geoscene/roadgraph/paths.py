@@ -77,11 +77,10 @@ def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
     kind = ["sidewalk" if w.tags.get("footway") == "sidewalk" else w.tags["highway"] for w in ways]
     width, source, material = [], [], []
     for way, name in zip(ways, kind, strict=True):
-        given = parse_length(way.tags.get("width"))
-        usable = given is not None and 0.3 <= given <= 30
+        metres, width_source = path_width(way.tags)
         made_of, material_source = surface_material(way.tags, _PATHS[name][1])
-        width.append(given if usable else _PATHS[name][0])
-        source.append(f"{'width' if usable else 'default'}/{material_source}")
+        width.append(metres)
+        source.append(f"{width_source}/{material_source}")
         material.append(made_of)
     bands = shapely.buffer(lines, np.array(width, float) / 2, quad_segs=4)
     return SurfaceRows.of(
@@ -93,6 +92,18 @@ def path_surfaces(osm: OsmData, frame: Frame) -> SurfaceRows:
         source=source,
         **_place_and_level([way.tags for way in ways]),
     )
+
+
+def path_width(tags: Tags) -> tuple[float, str]:
+    """Width of a path in metres, 0 for other ways, and its source (``width``, ``est_width``, ``default``)."""
+    if not _is_path(tags):
+        return 0.0, "default"
+    for key in ("width", "est_width"):
+        metres = parse_length(tags.get(key))
+        if metres is not None and 0.3 <= metres <= 30:
+            return metres, key
+    name = "sidewalk" if tags.get("footway") == "sidewalk" else tags["highway"]
+    return _PATHS[name][0], "default"
 
 
 def _is_path(tags: Tags) -> bool:

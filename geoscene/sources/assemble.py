@@ -214,7 +214,8 @@ def _existing(elements: Elements, near: Bools, *, bounds: Bounds | None) -> tupl
     def existing(name: str, tags: Tags, *, inside: bool) -> Tags:
         kept, absent = existing_tags(tags)
         if absent and inside:
-            problems.append(Problem(name, kind_of(tags), "dropped", "does-not-exist", absent))
+            kind = "node" if name.startswith("node") else kind_of(tags)
+            problems.append(Problem(name, kind, "dropped", "does-not-exist", absent))
         return kept
 
     west, south, east, north = bounds or (-np.inf, -np.inf, np.inf, np.inf)

@@ -16,6 +16,7 @@ from geoscene.classes import Class, materials
 from geoscene.geometry import polylines
 from geoscene.ground.layers import PADS, Layers
 from geoscene.roadgraph.surface_rows import in_reach
+from geoscene.structures.passages import PassageCuts
 from geoscene.structures.pieces import NEAR
 from geoscene.structures.sheets import areal
 from geoscene.structures.table import THINNEST, StructureOptions, Structures, surface_heights
@@ -207,16 +208,18 @@ def buildings_over(
     *,
     foot: Float,
     table: Structures,
+    cuts: PassageCuts | None = None,
     options: StructureOptions | None = None,
 ) -> tuple[Buildings, list[Problem]]:
-    """The buildings, those on a tunnel or a road bridge with a passage, and the rows of those.
+    """The buildings with passages, those on a tunnel or a road bridge, too, and the rows of those.
 
-    Passages reach from below a building up to the tunnel's roof or the bridge's free height, but leave parts
-    that end below the road. A bridge counts where its centre line lies within the building, not where its
-    edge touches it; footbridges do not count, they lead into buildings.
+    Those of tunnels and bridges reach from below a building up to the tunnel's roof or the bridge's free
+    height, but leave parts that end below the road. A bridge counts where its centre line lies within the
+    building, not where its edge touches it; footbridges do not count, they lead into buildings.
 
     base : (count,) z in metres of each building's base, NaN for buildings that are not looked at
     foot : (count,) z in metres of the lower end of its walls
+    cuts : passages of ways on the ground
     """
     options = options or StructureOptions()
     rows = np.flatnonzero(buildings.drawn & ~np.isnan(base[buildings.outline]))
@@ -239,20 +242,27 @@ def buildings_over(
     under = np.where(grounded, foot[buildings.outline[row]], stands + buildings.min_height[row])
     top = stands + buildings.height[row]
     hit &= (high > under) & (low < top)
-    if not hit.any():
-        return buildings, []
     corridor = table.polygon[road]
     for k in np.flatnonzero((high > under) & (low >= top)).tolist():  # below the road
         same = (road == road[k]) & (buildings.outline[row] == buildings.outline[row[k]])
         corridor[same] = shapely.difference(corridor[same], buildings.footprint[row[k]])
     corridor = corridor[hit]
-    clear = np.ceil((high - stands)[hit] / _RISE - 1e-3) * _RISE
-    return _with_passages(buildings, row[hit], corridor=corridor, clear=clear, tunnel=tunnel[hit])
+    clear, row, tunnel = (high - stands)[hit], row[hit], tunnel[hit]
+    problems = [
+        Problem(str(buildings.osm_id[k]), "building", "repaired", f"over-{what}", f"stands over a {what}")
+        for what in ("tunnel", "bridge")
+        for k in np.unique(buildings.outline[row[tunnel == (what == "tunnel")]]).tolist()
+    ]
+    if cuts is not None:
+        row, clear = np.append(row, cuts.row), np.append(clear, cuts.clear)
+        corridor = np.append(corridor, cuts.corridor)
+    clear = np.ceil(clear / _RISE - 1e-3) * _RISE
+    return _with_passages(buildings, row, corridor=corridor, clear=clear), problems
 
 
 def _with_passages(
-    buildings: Buildings, row: Ints, *, corridor: NDArray[np.object_], clear: Float, tunnel: Bools
-) -> tuple[Buildings, list[Problem]]:
+    buildings: Buildings, row: Ints, *, corridor: NDArray[np.object_], clear: Float
+) -> Buildings:
     """Buildings with passages in rows (k,): corridors (k,) up to ``clear`` (k,) metres over the base."""
     passages = buildings.passages.copy()
     # what would be too thin over a road is left out
@@ -269,12 +279,7 @@ def _with_passages(
         ]
         if shapely.area(shapely.difference(buildings.footprint[mine], gone)).max() > _LEAST:
             passages[k] = tuple(cuts)
-    problems = [
-        Problem(str(buildings.osm_id[k]), "building", "repaired", f"over-{what}", f"stands over a {what}")
-        for what in ("tunnel", "bridge")
-        for k in np.unique(of[tunnel == (what == "tunnel")]).tolist()
-    ]
-    return replace(buildings, passages=passages), problems
+    return replace(buildings, passages=passages)
 
 
 def _close_gaps(corridors: NDArray[np.object_]) -> shapely.Geometry:

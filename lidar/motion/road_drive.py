@@ -119,17 +119,46 @@ def _name(scene: Scene | RoadMap) -> str:
     return str(scene.path) if isinstance(scene, Scene) else scene.name
 
 
-def _buildings(scene: Scene) -> tuple[NDArray[np.object_], Float]:
-    """Footprints (k,) in scene metres of buildings, and metres (k,) from the ground to their lower ends."""
-    if not scene.table_length("buildings"):
-        return np.empty(0, object), np.empty(0)
-    layer = scene.features("buildings")
-    return layer.geometry, np.asarray(layer.columns["min_height"], float)
+_Buildings = tuple[NDArray[np.object_], Float, NDArray[np.object_], Float]
+"""Footprints (k,) in scene metres of buildings and parts, metres (k,) from the ground to their lower ends,
+passages (p,) through them, and the free height (p,) of these."""
 
 
-def _obstacles(footprints: NDArray[np.object_], min_height: Float) -> NDArray[np.object_]:
-    """Footprints of buildings without a passage below."""
-    return footprints[min_height < _HEADROOM]
+def _buildings(scene: Scene) -> _Buildings:
+    """The buildings of a scene in plan."""
+    tables = [scene.features(name) for name in ("buildings", "building_parts") if scene.table_length(name)]
+    if not tables:
+        return np.empty(0, object), np.empty(0), np.empty(0, object), np.empty(0)
+    parted = np.concatenate([table.columns["building"] for table in tables[1:]] or [np.empty(0, np.int64)])
+    whole = ~np.isin(tables[0].columns["feature"], parted)
+    kept = [whole, *(np.ones(len(table), np.bool_) for table in tables[1:])]
+    footprints, low = (
+        np.concatenate([column[rows] for column, rows in zip(columns, kept, strict=True)])
+        for columns in (
+            [table.geometry for table in tables],
+            [np.asarray(table.columns["min_height"], float) for table in tables],
+        )
+    )
+    if not scene.table_length("passages"):
+        return footprints, low, np.empty(0, object), np.empty(0)
+    passages = scene.features("passages")
+    return footprints, low, passages.geometry, np.asarray(passages.columns["height"], float)
+
+
+def _obstacles(buildings: _Buildings, *, height: float) -> NDArray[np.object_]:
+    """What buildings take of the ground for vehicles of a height: without what these pass under."""
+    footprints, min_height, passages, free = buildings
+    blocked = footprints[min_height < _HEADROOM]
+    passages = passages[free > height]
+    of, which = shapely.STRtree(passages).query(blocked, predicate="intersects")
+    for k in np.unique(of).tolist():
+        blocked[k] = shapely.difference(blocked[k], shapely.union_all(passages[which[of == k]]))
+    return blocked
+
+
+def building_obstacles(scene: Scene, *, height: float) -> NDArray[np.object_]:
+    """Footprints (k,) in scene metres of buildings without passages for vehicles of ``height`` metres."""
+    return _obstacles(_buildings(scene), height=height)
 
 
 def road_map(scene: Scene) -> RoadMap:
@@ -169,17 +198,17 @@ def plan_road_drive(
     whole = scene.road_graph()
     kept = edges_on_tiles(whole, scene)
     graph = whole if kept.all() else whole.take(kept)
-    footprints, min_height = _buildings(scene)
+    vehicle, buildings = load_vehicle(options.vehicle), _buildings(scene)
     progress("planning", 0, total=0)
     try:
         _, path = plan_route_and_path(
             graph,
             scene.frame,
             spec=spec,
-            vehicle=load_vehicle(options.vehicle),
+            vehicle=vehicle,
             options=options.route_options(spec),
-            obstacles=_obstacles(footprints, min_height),
-            roofs=shapely.STRtree(footprints),
+            obstacles=_obstacles(buildings, height=vehicle.height),
+            roofs=shapely.STRtree(buildings[0]),
             ground=road_surface(scene),
         )
     except RouteError as error:
@@ -221,13 +250,17 @@ def road_course(roads: RoadMap, spec: Spec, *, options: RoadDriveOptions) -> tup
     Raises RouteError as `plan_road_drive` does.
     """
     tried: list[Float] = []
+    vehicle = load_vehicle(options.vehicle)
     _, path = plan_route_and_path(
         graph_on_tiles(roads.graph, roads),
         roads.frame,
         spec=spec,
-        vehicle=load_vehicle(options.vehicle),
+        vehicle=vehicle,
         options=options.route_options(spec),
-        obstacles=_obstacles(roads.footprints, roads.min_height),
+        obstacles=_obstacles(
+            (roads.footprints, roads.min_height, roads.passages, roads.passage_height),
+            height=vehicle.height,
+        ),
         roofs=shapely.STRtree(roads.footprints),
         tried=lambda route: tried.append(route.line[:, :2]),
     )

@@ -16,6 +16,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from lidar.geometry.poses import Trajectory
+from lidar.motion.road_drive import building_obstacles
 from lidar.motion.vehicle import DRY, RoadConditions, Vehicle
 from lidar.traffic.junctions import JunctionPlan, junction_plan
 from lidar.traffic.lanes import Lanes, lane_shift, lanes_of
@@ -30,7 +31,7 @@ from lidar.traffic.trips import Trip, vehicle_trips
 from lidar.world.actors import Actors, first_feature, join_actors
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
-_HEADROOM = 2.5  # metres, minimum height of a building part above a passage
+_HEADROOM = 2.5  # metres, height of vehicles that pass through buildings
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
 
@@ -258,10 +259,7 @@ def _union(
 def _obstacles(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
     """Footprints (k,) in an area of posts, trunks and buildings without a passage below."""
     parts: list[NDArray[np.object_]] = [np.empty(0, object)]
-    buildings = _layer(scene, "buildings")
-    if buildings is not None:
-        low = np.asarray(buildings.columns["min_height"], float)
-        parts.append(buildings.geometry[low < _HEADROOM])
+    parts.append(building_obstacles(scene, height=_HEADROOM))
     near = shapely.intersects(area, shapely.box(*scene.tile_boxes.T))
     for i, j in itertools.compress(scene.tile_indices, near):
         tile = scene.tile(i, j)

@@ -19,7 +19,7 @@ from geoscene.buildings.facades.description import (
 from geoscene.buildings.facades.doors import Sheet, facing_street, put_guessed_doors, put_mapped_doors
 from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.solids import are_simple
-from geoscene.buildings.facades.walls import Elevations, find_walls
+from geoscene.buildings.facades.walls import Elevations, find_walls, in_passages
 from geoscene.geometry.mesh import Mesh
 from geoscene.support.columns import nth
 from geoscene.support.splitmix import uniform_at
@@ -67,9 +67,11 @@ def wall_relief(
         return Layout(WallRelief.empty(), Attached(mesh, np.empty(0, np.bool_), {}), {})
     walls, of_face = find_walls(mesh)
     simple = are_simple(mesh, of_face, count=len(walls))
-    at = Elevations.of(walls, setting, mesh=mesh, of_face=of_face, usable=simple, base=base, height=height)
+    inside = simple & in_passages(walls, setting.buildings, base=base)
+    usable = simple & ~inside
+    at = Elevations.of(walls, setting, mesh=mesh, of_face=of_face, usable=usable, base=base, height=height)
     walls, grids, cells = at.walls, at.grids, at.cells
-    planes = {"touching": int((~simple).sum()), "small": int(simple.sum()) - len(walls)}
+    planes = {"touching": int((~simple).sum()), "small": int(usable.sum()) - len(walls)}
     chosen, parts = _choose(at, guess=guess)
     parts, touching = without_touching(parts, mesh)
     openings, index = make_openings(chosen, at.styles, wall=cells.wall)
@@ -92,7 +94,7 @@ def wall_relief(
         grids.count.astype(np.int32),
         (np.cumsum(sizes) - sizes).astype(np.int32),
     )
-    planes["blank"] = int((~kept).sum())
+    planes["blank"] = int((~kept).sum() + inside.sum())
     left = {f"walls_{why}": n for why, n in planes.items()}
     counts = {"walls": len(walls), **left, **parts.counts, "parts_left_out": touching}
     relief = WallRelief(facades, index.astype(np.int32), openings, of_face.astype(np.int32))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.facades.setting import FacadeSetting
 from geoscene.buildings.facades.styles import Styles
+from geoscene.buildings.table import Buildings
 from geoscene.geometry.mesh import WALL, Mesh
 from geoscene.geometry.watertight import edge_uses, weld
 from geoscene.support.columns import Columns, nth
@@ -21,6 +22,9 @@ _UPRIGHT = 1e-3
 
 _TURN = 1e-3
 """Radians between the bearings of faces of one plane, above the error of corners on a grid of 0.1 mm."""
+
+_BEFORE = 0.15
+"""Metres before a wall at which a passage is looked for; passages reach less beyond facades."""
 
 _BESIDE = 0.3
 """Metres outside a wall at which the ground beside it is looked up."""
@@ -70,6 +74,24 @@ def find_walls(mesh: Mesh) -> tuple[FacadeWalls, NDArray[np.int32]]:
     )
     of_face[face] = number
     return walls, of_face
+
+
+def in_passages(walls: FacadeWalls, buildings: Buildings, *, base: Float) -> Bools:
+    """Whether walls (k,) are those of passages through their building, which have no openings.
+
+    base : (count,) z of each building's base
+    """
+    inside = np.zeros(len(walls), np.bool_)
+    for building in np.unique(walls.feature).tolist():
+        passages = buildings.passages[building]
+        if not len(passages):
+            continue
+        mine = np.flatnonzero(walls.feature == building)
+        before = shapely.points(walls.points(mine, walls.size[mine, 0] / 2, out=_BEFORE))
+        top = walls.foot[mine, 2] + walls.size[mine, 1] - base[building]
+        for polygon, height in passages:
+            inside[mine] |= (top < height + _BEFORE) & shapely.intersects(polygon, before)
+    return inside
 
 
 def _none() -> FacadeWalls:

@@ -392,6 +392,26 @@ def test_windows_stay_out_of_a_passage_that_runs_close_behind_their_wall():
     assert lowest[1] > 7.0
 
 
+def test_walls_of_a_passage_have_no_openings_and_facades_none_over_it():
+    shape, street = shapely.box(0, 0, 30, 12), [(-60, -8), (60, -8)]
+    passage = shapely.box(10, -0.1, 20, 12.1)
+    _, _, layout = facades_of(house(7, shape, building="apartments", height="15"), street=street,
+                              passages=[(passage, 4.5)])  # fmt: skip
+    relief = layout.relief
+    foot, tangent = relief.facades.foot, relief.facades.tangent
+    inner = (foot[:, 0] > 9) & (foot[:, 0] < 21) & (np.abs(tangent[:, 0]) < 0.01)
+    assert not inner.any()
+    over = 0
+    for wall, _, _, box, _ in panels_of(relief):
+        if abs(tangent[wall, 0]) < 0.99:
+            continue
+        x = foot[wall, 0] + box[[0, 2]] * tangent[wall, 0]
+        if x.max() > 10 and x.min() < 20:
+            over += 1
+            assert foot[wall, 2] + box[1] > 4.5
+    assert over
+
+
 def test_windows_and_doors_of_a_modelled_facade_are_marked():
     shape = shapely.box(0, 0, 20, 10)
     _, mesh, layout = facades_of(house(1, shape, building="house", height="6"), street=[(-30, -8), (40, -8)])
