@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +19,7 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.formats import format_of
 from lidar.dataset.layout import Dataset, Paths, reading_file
-from lidar.dataset.signable import is_truth, signed_files
+from lidar.dataset.signable import SignedFiles, signed_files
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.tools.integrity.digests import (
     SECTORS,
@@ -82,6 +84,8 @@ def write_chain(dataset: Dataset, signer: Signer, *, progress: Progress) -> tupl
     """Write the hash chain over the files of a dataset; frames, files, and the bytes of the signature."""
     signer.sign(b"")  # a key that cannot sign is refused before anything is written
     files, folder = signed_files(dataset), Paths(dataset.path).integrity
+    if files.links:
+        raise DatasetError(f"{dataset.path / files.links[0]}: is a link; signed data hold copies, replace it")
     folder.mkdir(exist_ok=True)
     Paths(dataset.path).chain.unlink(missing_ok=True)
     heads: dict[str, tuple[int, bytes]] = {}
@@ -99,7 +103,7 @@ def write_chain(dataset: Dataset, signer: Signer, *, progress: Progress) -> tupl
             done += 1
         write_atomically(folder / f"{sensor}.csv", links_bytes(links))
         heads[sensor] = len(links), head
-    tables = {name: file_sha256(dataset.path / name) for name in files.others}
+    tables = {name: _sha256(dataset.path, name) for name in files.others}
     document = {
         "schema": SCHEMA,
         "algorithm": signer.algorithm,
@@ -162,6 +166,7 @@ def verify_chain(dataset: Dataset, signer: Signer, *, progress: Progress) -> Cha
         findings.append(Finding("signature is not valid", path.relative_to(dataset.path).as_posix(), detail))
     files = signed_files(dataset)
     findings += _tables_found(dataset, tables, present=files.others)
+    findings += _not_signed(dataset, files, sensors=heads)
     frames = 0
     for sensor, head in heads.items():
         found, count = _frames_found(
@@ -176,11 +181,36 @@ def _tables_found(dataset: Dataset, signed: dict[str, bytes], *, present: list[s
     found = [Finding("added", name) for name in present if name not in signed]
     for name, sha256 in signed.items():
         path = _inside(dataset, name)
-        if path is None or not path.is_file():
+        if path is None or not (path.is_dir() if name.endswith("/") else path.is_file()):
             found.append(Finding("missing", name))
-        elif file_sha256(path) != sha256:
+        elif _sha256(dataset.path, name) != sha256:
             found.append(Finding("changed", name))
     return found
+
+
+def _sha256(folder: Path, name: str) -> bytes:
+    """SHA-256 of a file; of an empty folder, whose name ends with a slash, that of no bytes."""
+    return hashlib.sha256(b"").digest() if name.endswith("/") else file_sha256(folder / name)
+
+
+def _not_signed(dataset: Dataset, files: SignedFiles, *, sensors: Collection[str]) -> list[Finding]:
+    """Links, files of other sensors than the signed ones, and files in the folder of signatures."""
+    found = [Finding("link", name, f"leads to {(dataset.path / name).readlink()}") for name in files.links]
+    added = [
+        name
+        for sensor, frames in files.frames.items()
+        if sensor not in sensors
+        for names in frames.values()
+        for name in names
+    ]
+    paths, own = dataset.paths, set[Path]()
+    for sensor in sensors:
+        own.add(paths.integrity / f"{sensor}.csv")
+        with suppress(LidarError):  # a list that cannot be read is a finding of its own
+            links = read_links(paths.integrity / f"{sensor}.csv")
+            own |= {frame_file(paths.integrity, sensor, frame=one.frame) for one in links}
+    added += [n for n in files.lists if dataset.path / n not in own | {paths.chain}]
+    return found + [Finding("added", name) for name in added]
 
 
 def _inside(dataset: Dataset, name: str) -> Path | None:
@@ -248,7 +278,7 @@ def _files_found(
     for frame, names in files.items():
         own = signed[frame].sha256 if frame in signed else {}
         for name in names:
-            if name not in own and not is_truth(Path(name)):
+            if name not in own:
                 yield Finding("added", name, sensor=sensor, frame=frame)
     for done, (frame, digests) in enumerate(signed.items()):
         progress(f"verify {sensor}", done, total=len(signed))

@@ -162,6 +162,64 @@ def test_missing_added_and_exchanged_frames_are_named(copy):
     }
 
 
+@pytest.mark.parametrize(
+    "place",
+    [
+        "velodyne_9/000000.bin",
+        "labels_x/000000.label",
+        "samples/LIDAR_EXTRA/a.pcd.bin",
+        "top/pcd_9/000000.pcd",
+        "top/truth/000000.npz",  # the drive has no stages, and so no truth
+        "top/truth/000000.pcd",
+        "truth/gnss.csv",
+        "gnss.truth.csv",
+        "integrity/top/000000.pcd",
+        "integrity/note.txt",
+    ],
+)
+def test_any_file_that_is_not_signed_is_named(copy, place):
+    (copy / place).parent.mkdir(parents=True, exist_ok=True)
+    (copy / place).write_bytes(b"new")
+    assert [f.to_text() for f in findings(copy)] == [f"{place}: added"]
+
+
+def test_links_and_empty_folders_are_named(copy, tmp_path):
+    outside = tmp_path / "outside"
+    (copy / "top").rename(outside)
+    (copy / "top").symlink_to(outside)
+    (copy / "gnss.csv").rename(tmp_path / "gnss.csv")
+    (copy / "gnss.csv").symlink_to(tmp_path / "gnss.csv")
+    (copy / "more").mkdir()
+    (copy / "extra").symlink_to(outside)
+    assert {f.to_text() for f in findings(copy)} >= {
+        f"top: link (leads to {outside})",
+        f"gnss.csv: link (leads to {tmp_path / 'gnss.csv'})",
+        f"extra: link (leads to {outside})",
+        "more/: added",
+    }
+
+
+def test_data_with_links_are_not_signed_and_empty_folders_are(plain, tmp_path):
+    shutil.copytree(plain, tmp_path / "a")
+    (tmp_path / "a/more").mkdir()
+    sign_dataset(tmp_path / "a", None, signer=HMAC)
+    assert not findings(tmp_path / "a")
+    (tmp_path / "a/more").rmdir()
+    assert [f.to_text() for f in findings(tmp_path / "a")] == ["more/: missing"]
+    (tmp_path / "a/more").symlink_to(tmp_path)
+    with pytest.raises(DatasetError, match="more: is a link"):
+        sign_dataset(tmp_path / "a", None, signer=HMAC, overwrite=True)
+
+
+def test_truth_of_stages_is_not_signed(plain, tmp_path):
+    out = tmp_path / "lossy"
+    run_program("lidar", "apply", plain, "--stage", "dropped_packets:loss=0.1,burst=3", "-o", out)
+    assert (out / "top/truth/000000.npz").is_file()
+    sign_dataset(out, None, signer=HMAC)
+    shutil.rmtree(out / "top/truth")
+    assert not findings(out)
+
+
 def test_a_frame_that_is_cut_out_of_data_and_list_is_noticed(copy):
     table = copy / "integrity/top.csv"
     lines = table.read_text().splitlines()
