@@ -51,6 +51,9 @@ class SceneFormatError(InputError):
 BUILD_AGAIN = "build the scene again with `overwrite`"
 """What to do about a damaged file of a scene."""
 
+DIFFERS = f"differs from what the build wrote: damaged, edited or of another scene; {BUILD_AGAIN}"
+"""Fault of a file of a scene whose digest is not the stated one, and its remedy."""
+
 
 class MissingExtraError(InputError, ImportError):
     """An optional dependency that is not installed."""

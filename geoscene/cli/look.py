@@ -41,8 +41,9 @@ def info(
 
 
 def validate(scene: Path, /, *, json: bool = False) -> int:
-    """Check all solids and surfaces of a scene; exit code 1 if one has a fault.
+    """Check all files, solids and surfaces of a scene; exit code 1 if one has a fault.
 
+    A file is as the build wrote it: neither damaged nor edited, nor of another scene.
     A solid is closed, oriented and of positive volume, its faces meet in common edges and vertices only, and
     no two of its vertices are within 1 mm. In a surface, such as a road, no two vertices are
     within 1 mm, no face is a line and no edge has three faces.
@@ -54,6 +55,7 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
     json
         Print the result as JSON.
     """
+    from geoscene.errors import DIFFERS  # noqa: PLC0415
     from geoscene.scene.layout import open_scene, using  # noqa: PLC0415
     from geoscene.scene.validate import check_scene  # noqa: PLC0415
 
@@ -62,6 +64,8 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
     if json:
         print_json(report)
     else:
+        for name in report["changed"]:
+            print(f"{scene}/{name}: {DIFFERS}")
         for row in report["broken"]:
             print(f"{row['osm_id']} (feature {row['feature']}): {row['fault']}")
         valid = report["solids"] - len(report["broken"])
@@ -72,7 +76,7 @@ def validate(scene: Path, /, *, json: bool = False) -> int:
             print(f"{row['class']}{of} in tile {i}, {j}: {row['fault']}")
         valid = report["surfaces"] - len(report["broken_surfaces"])
         print(f"{report['surfaces']} surfaces, {valid} without faults")
-    return FAILURE if report["broken"] or report["broken_surfaces"] else 0
+    return FAILURE if report["changed"] or report["broken"] or report["broken_surfaces"] else 0
 
 
 def export(

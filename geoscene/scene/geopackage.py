@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
 from geoscene.geometry.frames import Frame
+from geoscene.support.digests import short
 from geoscene.support.files import atomic_path, not_written
 
 _TYPES: Mapping[str, Any] = {
@@ -105,10 +107,40 @@ def open_geopackage(
                 )
 
             yield append
+            _state_no_writer(part)
     except (DataSourceError, DataLayerError) as error:
         raise not_written(path, error) from error
     finally:
         pyogrio.set_gdal_config_options(before)
+
+
+_HEADER = {18: b"\1\1", 24: (1).to_bytes(4), 92: (1).to_bytes(4) + (3_000_000).to_bytes(4)}
+"""Bytes of SQLite's header that programs change which only open a file, by place: journal mode, counter of
+changes, counter and version of the library of the last one (SQLite's file format, 1.3)."""
+
+
+def _state_no_writer(path: Path) -> None:
+    """Write constants into the header, so that the same rows give the same bytes with any library."""
+    with path.open("r+b") as file:
+        for place, value in _HEADER.items():
+            file.seek(place)
+            file.write(value)
+
+
+def database_digest(path: Path) -> str:
+    """Digest of a GeoPackage as it was written, also if a program has opened it since; empty if missing."""
+    found = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            head = bytearray(file.read(100))
+            for place, value in _HEADER.items():
+                head[place : place + len(value)] = value
+            found.update(head)
+            while block := file.read(2**20):
+                found.update(block)
+    except OSError:
+        return ""
+    return short(found)
 
 
 def write_geopackage(path: Path, layers: Sequence[Layer], *, frame: Frame, indexed: bool = True) -> None:

@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 import shapely
 
-from geoscene.errors import BUILD_AGAIN, GeosceneError, InputError, SceneFormatError, reading
+from geoscene.errors import BUILD_AGAIN, DIFFERS, GeosceneError, InputError, SceneFormatError, reading
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
 from geoscene.objects.forests import Forests
 from geoscene.roadgraph import RoadGraph, read_graphml
-from geoscene.scene.geopackage import Layer, Schema, read_layer, read_schema
+from geoscene.scene.geopackage import Layer, Schema, database_digest, read_layer, read_schema
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.support.digests import digest, file_digest, value_digest
 from geoscene.support.files import write_atomically
@@ -254,9 +254,11 @@ class Scene(Previewed):
     def tile(self, i: int, j: int, *, forests: bool = True) -> Tile:
         """Tile (i, j) with the trees of its forests, or without them for a reader of the mesh alone.
 
-        Raises SceneFormatError if it is missing or damaged.
+        Raises SceneFormatError if it is missing, damaged or another one than the build wrote.
         """
-        tile = read_tile(self.files.tile(i, j))
+        path = self.files.tile(i, j)
+        stated = self._tile_digests
+        tile = read_tile(path, stated=None if stated is None else stated.get(path.name, ""))
         if self.modelled and tile.relief is not None:
             from geoscene.buildings.facades.solids import relief_mesh  # noqa: PLC0415  (0.1 s)
 
@@ -266,6 +268,29 @@ class Scene(Previewed):
         box = np.array([i, j, i + 1, j + 1]) * self.tile_size  # no forest is on a larger one
         low, high = np.maximum(box[:2], self.bounds[:2]), np.minimum(box[2:], self.bounds[2:])
         return with_forests(tile, self.forests, box=(*low, *high))
+
+    @functools.cached_property
+    def _tile_digests(self) -> dict[str, str] | None:
+        """Digest of each tile by its file's name; None for a manifest that states no reports of tiles."""
+        path = self.files.tile_reports
+        if path.name not in self.manifest.get("files", {}):
+            return None
+        with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
+            return _tile_digests(self._verified(path))
+
+    def _verified(self, path: Path) -> Path:
+        """A file that has the digest which the manifest states; raises SceneFormatError for another one."""
+        stated = self.manifest.get("files", {}).get(path.name)
+        if path not in self._verified_files and stated is not None:
+            if content_digest(path) != stated:
+                fault = DIFFERS if path.exists() else f"is missing; {BUILD_AGAIN}"
+                raise SceneFormatError(f"{path}: {fault}")
+            self._verified_files.add(path)
+        return path
+
+    @functools.cached_property
+    def _verified_files(self) -> set[Path]:
+        return set()
 
     @property
     def relief(self) -> str:
@@ -292,7 +317,7 @@ class Scene(Previewed):
 
     @functools.cached_property
     def _shapes(self) -> dict[str, Mesh]:  # several worlds of a drive ask for them
-        return read_shapes(self.files.shapes)
+        return read_shapes(self._verified(self.files.shapes))
 
     def features(
         self,
@@ -305,17 +330,19 @@ class Scene(Previewed):
 
         Raises SceneFormatError if the scene has no such feature.
         """
-        return read_layer(self.files.features, layer, frame=self.frame, geometry=geometry, rows=rows)
+        path = self._verified(self.files.features)
+        return read_layer(path, layer, frame=self.frame, geometry=geometry, rows=rows)
 
     def schema(self, layer: str) -> Schema:
         """The geometry type and the columns of a layer; raises SceneFormatError as `features` does."""
-        return read_schema(self.files.features, layer)
+        return read_schema(self._verified(self.files.features), layer)
 
     def road_graph(self) -> RoadGraph:
         """The drivable road graph; raises SceneFormatError if the scene has no drivable roads."""
-        if not self.files.road_graph.exists():
+        path = self._verified(self.files.road_graph)
+        if not path.exists():
             raise SceneFormatError(f"{self.path}: this scene has no drivable roads")
-        return read_graphml(self.files.road_graph, self.frame)
+        return read_graphml(path, self.frame)
 
 
 def open_scene(path: str | Path) -> Scene:
@@ -344,7 +371,7 @@ def open_scene(path: str | Path) -> Scene:
                 f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
             )
         if manifest.get("digest") != manifest_digest(manifest):
-            raise SceneFormatError(f"{manifest_file}: differs from what the build wrote; {BUILD_AGAIN}")
+            raise SceneFormatError(f"{manifest_file}: {DIFFERS}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))
         _ = scene.frame.crs, scene.bounds, scene.layers, scene.forests
         _ = scene.tile_boxes if scene.has_tiles else None
@@ -353,16 +380,15 @@ def open_scene(path: str | Path) -> Scene:
 
 def _open_stored(url: str) -> Scene:
     """Open the scene at a URL; its cache is of these contents of ``scene.json``."""
-    stored, names = StoredFolder(url), SceneFiles(Path())
-    data = stored.read(names.manifest.name)
+    stored = StoredFolder(url)
+    data = stored.read(SceneFiles(Path()).manifest.name)
     folder = cache_folder() / "stored" / digest(url.encode() + data)
     write_atomically(SceneFiles(folder).manifest, data)
     scene, reports = open_scene(folder), SceneFiles(folder).tile_reports
     if not reports.exists():
         stored.fetch(reports.name, reports)
     with reading(reports, SceneFormatError, remedy=BUILD_AGAIN):
-        rows = json.loads(reports.read_text("utf-8"))["tiles"]
-        tiles = {names.tile(int(r["i"]), int(r["j"])).as_posix(): str(r["digest"]) for r in rows}
+        tiles = {f"{_TILES}/{name}": value for name, value in _tile_digests(reports).items()}
     return replace(scene, stored=StoredFolder(url, {**scene.manifest.get("files", {}), **tiles}))
 
 
@@ -376,10 +402,21 @@ def changed_files(scene: Scene) -> list[Path]:
     """Files of a scene that are missing or differ from what the build wrote."""
     stated = {scene.path / name: value for name, value in scene.manifest.get("files", {}).items()}
     with suppress(OSError, ValueError, LookupError, TypeError):
-        reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
-        stated |= {SceneFiles(scene.path).tile(int(r["i"]), int(r["j"])): r["digest"] for r in reports}
+        reports = _tile_digests(scene.files.tile_reports)
+        stated |= {scene.files.tiles / name: value for name, value in reports.items()}
     here = {path: value for path, value in stated.items() if scene.stored is None or path.exists()}
-    return [path for path, value in here.items() if file_digest(path) != value]
+    return [path for path, value in here.items() if content_digest(path) != value]
+
+
+def content_digest(path: Path) -> str:
+    """Digest of a scene's file as the manifest states it; empty if the file cannot be read."""
+    return (database_digest if path.suffix == ".gpkg" else file_digest)(path)
+
+
+def _tile_digests(reports: Path) -> dict[str, str]:
+    """Digests of tiles by their files' names, from the file of their reports."""
+    rows = json.loads(reports.read_text("utf-8"))["tiles"]
+    return {SceneFiles(Path()).tile(int(r["i"]), int(r["j"])).name: str(r["digest"]) for r in rows}
 
 
 @contextmanager
@@ -397,7 +434,5 @@ def using(scene: Scene, *, known: type[Exception] = GeosceneError) -> Iterator[S
     except Exception as error:
         if changed := changed_files(scene):
             cause = f"{type(error).__name__}: {error}"
-            raise SceneFormatError(
-                f"{changed[0]}: differs from what the build wrote ({cause}); {BUILD_AGAIN}"
-            ) from error
+            raise SceneFormatError(f"{changed[0]}: {DIFFERS} ({cause})") from error
         raise

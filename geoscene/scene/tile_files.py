@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings.facades import FacadeTable, Openings, WallRelief
 from geoscene.classes import Class
-from geoscene.errors import BUILD_AGAIN, SceneFormatError, reading
+from geoscene.errors import BUILD_AGAIN, DIFFERS, SceneFormatError, reading
 from geoscene.geometry.mesh import Mesh, ShapeInstances
 from geoscene.objects.forests import Forests, forest_instances
 from geoscene.support.digests import digest
@@ -109,13 +109,18 @@ def write_tile(path: Path, tile: Tile) -> str:
     return digest(data)
 
 
-def read_tile(path: Path) -> Tile:
+def read_tile(path: Path, *, stated: str | None = None) -> Tile:
     """The tile that `write_tile` wrote.
 
-    Raises SceneFormatError if the file is missing or damaged.
+    stated : digest that the file must have; by default any
+
+    Raises SceneFormatError if the file is missing, damaged or another one.
     """
     with reading(path, SceneFormatError, remedy=BUILD_AGAIN, known=SceneFormatError):
-        arrays = read_arrays(path)
+        data = path.read_bytes()
+        if stated is not None and digest(data) != stated:
+            raise SceneFormatError(f"{path}: {DIFFERS}")
+        arrays = read_arrays(BytesIO(data))
         mesh, copies = _table_of(Mesh, arrays), _table_of(ShapeInstances, arrays, prefix="instance_")
         relief = _relief(arrays, faces=len(mesh)) if "relief_cells" in arrays else None
         full_parts = (

@@ -19,7 +19,7 @@ from geoscene.geometry.watertight import (
     validate_mesh,
     weld,
 )
-from geoscene.scene.layout import Scene
+from geoscene.scene.layout import Scene, changed_files
 from geoscene.typing import Ints
 
 _STEP = 1e-5
@@ -29,16 +29,20 @@ _STEP = 1e-5
 def check_scene(scene: Scene) -> dict[str, Any]:
     """Results of the checks, tile by tile.
 
-    ``{"solids": n, "volume": cubic metres, "broken": [{"feature", "osm_id", "fault"}], "surfaces": n,
-    "broken_surfaces": [{"tile": [i, j], "class", "feature", "osm_id", "fault"}]}``; a surface is the open
-    faces of one feature and class in a tile.
+    ``{"changed": [path], "solids": n, "volume": cubic metres, "broken": [{"feature", "osm_id", "fault"}],
+    "surfaces": n, "broken_surfaces": [{"tile": [i, j], "class", "feature", "osm_id", "fault"}]}``; a surface
+    is the open faces of one feature and class in a tile. Files that differ from what the build wrote are not
+    checked further.
 
     Raises SceneFormatError for a tile that cannot be read.
     """
+    changed = changed_files(scene)
     solids, surfaces, volume = 0, 0, 0.0
     faults: dict[int, str] = {}
     broken_surfaces: list[dict[str, Any]] = []
     for index in scene.tile_indices:
+        if {scene.files.tile(*index), scene.files.tile_reports} & set(changed):
+            continue
         tile = scene.tile(*index, forests=False)
         verdict = validate_mesh(tile.mesh)
         solids += len(verdict)
@@ -55,13 +59,15 @@ def check_scene(scene: Scene) -> dict[str, Any]:
             }
             for k in (~checked.ok).nonzero()[0].tolist()
         ]
-    names = _osm_ids(scene, set(faults) | {row["feature"] for row in broken_surfaces})
+    named = set(faults) | {row["feature"] for row in broken_surfaces}
+    names = _osm_ids(scene, named) if scene.files.features not in changed else {}
     broken = [
         {"feature": k, "osm_id": names.get(k, ""), "fault": fault} for k, fault in sorted(faults.items())
     ]
     for row in broken_surfaces:
         row["osm_id"] = names.get(row["feature"], "")
     return {
+        "changed": [path.relative_to(scene.path).as_posix() for path in changed],
         "solids": solids,
         "volume": volume,
         "broken": broken,

@@ -154,7 +154,10 @@ class SceneWriter:
         write_columns(self.files.problems, columns)
         write_json(self.files.tile_reports, tiles, indent=1)
         self.files.tile_journal.unlink(missing_ok=True)
-        tables = (self.files.features, self.files.road_graph, self.files.shapes, self.files.problems)
+        tables = (
+            *(self.files.features, self.files.road_graph, self.files.shapes, self.files.problems),
+            self.files.tile_reports,
+        )
         document = {
             "schema": SCHEMA,
             **redacted(manifest),

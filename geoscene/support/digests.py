@@ -16,7 +16,12 @@ _LENGTH = 20  # hexadecimal digits
 
 def digest(data: bytes) -> str:
     """Digest of bytes: the first 20 hexadecimal digits of their SHA-256."""
-    return hashlib.sha256(data).hexdigest()[:_LENGTH]
+    return short(hashlib.sha256(data))
+
+
+def short(sha256: hashlib._Hash) -> str:
+    """Digest of the bytes that a SHA-256 has been fed."""
+    return sha256.hexdigest()[:_LENGTH]
 
 
 def file_digest(path: Path) -> str:
@@ -50,7 +55,7 @@ def sources_digest(package: str) -> str:
     for name, file in sorted(_sources(resources.files(package), ""), key=itemgetter(0)):
         data = file.read_bytes()
         found.update(f"{name}\n{len(data)}\n".encode() + data)
-    return found.hexdigest()[:_LENGTH]
+    return short(found)
 
 
 def _sources(folder: Traversable, prefix: str) -> Iterator[tuple[str, Traversable]]:

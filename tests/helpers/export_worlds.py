@@ -165,6 +165,7 @@ def write_world(path, crs="utm", *, at=(13.35, 52.51)):
         "bounds": [-100, -100, 100, 100], "tile_size": size,
         "tiles": [[-1, -1, 1], [-1, 0, 1], [0, -1, 1], [0, 0, 1]],
     }  # fmt: skip
+    rows = []
     with SceneWriter(path) as writer:
         writer.files.tiles.mkdir()
         for i, j, _ in manifest["tiles"]:
@@ -177,8 +178,9 @@ def write_world(path, crs="utm", *, at=(13.35, 52.51)):
             origin = np.array([i * size, j * size, np.floor(mesh.vertices[:, 2].min())])
             some.transform[:, :, 3] -= origin
             tile = Tile(origin, mesh.shifted(-origin), some)
-            write_tile(writer.files.tile(i, j), tile)
+            rows.append({"i": i, "j": j, "digest": write_tile(writer.files.tile(i, j), tile)})
         writer.finish(
-            frame=frame, layers=layers, graph=graph, shapes=shapes(), problems=[], tiles={}, manifest=manifest
-        )
+            frame=frame, layers=layers, graph=graph, shapes=shapes(), problems=[], tiles={"tiles": rows},
+            manifest=manifest,
+        )  # fmt: skip
     return open_scene(path)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers.export_worlds import roads, write_world
 from helpers.roadgrids import grid, road_graph
+from helpers.scenes import restated
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,9 +101,9 @@ def _write(graph, scene, folder, **options):
     if not path.exists():
         write_world(path)
     write_graphml(graph, scene.frame, path=SceneFiles(path).road_graph)
-    return export_scene(
-        replace(scene, path=path), folder / "a.xodr", overwrite=True, options=ExportOptions(**options)
-    ).path
+    manifest = scene.manifest | {"files": restated(path).manifest["files"]}
+    scene = replace(scene, path=path, manifest=manifest)
+    return export_scene(scene, folder / "a.xodr", overwrite=True, options=ExportOptions(**options)).path
 
 
 def _check_links(path):
@@ -151,6 +152,7 @@ def test_restrictions_without_opendrive_equivalent_are_counted(tmp_path):
     chain = np.fromiter([np.array([0, 2, 3], np.int32)], object)
     graph = replace(roads(), chain_edges=chain, chain_kind=np.array(["no_u_turn"]))
     write_graphml(graph, scene.frame, path=scene.files.road_graph)
+    scene = restated(scene.path)
     (note,) = export_scene(scene, tmp_path / "bound.xodr").notes
     assert note.startswith("1 turn restrictions via ways are left out")
     assert (tmp_path / "bound.xodr").read_bytes() == (tmp_path / "plain.xodr").read_bytes()
@@ -232,7 +234,7 @@ def test_scene_without_roads_is_refused(scene, tmp_path):
     folder = tmp_path / "none"
     folder.mkdir()
     with pytest.raises(InputError, match="no drivable roads"):
-        export_scene(replace(scene, path=folder), tmp_path / "a.xodr")
+        export_scene(replace(scene, path=folder, manifest={"files": {}}), tmp_path / "a.xodr")
 
 
 steps = st.lists(st.tuples(st.floats(0.5, 60), st.floats(-3.0, 3.0)), min_size=1, max_size=8)

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from helpers import DEMO_BOX
 from helpers.programs import run_program
-from helpers.scenes import same_files
+from helpers.scenes import restated, same_files
 
 import geoscene.pipeline.tiles
 from geoscene.classes import Class
@@ -56,7 +56,9 @@ def test_check_scene_reports_a_broken_solid(scene, tmp_path):
     keep = np.ones(len(tile.mesh), bool)
     keep[np.flatnonzero(tile.mesh.closed)[5]] = False
     write_tile(broken.path / "tiles" / f"{i}_{j}.npz", Tile(tile.origin, tile.mesh.take(keep)))
-    report = check_scene(broken)
+    assert check_scene(broken)["changed"] == [f"tiles/{i}_{j}.npz"]
+    report = check_scene(restated(broken.path))
+    assert report["changed"] == []
     assert [row["fault"] for row in report["broken"]] == ["not-closed"]
     assert report["broken"][0]["osm_id"].startswith(("way/", "relation/"))
 
@@ -80,7 +82,7 @@ def test_check_scene_reports_broken_surfaces(scene, tmp_path):
         )
         with_extra = replace(tile, mesh=concatenate([mesh, extra]), relief=None)
         write_tile(broken.files.tile(i, j), with_extra)
-        [told] = check_scene(broken)["broken_surfaces"]
+        [told] = check_scene(restated(broken.path))["broken_surfaces"]
         assert (told["tile"], told["fault"]) == ([i, j], fault)
         assert told["feature"] == mesh.feature[row]
 

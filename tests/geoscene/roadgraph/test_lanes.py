@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.export_worlds import write_world
 from helpers.roadgrids import road_graph
+from helpers.scenes import restated
 
 from geoscene.errors import InputError
 from geoscene.export import export_scene
@@ -145,6 +146,7 @@ def test_routes_traffic_and_opendrive_agree(tmp_path, lanes, width):
     graph = road_graph([(0, 0), (200, 0)], [(0, 1)], lanes=lanes, width=width)
     scene = write_world(tmp_path / "scene")
     write_graphml(graph, scene.frame, path=scene.files.road_graph)
+    scene = restated(scene.path)
     root = ET.parse(export_scene(scene, tmp_path / "a.xodr").path).getroot()  # noqa: S314  (our own file)
     road = root.find("road")
     zero = float(road.find("lanes/laneOffset").get("a"))

@@ -2,16 +2,22 @@
 
 import ast
 import shutil
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from helpers import ROOT
 from helpers.export_worlds import write_world
+from helpers.programs import run_program
+from helpers.scenes import restated
 
 from geoscene.errors import SceneFormatError
 from geoscene.scene import SceneFiles, layout, open_scene
 from geoscene.scene.layout import changed_files, using
+from geoscene.scene.tile_files import read_tile, write_tile
 
 
 def test_scene_file_names_occur_only_in_the_layout_module():
@@ -78,13 +84,11 @@ def test_damaged_files_give_one_line_that_names_them(copied, name, damage):
         path.write_bytes(
             changed.get(damage, data[: middle // 2] + bytes(middle) + data[middle // 2 + middle :])
         )
-    if (name, damage) == ("features.gpkg", "zeros") or (name, damage) == ("shapes.npz", "missing"):
-        return  # pages without an index are read; a scene without copies has no shapes
     with pytest.raises(SceneFormatError) as raised:
         used(copied)
     text = str(raised.value)
     assert "\n" not in text
-    assert path.name in text or (name, damage) == ("roads.graphml", "missing")
+    assert path.name in text
 
 
 @pytest.mark.parametrize("name", ["shapes.npz", "tiles"])
@@ -95,8 +99,47 @@ def test_columns_that_do_not_fit_their_mesh_name_the_file(copied, name):
     column = next(key for key in arrays if key.endswith("surface"))
     for damaged in (np.tile(arrays[column], 2), arrays[column][:, None], arrays[column][0]):
         np.savez(path, **(arrays | {column: damaged}))
+        restated(copied)
         with pytest.raises(SceneFormatError, match=path.name):
             used(copied)
+
+
+@pytest.mark.parametrize("what", ["swapped", "shifted", "features", "roads", "reports"])
+def test_files_of_other_places_and_scenes_are_refused(copied, what, tmp_path):
+    tiles = sorted((copied / "tiles").iterdir())
+    foreign = write_world(tmp_path / "other").path
+    if what == "swapped":
+        changed, data = tiles[:2], [tiles[1].read_bytes(), tiles[0].read_bytes()]
+    elif what == "shifted":
+        tile = read_tile(tiles[0])
+        write_tile(tmp_path / "a.npz", replace(tile, origin=tile.origin + np.array([5.0, 0.0, 0.0])))
+        changed, data = tiles[:1], [(tmp_path / "a.npz").read_bytes()]
+    else:
+        names = {"features": "features.gpkg", "roads": "roads.graphml", "reports": "tiles.json"}
+        changed, data = [copied / names[what]], [(foreign / names[what]).read_bytes()]
+    for path, content in zip(changed, data, strict=True):
+        path.write_bytes(content)
+    assert set(changed) <= set(changed_files(open_scene(copied)))
+    with pytest.raises(SceneFormatError, match=f"{changed[0].name}: differs from what the build wrote"):
+        used(copied)
+    done = run_program("geoscene", "validate", copied)
+    assert done.returncode == 1
+    assert all(f"{path}: differs from what the build wrote" in done.stdout for path in changed)
+    assert not done.stderr
+
+
+def test_a_geopackage_that_a_program_has_only_opened_is_the_same(copied):
+    path = copied / "features.gpkg"
+    before = path.read_bytes()
+    with closing(sqlite3.connect(path)) as database:  # as QGIS does
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA journal_mode=DELETE")
+    assert path.read_bytes() != before
+    assert changed_files(open_scene(copied)) == []
+    used(copied)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE mine (a)")
+    assert changed_files(open_scene(copied)) == [path]
 
 
 def test_unexpected_error_is_explained_by_a_changed_file(copied):
