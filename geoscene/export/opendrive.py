@@ -36,6 +36,9 @@ _TYPES = {
 _FAST = 70 / 3.6
 """Metres a second above which a road that is no motorway is a rural one."""
 
+_THIN = 1e-6
+"""Metres: what rounding leaves of a carriageway beside its lanes is no shoulder."""
+
 _SIGNALS = {
     "traffic_signals": ("yes", "OpenDRIVE", "1000001"),
     "stop": ("no", "DE", "206"),
@@ -194,19 +197,22 @@ def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, left_hand: bool) -> Iterat
         if (k, end) in net.joints
     }  # sign of the connected lane at each joint
     sides: dict[int, list[str]] = {}
-    for side, edge, count in ((sign, road.edge, road.ahead + road.shared), (-sign, road.twin, road.back)):
+    ahead: list[tuple[str, float]] = [(lane.kind, lane.width) for lane in road.ahead]
+    if road.shared:
+        ahead = [("bidirectional", road.shared), *ahead]
+    back: list[tuple[str, float]] = [(lane.kind, lane.width) for lane in road.back]
+    for side, edge, own in ((sign, road.edge, ahead), (-sign, road.twin, back)):
         lanes = []
-        for number in range(1, count + 1):
-            kind = "bidirectional" if road.shared and side == sign and number == 1 else "driving"
-            mark = "broken" if number < count else "none"
-            speed = float(graph.speed[edge])
+        for number, (kind, width) in enumerate(own, start=1):
+            mark = "broken" if number < len(own) else "none"
+            speed = float(graph.speed[edge if edge >= 0 else road.edge])
             links = {word: by * side * number for word, by in flip.items()}
-            lanes.append(_lane(side * number, kind, width=road.width, mark=mark, links=links, speed=speed))
-        if road.shoulder > 0:
-            links = {word: by * side * (count + 1) for word, by in flip.items()}
-            lanes.append(_lane(side * (count + 1), "shoulder", width=road.shoulder, links=links))
+            lanes.append(_lane(side * number, kind, width=width, mark=mark, links=links, speed=speed))
+        if road.shoulder > _THIN:
+            links = {word: by * side * (len(own) + 1) for word, by in flip.items()}
+            lanes.append(_lane(side * (len(own) + 1), "shoulder", width=road.shoulder, links=links))
         sides[side] = lanes
-    middle = "solid" if road.twin >= 0 and not road.shared else "none"
+    middle = "solid" if road.back and road.ahead and not road.shared else "none"
     if sides[1]:
         yield from ("<left>\n", *reversed(sides[1]), "</left>\n")
     yield f'<center><lane id="0" type="none" level="false"><link/>{_road_mark(middle)}</lane></center>\n'
@@ -255,8 +261,8 @@ def _signals(
             dynamic, country, code = _SIGNALS[kind]
             place = (share if along else 1 - share) * road.whole - road.begins
             s = min(max(place, 0.0), total)
-            lanes = road.ahead + road.back + road.shared
-            t = (lanes * road.width / 2 + road.shoulder + 0.5) * (1 if along == left_hand else -1)
+            across = road.shared + sum(lane.width for lane in (*road.ahead, *road.back))
+            t = (across / 2 + road.shoulder + 0.5) * (1 if along == left_hand else -1)
             high = "3" if dynamic == "yes" else "2.2"
             yield (
                 f'<signal s="{_n(s)}" t="{_n(t)}" id="{k + 1}{count:03d}" name="{kind}" dynamic="{dynamic}" '
@@ -297,11 +303,13 @@ def _connecting_road(
     )
     middle = f'<center><lane id="0" type="none" level="false"><link/>{_road_mark("none")}</lane></center>\n'
     lanes = []
-    growth = (c.widths[1] - c.widths[0]) / max(curve.length, 1e-3)
-    for k, (before, after) in enumerate(c.lanes.tolist()):
+    for k, ((before, after), kind, (start, end)) in enumerate(
+        zip(c.lanes.tolist(), c.kinds, c.widths.tolist(), strict=True)
+    ):
         links = {"predecessor": before, "successor": after}
+        growth = (end - start) / max(curve.length, 1e-3)
         number = sign * (k + 1)
-        lanes.append(_lane(number, "driving", width=c.widths[0], growth=growth, links=links, speed=speed))
+        lanes.append(_lane(number, kind, width=start, growth=growth, links=links, speed=speed))
     if left_hand:
         yield f"<{side}>\n{''.join(reversed(lanes))}</{side}>\n{middle}"
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,17 +11,21 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
+from geoscene.roadgraph.lane_tags import Lane, LaneKind
+from geoscene.roadgraph.lanes import LaneLayout, edge_lanes, graph_lanes
 from geoscene.roadgraph.routing import turn_table
+from geoscene.roadgraph.turn_lanes import STRAIGHT, lanes_by_turn, merges
 from geoscene.typing import Bools, Float, Ints
 
-Lane = tuple[int, float, float]
-"""Number of a lane, metres from the centre line to its inner edge (left of the driving direction), width."""
+Pose = tuple[Float, float, float]
+"""Point (3,), heading and gradient, in driving direction, where traffic enters or leaves a road."""
 
 START, END = 0, 1
 
 _LEAST_GAP, _MOST_GAP, _MOST_SHARE = 2.0, 30.0, 0.4
 _STRAIGHT = np.radians(0.05)
+_TOGETHER = 0.01
+"""Metres between the ends of two centre lines that are one line."""
 
 REACH = 0.1
 """Metres that a reference line may cut a corner of its polyline by."""
@@ -39,10 +44,9 @@ class Carriageway:
     plan     : the reference line
     begins   : metres along the edge's whole centre line at which ``line`` begins
     whole    : length of the whole centre line, metres
-    width    : metres of a lane
-    ahead, back : number of lanes along the edge and along its twin
-    shared   : one more lane, used in both directions, between them
-    shift    : metres that the lanes' middle line lies left of the reference line
+    ahead, back : lanes along the edge and against it, from the middle outwards
+    shared   : metres of one more lane, used in both directions, between them; 0 without it
+    shift    : metres that the line between the directions lies left of the reference line
     shoulder : metres of the carriageway on each side of the lanes
     """
 
@@ -52,10 +56,9 @@ class Carriageway:
     plan: PlanView
     begins: float
     whole: float
-    width: float
-    ahead: int
-    back: int
-    shared: bool
+    ahead: tuple[Lane, ...]
+    back: tuple[Lane, ...]
+    shared: float
     shift: float
     shoulder: float
 
@@ -67,8 +70,9 @@ class Connection:
     node   : node of the junction
     before, after : edges
     curve  : reference line
-    lanes  : (k, 2) numbers of the lanes that are joined
-    widths : metres of a lane at its start and end
+    lanes  : (k, 2) numbers of the lanes that are joined, from the middle outwards
+    kinds  : (k) of the lanes
+    widths : (k, 2) metres of each lane at its start and end
     rise   : (4,) height along it, coefficients of 1, s, s2, s3
     """
 
@@ -77,7 +81,8 @@ class Connection:
     after: int
     curve: Curve
     lanes: Ints
-    widths: tuple[float, float]
+    kinds: tuple[LaneKind, ...]
+    widths: Float
     rise: Float
 
 
@@ -128,14 +133,22 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
         edge = firsts[k]
         junctions[graph.head[edge] if end == END else graph.tail[edge]] = False
     gaps = _gaps(graph, firsts, ends=ends, junctions=junctions)
-    lanes = graph_lanes(graph)
-    roads = [_carriageway(graph, lanes, edge=edge, gap=gaps[k]) for k, edge in enumerate(firsts)]
-    connections = []
+    lanes = graph_lanes(graph, left_hand=left_hand)
+    roads = [
+        _carriageway(graph, lanes, edge=edge, gap=gaps[k], left_hand=left_hand)
+        for k, edge in enumerate(firsts)
+    ]
+    following: dict[int, list[int]] = defaultdict(list)
     for first, then in sorted(zip(before.tolist(), after.tolist(), strict=True)):
-        node = int(graph.head[first])
-        if junctions[node]:
-            made = _connection(graph, roads, road_of=road_of, before=first, after=then, left_hand=left_hand)
-            connections.append(made)
+        if junctions[graph.head[first]]:
+            following[first].append(then)
+    connections = [
+        connection
+        for first, then in following.items()
+        for connection in _connections(
+            graph, roads, road_of=road_of, before=first, after=then, left_hand=left_hand
+        )
+    ]
     connections.sort(key=lambda c: (c.node, c.before, c.after))
     return RoadNet(roads, road_of, junctions, connections, joints)
 
@@ -173,15 +186,26 @@ def _joints(
         if (twin_a < 0) != (twin_b < 0) or (twin_a < 0 and turned):
             continue
         along = (twin_b, edge_b) if turned else (edge_b, twin_b)
-        same = graph.width[edge_a] == graph.width[edge_b] and graph.lanes[edge_a] == graph.lanes[along[0]]
+        same = _alike(graph, edge_a, other=along[0]) and graph.width[edge_a] == graph.width[edge_b]
+        one, other = (
+            graph.geometry[edge][-1 if end == END else 0, :2]
+            for edge, end in ((edge_a, end_a), (edge_b, end_b))
+        )
+        same = same and bool(np.hypot(*(one - other)) < _TOGETHER)
         wanted = {(edge_a, along[0]) if end_a == END else (along[0], edge_a)}
         if twin_a >= 0:
-            same = same and graph.lanes[twin_a] == graph.lanes[along[1]]
+            same = same and _alike(graph, twin_a, other=along[1])
             wanted.add((along[1], twin_a) if end_a == END else (twin_a, along[1]))
         if same and wanted <= turns:
             joints[a, end_a] = (b, end_b)
             joints[b, end_b] = (a, end_a)
     return joints
+
+
+def _alike(graph: RoadGraph, edge: int, *, other: int) -> bool:
+    """Whether two edges have the same lanes."""
+    columns = (graph.lanes, graph.contraflow, graph.lane_kinds, graph.lane_widths)
+    return all(bool(column[edge] == column[other]) for column in columns)
 
 
 def _gaps(
@@ -208,31 +232,54 @@ def _gaps(
     return gaps
 
 
-def _carriageway(graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float) -> Carriageway:
+def _carriageway(
+    graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float, left_hand: bool
+) -> Carriageway:
     full = graph.geometry[edge]
     fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
     distinct = full[fresh]
     end = polylines.stations(distinct)[-1] - float(gap[END])
     line = polylines.cut(distinct, float(gap[START]), end=end, gap=1e-3)
-    ahead, behind = int(lanes.own[edge]), int(lanes.other[edge])
-    shared, width = bool(lanes.shared[edge]), float(lanes.width[edge])
+    own, other, shared = int(lanes.own[edge]), int(lanes.other[edge]), int(lanes.shared[edge])
+    borders = lanes.borders[edge]
+    widths = (borders[:-1] - borders[1:])[: own + shared + other].tolist()
+    twin = int(graph.twin[edge])
+    described = [edge_lanes(graph, k) if k >= 0 else () for k in (edge, twin)]
+    kinds = [sides[::-1] if left_hand else sides for sides in described]
+    ahead = kinds[0] or (Lane(),) * own
+    back = kinds[1] or (Lane("driving" if twin >= 0 else "bus"),) * other
     return Carriageway(
         edge=edge,
-        twin=int(graph.twin[edge]),
+        twin=twin,
         line=line,
         plan=plan_view(line[:, :2]),
         begins=float(gap[START]),
         whole=polylines.length(full),
-        width=width,
-        ahead=ahead,
-        back=behind,
-        shared=shared,
-        shift=width * (ahead + shared - behind) / 2,
+        ahead=tuple(replace(lane, width=w) for lane, w in zip(ahead, widths[:own][::-1], strict=True)),
+        back=tuple(replace(lane, width=w) for lane, w in zip(back, widths[own + shared :], strict=True)),
+        shared=widths[own] if shared else 0.0,
+        shift=-float(borders[own + shared]),
         shoulder=float(graph.width[edge] - lanes.span[edge]) / 2,
     )
 
 
-def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]:
+@dataclass(frozen=True, slots=True)
+class DrivenLane:
+    """A lane at the end of a road, as seen in its direction.
+
+    number : in OpenDRIVE
+    lane   : its kind, width and arrows
+    inner  : metres that its inner edge is left of the centre line
+    middle : metres that its middle is left of the centre line
+    """
+
+    number: int
+    lane: Lane
+    inner: float
+    middle: float
+
+
+def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[DrivenLane]:
     """The lanes of one direction of a road, from the middle outwards.
 
     In right-hand traffic the lanes along the reference line have negative numbers, the shared lane among
@@ -240,52 +287,148 @@ def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Lane]
     """
     sign = 1 if left_hand else -1  # of the lanes along the reference line
     along = edge == road.edge
-    middle = -sign * road.shift if along else sign * road.shift  # of the lanes' zero, left as one drives
-    count = road.ahead if along else road.back
-    first = 1 + (road.shared and along)
-    if count == 0:  # the shared lane is all there is
-        inner = middle if along else middle - sign * road.width
-        return [(sign, inner, road.width)]
+    at = -sign * road.shift if along else sign * road.shift  # of the lanes' zero, left as one drives
+    lanes = road.ahead if along else road.back
+    first = 1
+    if not lanes:  # the shared lane is all there is
+        lanes = (Lane(width=road.shared),)
+        at -= 0.0 if along else sign * road.shared
+        along = True
+    elif road.shared and along:
+        first, at = 2, at + sign * road.shared
     number = sign if along else -sign
-    return [
-        (number * (first + k), middle + sign * (first - 1 + k) * road.width, road.width) for k in range(count)
+    found = []
+    for k, lane in enumerate(lanes):
+        found.append(DrivenLane(number * (first + k), lane, at, at + sign * lane.width / 2))
+        at += sign * lane.width
+    return found
+
+
+def _connections(
+    graph: RoadGraph,
+    roads: list[Carriageway],
+    *,
+    road_of: Ints,
+    before: int,
+    after: Sequence[int],
+    left_hand: bool,
+) -> Iterator[Connection]:
+    """The connections from the end of one edge to the starts of others."""
+    source = roads[road_of[before]]
+    begin = _pose(source, arriving=True, along=before == source.edge)
+    here = driven_lanes(source, before, left_hand=left_hand)
+    targets = [roads[road_of[edge]] for edge in after]
+    poses = [
+        _pose(road, arriving=False, along=edge == road.edge)
+        for road, edge in zip(targets, after, strict=True)
     ]
+    turns = np.array([(pose[1] - begin[1] + np.pi) % (2 * np.pi) - np.pi for pose in poses])
+    links: list[list[tuple[DrivenLane, DrivenLane]]] = [[] for _ in after]
+    theres = [
+        driven_lanes(road, edge, left_hand=left_hand) for road, edge in zip(targets, after, strict=True)
+    ]
+    kinds: tuple[LaneKind, ...] = ("driving", "bus")
+    for kind in kinds:
+        own = [lane for lane in here if lane.lane.kind == kind]
+        in_order = own[::-1] if left_hand else own  # from left to right
+        allowed = lanes_by_turn([lane.lane for lane in in_order], turns, left_hand=left_hand)
+        for k, there in enumerate(theres):
+            chosen = [in_order[number] for number in allowed[k]]
+            chosen = chosen[::-1] if left_hand else chosen
+            open_there = [lane for lane in there if lane.lane.kind == kind]
+            if len(chosen) > len(open_there):
+                chosen = [lane for lane in chosen if not merges(lane.lane)] or chosen
+            if not open_there and kind == "bus":  # the bus lane ends
+                open_there = [lane for lane in there if lane.lane.kind == "driving"][-1:]
+            links[k] += _aligned(chosen, open_there, begin=begin, end=poses[k], left_hand=left_hand)
+        if len(turns) and own:
+            ahead = int(np.abs(turns).argmin())
+            linked = {lane.number for pairs in links for lane, _ in pairs}
+            for lane in own:
+                if lane.number not in linked and links[ahead]:  # it ends: its traffic merges
+                    near = min(links[ahead], key=lambda pair: abs(pair[0].number - lane.number))
+                    links[ahead].append((lane, near[1]))
+    for edge, pose, pairs in zip(after, poses, links, strict=True):
+        for run in _runs(pairs):
+            yield _connection(begin, pose, pairs=run, node=int(graph.head[before]), edges=(before, edge))
+
+
+def _aligned(
+    here: Sequence[DrivenLane],
+    there: Sequence[DrivenLane],
+    *,
+    begin: Pose,
+    end: Pose,
+    left_hand: bool,
+) -> list[tuple[DrivenLane, DrivenLane]]:
+    """Pairs of lanes, both from the middle outwards.
+
+    A turn towards the kerb takes the outermost lanes, one away from it the innermost ones; straight on, those
+    that lie in line.
+    """
+    turn = (end[1] - begin[1] + np.pi) % (2 * np.pi) - np.pi
+    outward = turn if left_hand else -turn
+    count = min(len(here), len(there))
+    spare, more = len(here) - count, len(there) - count
+    if outward > STRAIGHT:
+        places = [(spare, more)]
+    elif outward < -STRAIGHT:
+        places = [(0, 0)]
+    else:
+        places = [(k, 0) for k in range(spare + 1)] if spare else [(0, k) for k in range(more + 1)]
+    heading = begin[1] + turn / 2
+    left = np.array([-np.sin(heading), np.cos(heading)])
+    gap = float((end[0][:2] - begin[0][:2]) @ left)
+
+    def off(place: tuple[int, int]) -> float:
+        pairs = zip(here[place[0] :], there[place[1] :], strict=False)
+        return round(sum(abs(gap + b.middle - a.middle) for a, b in pairs), 6)
+
+    a, b = min(places, key=off)
+    return list(zip(here[a : a + count], there[b : b + count], strict=True))
+
+
+def _runs(pairs: list[tuple[DrivenLane, DrivenLane]]) -> list[list[tuple[DrivenLane, DrivenLane]]]:
+    """Pairs from the middle outwards, in runs of lanes that lie side by side on both roads."""
+    runs: list[list[tuple[DrivenLane, DrivenLane]]] = []
+    for pair in sorted(pairs, key=lambda pair: (abs(pair[0].number), abs(pair[1].number))):
+        last = runs[-1][-1] if runs else None
+        if last and all(abs(abs(pair[k].number) - abs(last[k].number)) == 1 for k in (0, 1)):
+            runs[-1].append(pair)
+        else:
+            runs.append([pair])
+    return runs
 
 
 def _connection(
-    graph: RoadGraph, roads: list[Carriageway], *, road_of: Ints, before: int, after: int, left_hand: bool
+    begin: Pose,
+    end: Pose,
+    *,
+    pairs: Sequence[tuple[DrivenLane, DrivenLane]],
+    node: int,
+    edges: tuple[int, int],
 ) -> Connection:
-    """The connection from the end of one edge to the start of another."""
-    sign = 1 if left_hand else -1
-    source, target = roads[road_of[before]], roads[road_of[after]]
-    start, heading, slope = _pose(source, arriving=True, along=before == source.edge)
-    end, end_heading, end_slope = _pose(target, arriving=False, along=after == target.edge)
-    here = driven_lanes(source, before, left_hand=left_hand)
-    there = driven_lanes(target, after, left_hand=left_hand)
-    turn = (end_heading - heading + np.pi) % (2 * np.pi) - np.pi
-    count = min(len(here), len(there))
-    outer = sign * turn > np.radians(30)  # a turn towards the kerb starts in the outermost lane
-    here, there = (here[-count:], there[-count:]) if outer else (here[:count], there[:count])
-    first = start[:2] + here[0][1] * np.array([-np.sin(heading), np.cos(heading)])
-    last = end[:2] + there[0][1] * np.array([-np.sin(end_heading), np.cos(end_heading)])
+    """The connection of lanes that lie side by side, from the middle outwards."""
+    (start, heading, slope), (stop, end_heading, end_slope) = begin, end
+    first = start[:2] + pairs[0][0].inner * np.array([-np.sin(heading), np.cos(heading)])
+    last = stop[:2] + pairs[0][1].inner * np.array([-np.sin(end_heading), np.cos(end_heading)])
     curve = connecting_curve(first, heading, end=last, end_heading=end_heading)
     length = max(curve.length, 1e-3)
-    rise = end[2] - start[2]
+    rise = stop[2] - start[2]
     c = (3 * rise / length - 2 * slope - end_slope) / length
     d = (slope + end_slope - 2 * rise / length) / length**2
     return Connection(
-        int(graph.head[before]),
-        before,
-        after,
+        node,
+        *edges,
         curve,
-        np.array([[a[0], b[0]] for a, b in zip(here, there, strict=True)], np.int64),
-        (here[0][2], there[0][2]),
+        np.array([[a.number, b.number] for a, b in pairs], np.int64),
+        tuple(a.lane.kind for a, _ in pairs),
+        np.array([[a.lane.width, b.lane.width] for a, b in pairs]),
         np.array([start[2], slope, c, d]),
     )
 
 
-def _pose(road: Carriageway, *, arriving: bool, along: bool) -> tuple[Float, float, float]:
-    """Point (3,), heading and gradient, in driving direction, where traffic enters or leaves a road."""
+def _pose(road: Carriageway, *, arriving: bool, along: bool) -> Pose:
     last = arriving == along
     plan, line = road.plan, road.line
     rows = (-2, -1) if last else (0, 1)

@@ -56,7 +56,14 @@ from geoscene.pipeline.features import (
     wire_layer,
 )
 from geoscene.pipeline.reach import AROUND, AreaOf, Reach, RoadMap, all_tiles, tile_boxes
-from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph import (
+    ProfileOptions,
+    RoadOptions,
+    build_road_graph,
+    find_obstacles,
+    graded_ground,
+    profile,
+)
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.creases import crease_lines
 from geoscene.roadgraph.graph import RoadGraph
@@ -357,7 +364,11 @@ def _plan_roads(
 ) -> _Roads:
     """Road graph with heights, and carriageways."""
     mapped = _only_roads(osm, options)
-    graph = _collect(problems, build_road_graph(mapped, frame))
+    side, source = found_side(osm)
+    if options.driving_side:
+        side, source = cast("Side", options.driving_side), "option"
+    road_options = RoadOptions(left_hand=side == "left")
+    graph = _collect(problems, build_road_graph(mapped, frame, options=road_options))
     problems += find_odd_layers(mapped.ways)
     surveyed = 0.0 < terrain.spacing <= _SURVEYED
     obstacles = find_obstacles(osm, frame)
@@ -366,9 +377,6 @@ def _plan_roads(
     height = None
     if uneven:
         height = graded_ground(graph, terrain.height, level=not terrain.grids, surveyed=surveyed)
-    side, source = found_side(osm)
-    if options.driving_side:
-        side, source = cast("Side", options.driving_side), "option"
     sidewalks = SurfaceOptions().sidewalks
     carriageways = read_carriageways(mapped, frame, sidewalks=sidewalks, left_hand=side == "left")
     return _Roads(graph, carriageways, side, source, height, uneven)

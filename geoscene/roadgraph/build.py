@@ -12,8 +12,9 @@ import numpy as np
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.chains import RoadChain, Runs, add_controls, chains_of, link_chains
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.lane_uses import read_lane_uses
-from geoscene.roadgraph.tags import Street, drivable, read_street
+from geoscene.roadgraph.lanes import lane_column
+from geoscene.roadgraph.streets import move_aside, read_streets
+from geoscene.roadgraph.tags import Street
 from geoscene.sources.data import OsmData, Relation, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
@@ -31,10 +32,12 @@ class RoadOptions:
 
     simplify : nodes only where roads join, end or change; else every OSM node becomes a node
     private  : include roads closed to the public, tracks and busways
+    left_hand : traffic keeps left
     """
 
     simplify: bool = True
     private: bool = False
+    left_hand: bool = False
 
 
 def build_road_graph(
@@ -44,14 +47,18 @@ def build_road_graph(
 
     Roads join where they share an OSM node and nowhere else: a bridge does not join the road below. A node of
     the simplified graph is a junction, a dead end, or a place where an attribute of the edges changes
-    (class, name, width, lanes, limit, direction, layer, bridge, tunnel); ways of equal tags are joined.
-    Nodes are sorted by id, edges follow the order of the ways; the two edges of a two-way street are
-    consecutive.
+    (class, name, width, lanes and their uses, limit, direction, layer, bridge, tunnel); ways of equal tags
+    are joined. Nodes are sorted by id, edges follow the order of the ways; the two edges of a two-way street
+    are consecutive.
     """
     options = options or RoadOptions()
     problems: list[Problem] = []
-    ways = [way for way in osm.ways if drivable(way.tags, private=options.private)]
-    streets = _read_streets(ways, problems)
+    ways, streets, remarks = read_streets(osm, private=options.private, left_hand=options.left_hand)
+    problems += [
+        Problem(osm_id, "road", "repaired", reason, detail)
+        for osm_id, found in remarks
+        for reason, detail in found
+    ]
     runs, node_id, lonlat = read_runs(ways, problems)
     if options.simplify:
         chains = chains_of(runs, streets, nodes=len(node_id))
@@ -59,17 +66,8 @@ def build_road_graph(
         chains = link_chains(runs, np.ones(len(node_id), np.bool_))
     graph, sides = _edges(chains, ways, streets=streets, places=(node_id, lonlat), frame=frame)
     graph = add_turns(graph, osm.relations, problems=problems)
-    return add_controls(graph, osm.points, sides=sides, lines=(chains, ways, node_id)), problems
-
-
-def _read_streets(ways: Sequence[Way], problems: list[Problem]) -> list[Street]:
-    streets = []
-    for way in ways:
-        street, unread = read_street(way.tags)
-        unread += read_lane_uses(way.tags, street)[1]
-        streets.append(street)
-        problems += [Problem(way.osm_id, "road", "repaired", "unreadable-tag", text) for text in unread]
-    return streets
+    lines = chains, ways, node_id
+    return add_controls(graph, osm.points, sides=sides, lines=lines, problems=problems), problems
 
 
 def read_runs(ways: Sequence[Way], problems: list[Problem]) -> tuple[Runs, Ints, Float]:
@@ -136,7 +134,7 @@ def _edges(
     two_way = np.bincount(chain_of, minlength=len(chains))[chain_of] == 2
     twin = np.where(two_way, np.arange(len(rows)) + np.where(backward, -1, 1), -1).astype(np.int32)
 
-    lines = [xyz[chain.node] for chain in chains]
+    lines = move_aside([xyz[chain.node] for chain in chains], chains, ways=ways, streets=streets, frame=frame)
     geometry = np.empty(len(rows), object)
     for edge, (number, against) in enumerate(rows):
         geometry[edge] = lines[number][::-1].copy() if against else lines[number]
@@ -153,6 +151,12 @@ def _edges(
         speed=np.array([s.speed[k] for s, k in side], float),
         speed_source=np.array([s.speed_source[k] for s, k in side], np.str_),
         lanes=np.array([s.lanes[k] for s, k in side], float),
+        contraflow=np.array([s.lanes[1 - k] if s.direction else 0.0 for s, k in side], float),
+        lane_kinds=lane_column([s.described[k] for s, k in side], lambda lane: lane.kind, plain="driving"),
+        lane_widths=lane_column(
+            [s.described[k] for s, k in side], lambda lane: f"{lane.width:g}" if lane.width else ""
+        ),
+        lane_turns=lane_column([s.described[k] for s, k in side], lambda lane: ";".join(lane.turns)),
         lanes_source=np.array([s.lanes_source for s, _ in side], np.str_),
         width=np.array([s.width for s, _ in side], float),
         width_source=np.array([s.width_source for s, _ in side], np.str_),

@@ -14,7 +14,8 @@ from geoscene.ground.kinds import SURFACES
 from geoscene.roadgraph.build import read_runs
 from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
-from geoscene.roadgraph.tags import CLASSES, Street, drivable, place_of, read_street
+from geoscene.roadgraph.streets import move_aside, read_streets
+from geoscene.roadgraph.tags import CLASSES, Street, place_of
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
@@ -49,7 +50,7 @@ class Carriageways:
 
     Left and right are as seen along the line.
 
-    line   : (k,) shapely LineString, scene metres
+    line   : (k,) shapely LineString, scene metres; the middle of the carriageway
     ends   : (k, 2) int32 node of the line's start and end
     node_xy : (n, 2) float64 scene metres
     node_id : (n,) int64 OSM ids
@@ -132,15 +133,16 @@ def read_carriageways(
                 nor a footway beside them
     left_hand : traffic keeps left
     """
-    ways = [way for way in osm.ways if drivable(way.tags, private=True)]
-    kinds = [_read_kind(way, left_hand=left_hand) for way in ways]
+    ways, streets, _ = read_streets(osm, private=True, left_hand=left_hand)
+    kinds = [_read_kind(way, street, left_hand=left_hand) for way, street in zip(ways, streets, strict=True)]
     ignored: list[Problem] = []  # reported with the road graph
     runs, node_id, lonlat = read_runs(ways, ignored)
     chains = chains_of(runs, kinds, nodes=len(node_id))
     x, y = frame.from_geographic(lonlat[:, 0], lonlat[:, 1])
     xy = np.stack([x, y], axis=1)
     sizes = [len(chain.node) for chain in chains]
-    places = xy[np.concatenate([c.node for c in chains])] if chains else np.empty((0, 2))
+    lines = move_aside([xy[chain.node] for chain in chains], chains, ways=ways, streets=streets, frame=frame)
+    places = np.concatenate(lines) if chains else np.empty((0, 2))
     line = shapely.linestrings(places, indices=np.repeat(np.arange(len(chains)), sizes))
     of = [kinds[chain.way[0]] for chain in chains]
     middle = shapely.get_coordinates(shapely.line_interpolate_point(line, 0.5, normalized=True))
@@ -163,8 +165,7 @@ def read_carriageways(
     return _guess_sidewalks(table, osm, frame=frame, urban=sidewalks == "urban", left_hand=left_hand)
 
 
-def _read_kind(way: Way, *, left_hand: bool) -> _Kind:
-    street, _ = read_street(way.tags)
+def _read_kind(way: Way, street: Street, *, left_hand: bool) -> _Kind:
     walks = [_sidewalk(way.tags, side) for side in ("left", "right")]
     rough = street.highway == "track" and way.tags.get("tracktype") != "grade1"
     material = surface_material(way.tags, "gravel" if rough else "asphalt")
@@ -173,7 +174,7 @@ def _read_kind(way: Way, *, left_hand: bool) -> _Kind:
     mapped = street.lanes_source == "lanes" and sum(street.lanes) >= 2 and street.highway != "service"
     marked = markings != "no" and (main or mapped or markings == "yes") and material[0] in PAVED
     painted = material[0] in PAVED and street.highway not in MINOR
-    uses = read_lane_uses(way.tags, street, left_hand=left_hand)[0] if painted else NO_USES
+    uses = read_lane_uses(way.tags, street, left_hand=left_hand) if painted else NO_USES
     return _Kind(street, (walks[0][0], walks[1][0]), (walks[0][1], walks[1][1]), material, marked, uses)
 
 

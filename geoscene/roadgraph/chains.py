@@ -12,6 +12,7 @@ import numpy as np
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import CLASSES
 from geoscene.sources.data import TaggedNode, Tags, Way
+from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Ints
 
 # Metres before a node within which a signal or a sign is the node's own.
@@ -143,12 +144,14 @@ def add_controls(
     *,
     sides: tuple[Ints, Bools],
     lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
+    problems: list[Problem],
 ) -> RoadGraph:
     """The graph with its traffic controls.
 
     ``direction`` tags are respected. Without one, signals and crossings control both directions, and a sign
     controls the traffic towards the nearer end of its road (OSM wiki, Key:direction). At a junction, signals
     and ``stop=all`` control every arm, other signs the arms of lesser class, or all if they are equal.
+    Where a tagged direction has no traffic, they control that of the one-way streets there (``direction``).
 
     sides : the chain of each edge (m,) and whether the edge runs against it (m,)
     lines : the chains, the ways they are made of, and the ids of the nodes that they count
@@ -166,7 +169,17 @@ def add_controls(
 
     flags = {name: np.zeros(len(graph.node_id), np.bool_) for name in ("traffic_signals", "stop", "give_way")}
     rows = []
-    for edge, vertex, with_way, tags in _controls_on_edges(graph, points, sides=sides, lines=lines):
+    unused: dict[tuple[int, str], list[tuple[int, float]]] = {}
+    used: set[tuple[int, str]] = set()
+
+    def control(edge: int, offset: float, *, kind: str) -> None:
+        rows.append((edge, offset, kind))
+        if kind in flags and float(graph.length[edge]) - offset <= _REACH:
+            flags[kind][int(graph.head[edge])] = True
+
+    for edge, vertex, with_way, (osm_node, tags) in _controls_on_edges(
+        graph, points, sides=sides, lines=lines
+    ):
         plan = np.linalg.norm(np.diff(graph.geometry[edge][:, :2], axis=0), axis=1)
         length = float(graph.length[edge])
         offset = length * float(plan[:vertex].sum() / max(plan.sum(), 1e-9))
@@ -186,9 +199,19 @@ def add_controls(
                 ahead = float(arm_metres[node]) - length if at_end else length - offset
                 applies = ahead <= offset
             if applies:
-                rows.append((edge, offset, kind))
-                if kind in flags and length - offset <= _REACH:
-                    flags[kind][node] = True
+                control(edge, offset, kind=kind)
+                used.add((osm_node, kind))
+            elif side:
+                unused.setdefault((osm_node, kind), []).append((edge, offset))
+    for (osm_node, kind), places in sorted(unused.items()):
+        if (osm_node, kind) in used:
+            continue
+        only = [(edge, offset) for edge, offset in places if graph.twin[edge] < 0]
+        for edge, offset in only:
+            control(edge, offset, kind=kind)
+        detail = f"{kind} in a direction without traffic" + ("; taken for the other one" if only else "")
+        action: Action = "repaired" if only else "dropped"
+        problems.append(Problem(f"node/{osm_node}", "control", action, "direction", detail))
     rows.sort()
     return replace(
         graph,
@@ -207,8 +230,8 @@ def _controls_on_edges(
     *,
     sides: tuple[Ints, Bools],
     lines: tuple[Sequence[RoadChain], Sequence[Way], Ints],
-) -> Iterator[tuple[int, int, bool, Tags]]:
-    """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, tags)."""
+) -> Iterator[tuple[int, int, bool, tuple[int, Tags]]]:
+    """Controls on edges: (edge, vertex > 0, whether the edge runs along the way, node's id and tags)."""
     chain_of, against = sides
     chains, ways, node_id = lines
     signed = {int(p.osm_id.removeprefix("node/")): p.tags for p in points if _kinds(p.tags)}
@@ -223,12 +246,15 @@ def _controls_on_edges(
             a, b = node_id[node[vertex - 1]], node_id[node[vertex]]
             nodes = ways[way[vertex - 1]].nodes
             with_way = bool(((nodes[:-1] == a) & (nodes[1:] == b)).any())
-            yield edge, vertex, with_way, signed[int(b)]
+            yield edge, vertex, with_way, (int(b), signed[int(b)])
 
 
 def _kinds(tags: Tags) -> list[str]:
     """Kinds of control at a point; a signalled crossing is also a signal."""
-    kind = tags.get("highway", "")
+    values = [value.strip() for value in tags.get("highway", "").split(";")]
+    if len(values) > 1:
+        return list(dict.fromkeys(kind for value in values for kind in _kinds({**tags, "highway": value})))
+    kind = values[0]
     if kind not in ("traffic_signals", "stop", "give_way", "crossing"):
         return []
     crossing = tags.get("crossing", "no" if kind != "crossing" else "unknown")

@@ -18,13 +18,18 @@ class RoadGraph:
     node_id  : (n,) int64 OSM node ids
     node_xyz : (n, 3) float64, scene frame, metres
     tail, head : (m,) int32 node indices: traffic runs from tail to head
-    geometry : (m,) object, each (k, 3) float64 centre line of the carriageway from tail to head, scene frame
+    geometry : (m,) object, each (k, 3) float64 centre line of the carriageway from tail to head, scene frame;
+               it begins and ends beside the nodes where the map's line is not the middle (``placement``)
     length   : (m,) float64, true metres in plan
     speed    : (m,) float64, speed limit in m/s
     speed_source : (m,) str: ``maxspeed``, ``zone`` (a legal default named by the map: ``DE:urban``) or
                    ``default`` (by road class)
     lanes    : (m,) float64, lanes in this direction; a half is a lane shared with the other direction
+    contraflow : (m,) float64, lanes against the traffic of a one-way street, for buses; 0 on other streets
     lanes_source : (m,) str: ``lanes`` or ``default``
+    lane_kinds, lane_widths, lane_turns : (m,) str, who may drive in each lane of this direction
+               (``driving|bus``), its metres (``3|3.5``) and the values of ``turn:lanes`` (``left|through``),
+               from left to right; "" where they are not mapped. Cycle lanes are among them (``biking``)
     width    : (m,) float64, metres of the whole carriageway (both directions)
     width_source : (m,) str: ``width``, ``est_width``, ``lanes`` (mapped lanes x the class's lane width) or
                    ``default``
@@ -67,6 +72,10 @@ class RoadGraph:
     speed: Float
     speed_source: NDArray[np.str_]
     lanes: Float
+    contraflow: Float
+    lane_kinds: NDArray[np.str_]
+    lane_widths: NDArray[np.str_]
+    lane_turns: NDArray[np.str_]
     lanes_source: NDArray[np.str_]
     width: Float
     width_source: NDArray[np.str_]

@@ -34,9 +34,11 @@ def write_graphml(graph: RoadGraph, frame: Frame, *, path: Path) -> None:
     Keys and values are those of ``osmnx.save_graphml``: all text; ``x`` and ``y`` are degrees, ``length``
     metres, ``lanes`` those of both directions, ``geometry`` WKT in degrees. Where the graph has heights,
     nodes have ``elevation`` and lines are ``LINESTRING Z``, scene metres. Added keys: ``*_source``;
-    ``lanes_ahead`` (this direction), ``edge`` (its number), ``twin`` (the number of the other direction),
-    ``turns`` (``no_left_turn 17`` names a restriction and the edge turned into, ``no_u_turn 12 17`` one via
-    other edges and these first) and ``controls`` (``12.5 stop``: metres from the tail).
+    ``lanes_ahead`` (this direction), ``contraflow`` (for buses against a one-way street), ``lane_kinds``,
+    ``lane_widths`` and ``lane_turns`` (of each lane, as in `RoadGraph`), ``edge`` (its number), ``twin`` (the
+    number of the other direction), ``turns`` (``no_left_turn 17`` names a restriction and the edge turned
+    into, ``no_u_turn 12 17`` one via other edges and these first) and ``controls`` (``12.5 stop``: metres
+    from the tail).
     """
     write_atomically(path, "\n".join(_document(graph, frame)).encode())
 
@@ -102,7 +104,7 @@ def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[s
 
 def _edge_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[str, str]]:
     turns, controls = _lists(graph)
-    both = graph.lanes + np.where(graph.twin >= 0, graph.lanes[graph.twin], 0.0)
+    both = graph.lanes + np.where(graph.twin >= 0, graph.lanes[graph.twin], graph.contraflow)
     seconds = graph.travel_time
     for k, wkt in enumerate(_wkt(graph, frame, tall=tall)):
         ways = [part.removeprefix("way/") for part in str(graph.osm_id[k]).split(";")]
@@ -120,7 +122,11 @@ def _edge_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[s
             "travel_time": f"{seconds[k]:.6f}",
             "lanes": f"{both[k]:g}",
             "lanes_ahead": f"{graph.lanes[k]:g}",
+            "contraflow": f"{graph.contraflow[k]:g}" if graph.contraflow[k] else "",
             "lanes_source": str(graph.lanes_source[k]),
+            "lane_kinds": str(graph.lane_kinds[k]),
+            "lane_widths": str(graph.lane_widths[k]),
+            "lane_turns": str(graph.lane_turns[k]),
             "width": f"{graph.width[k]:.6g}",
             "width_source": str(graph.width_source[k]),
             "layer": str(graph.layer[k]),
@@ -234,7 +240,11 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], *, frame:
         speed=column("speed_kph", float, dtype=float) / 3.6,
         speed_source=column("speed_source", str, dtype=np.str_),
         lanes=column("lanes_ahead", float, dtype=float),
+        contraflow=column("contraflow", lambda text: float(text or 0), dtype=float),
         lanes_source=column("lanes_source", str, dtype=np.str_),
+        lane_kinds=column("lane_kinds", str, dtype=np.str_),
+        lane_widths=column("lane_widths", str, dtype=np.str_),
+        lane_turns=column("lane_turns", str, dtype=np.str_),
         width=column("width", float, dtype=float),
         width_source=column("width_source", str, dtype=np.str_),
         oneway=column("oneway", "True".__eq__, dtype=np.bool_),

@@ -77,8 +77,10 @@ def build_junctions(roads: Carriageways, importance: Ints, *, wanted: Bools) -> 
     arms = _arms(roads)
     after, between, width, radius, tangent = _corners(roads, arms)
     count = np.bincount(arms.group)[arms.group]
+    apart = np.hypot(*(arms.start_xy[after] - arms.start_xy).T)
     straight = (
         (count == 2)
+        & (apart < _STEP)
         & (np.abs(between - np.pi) < _BEND)
         & (np.abs(width - width[after]) < _STEP)
         & (np.abs(arms.walk - arms.walk[after][:, ::-1]) < _STEP).all(axis=1)
@@ -97,12 +99,13 @@ def build_junctions(roads: Carriageways, importance: Ints, *, wanted: Bools) -> 
     stub, disc, taper = np.full((3, len(half)), None)
     stub[used] = _stubs(roads, arms, rows=used, length=np.maximum(reach + 0.5, half + 1.0)[used])
     disc[used] = shapely.buffer(
-        shapely.points(arms.node_xy[used]), np.minimum(width, width[after])[used] / 2, quad_segs=_QUAD
+        shapely.points(arms.start_xy[used]), np.minimum(width, width[after])[used] / 2, quad_segs=_QUAD
     )
     rounded = np.where(np.abs(between - np.pi) > _ROUNDED, radius, 0.0)
-    slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & (width[after] > width + _STEP)
+    wider = (width[after] > width + _STEP) | (apart > _STEP)
+    slanted = (count == 2) & (np.abs(between - np.pi) < _BENT) & wider
     tapered = np.flatnonzero(slanted & groups[arms.group])
-    taper[tapered] = _tapers(roads, arms, rows=tapered, widest=np.maximum(width, width[after])[tapered])
+    taper[tapered] = _tapers(roads, arms, rows=tapered, after=after[tapered], apart=apart[tapered])
     corner = _corner(np.stack([stub, stub[after], disc, taper], axis=1)[keep], rounded[keep])
 
     walk_width = np.minimum(arms.walk[:, 0], arms.walk[after][:, 1])[keep]
@@ -147,7 +150,7 @@ class _Arms:
     road, end : (a,) int64 row of the carriageways, and 0 for its start or 1 for its end
     angle : (a,) float64 direction away from the node
     walk  : (a, 2) float64 sidewalk widths on the left and the right, seen from the node
-    node_xy : (a, 2) float64
+    start_xy : (a, 2) float64 end of the centre line at the junction, which may lie beside the node
     """
 
     group: Ints
@@ -155,7 +158,7 @@ class _Arms:
     end: Ints
     angle: Float
     walk: Float
-    node_xy: Float
+    start_xy: Float
 
 
 def _arms(roads: Carriageways) -> _Arms:
@@ -169,11 +172,12 @@ def _arms(roads: Carriageways) -> _Arms:
     length = shapely.length(roads.line)
     ahead = np.where(end == 0, 1, -1) * np.minimum(5.0, length / 2)[road]
     there = shapely.get_coordinates(shapely.line_interpolate_point(roads.line[road], ahead))
-    away = there - roads.node_xy[node]
+    start_xy = shapely.get_coordinates(shapely.get_point(roads.line[road], np.where(end == 0, 0, -1)))
+    away = there - start_xy
     angle = np.arctan2(away[:, 1], away[:, 0])
     walk = np.where((end == 0)[:, None], roads.walk[road], roads.walk[road][:, ::-1])
     order = np.lexsort([end, road, angle, group])
-    return _Arms(group[order], road[order], end[order], angle[order], walk[order], roads.node_xy[node[order]])
+    return _Arms(group[order], road[order], end[order], angle[order], walk[order], start_xy[order])
 
 
 def _corners(roads: Carriageways, arms: _Arms) -> tuple[Ints, Float, Float, Float, Float]:
@@ -218,17 +222,20 @@ def carriageway(lines: NDArray[np.object_], half: Float) -> NDArray[np.object_]:
     return bands
 
 
-def _tapers(roads: Carriageways, arms: _Arms, *, rows: Ints, widest: Float) -> NDArray[np.object_]:
-    """Tapers (n,) between the ends of some arms (n,) and the next arms'; ``widest`` (n,) of both."""
+def _tapers(
+    roads: Carriageways, arms: _Arms, *, rows: Ints, after: Ints, apart: Float
+) -> NDArray[np.object_]:
+    """Tapers (n,) between the ends of some arms (n,) and the next arms (n,), metres ``apart`` (n,)."""
     width, line = roads.width[arms.road[rows]], roads.line[arms.road[rows]]
-    far = np.minimum(_SLANT * (widest - width), shapely.length(line) / 2)
+    other = roads.width[arms.road[after]]
+    far = np.minimum(_SLANT * np.maximum(other - width, 2 * apart), shapely.length(line) / 2)
     ahead = np.where(arms.end[rows] == 0, far, -np.maximum(far, 1e-9))
     there = shapely.get_coordinates(shapely.line_interpolate_point(line, ahead))
     across = np.stack([-np.sin(arms.angle[rows]), np.cos(arms.angle[rows])], axis=1) / 2
-    node = arms.node_xy[rows]
+    start = arms.start_xy[after]
     corners = [
-        node + across * widest[:, None],
-        node - across * widest[:, None],
+        start + across * other[:, None],
+        start - across * other[:, None],
         there - across * width[:, None],
         there + across * width[:, None],
     ]
@@ -252,9 +259,9 @@ def _wedges(arms: _Arms, between: Float, *, reach: Float) -> NDArray[np.object_]
     turn = np.linspace(0.0, 1.0, 9)
     angle = arms.angle[:, None] + between[:, None] * turn
     radius = (2.0 * reach + 60.0)[:, None]
-    rim = arms.node_xy[:, None] + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2)
+    rim = arms.start_xy[:, None] + np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=2)
     # Arms in one direction have no angle between them, and a full turn on their other sides.
-    ring = np.concatenate([arms.node_xy[:, None], rim], axis=1)
+    ring = np.concatenate([arms.start_xy[:, None], rim], axis=1)
     around = between > 2 * np.pi - _ONE_DIRECTION
     ring[around, 0] = rim[around, 0]
     wedges: NDArray[np.object_] = shapely.polygons(ring)

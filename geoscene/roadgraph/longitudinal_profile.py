@@ -400,9 +400,11 @@ def _with_heights(graph: RoadGraph, stations: Stations, *, z: Float) -> RoadGrap
     begin = np.flatnonzero(np.diff(stations.edge, prepend=-1))
     for start, stop in zip(begin.tolist(), [*begin[1:].tolist(), len(stations.edge)], strict=True):
         edge, row = int(stations.edge[start]), stations.row[start:stop]
+        place = stations.place[start:stop]
         if np.ptp(z[row]) < 1e-3:
-            row = row[stations.drawn[start:stop]]
-        line = np.column_stack([stations.xy[row], z[row]])
+            drawn = stations.drawn[start:stop]
+            row, place = row[drawn], place[drawn]
+        line = np.column_stack([place, z[row]])
         geometry[edge] = line
         if graph.twin[edge] >= 0:
             geometry[graph.twin[edge]] = line[::-1].copy()

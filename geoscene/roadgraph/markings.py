@@ -13,8 +13,7 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.carriageways import MINOR, PAVED, Carriageways
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.junctions import junction_reach
-from geoscene.roadgraph.lane_uses import LaneUses
-from geoscene.roadgraph.lanes import LaneLayout, graph_lanes, lane_layout
+from geoscene.roadgraph.lanes import LaneLayout, graph_lanes, street_lanes
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
 from geoscene.support.columns import Columns, nth
@@ -62,8 +61,8 @@ class PaintedStretches(Columns):
         return replace(taken, layout=self.layout.take(rows))
 
 
-def painted_stretches(roads: Carriageways) -> PaintedStretches:
-    """The stretches of the carriageways that have any paint along them."""
+def painted_stretches(roads: Carriageways, *, left_hand: bool) -> PaintedStretches:
+    """The stretches of the carriageways that have any paint along them; ``left_hand``: traffic keeps left."""
     keep = np.array([s.highway not in MINOR for s in roads.street], np.bool_)
     streets, of = roads.take(keep), np.flatnonzero(keep)
     reach, _ = junction_reach(streets)
@@ -79,10 +78,7 @@ def painted_stretches(roads: Carriageways) -> PaintedStretches:
         length = float(shapely.length(streets.line[row]))
         lines[k] = shapely.linestrings(polylines.cut(xy, reach[row, 0], end=length - reach[row, 1]))
     chosen = [streets.street[row] for row in rows.tolist()]
-    lanes = np.array([s.lanes for s in chosen], float).reshape(-1, 2)
-    two_way = np.array([s.direction == 0 for s in chosen], np.bool_)
-    lanes = np.where(two_way[:, None], lanes, lanes.sum(axis=1, keepdims=True))
-    layout = lane_layout(lanes[:, 0], lanes[:, 1], two_way=two_way, width=streets.width[rows])
+    layout = street_lanes(chosen, streets.width[rows], left_hand=left_hand)
     return PaintedStretches(of[rows], lines, junction[rows], layout)
 
 
@@ -140,15 +136,25 @@ def _offsets(
     for k, row in enumerate(stretches.row.tolist()):
         street, uses = roads.street[row], roads.uses[row]
         count, own, shared = int(layout.count[k]), int(layout.own[k]), bool(layout.shared[k])
-        lane, width = float(layout.width[k]), float(layout.carriageway[k])
+        width = float(layout.carriageway[k])
         # Lanes along the line lie on its right, or on its left where traffic keeps left.
         aside = -1.0 if left_hand else 1.0
-        of_side = (own, int(layout.other[k]) or own)
-        buses = _bus_borders(uses, of_side, count=count, left_hand=left_hand)
+        of_side = (own, count - own - shared)
+        buses, bicycles = (
+            _borders_of(lanes, of_side, count=count, left_hand=left_hand)
+            for lanes in (uses.bus, uses.bicycles)
+        )
         for i in range(1, count if roads.marked[row] else 1):
-            between = street.direction == 0 and abs(i - own - 0.5 * shared) < 0.75
-            style = _SOLID if between else _BUS if i in buses else _BROKEN
-            found.append((k, aside * (i - count / 2) * lane, style, "busway" if style == _BUS else ""))
+            between = min(of_side) > 0 or shared
+            if between and abs(i - own - 0.5 * shared) < 0.75:
+                style, kind = _SOLID, ""
+            elif i in buses:
+                style, kind = _BUS, "busway"
+            elif i in bicycles:
+                style, kind = _SOLID, "cycleway"
+            else:
+                style, kind = _BROKEN, ""
+            found.append((k, -aside * float(layout.borders[k, i]), style, kind))
         if roads.marked[row] and street.highway.removesuffix("_link") in _EDGED:
             for side, sign in ((0, 1.0), (1, -1.0)):
                 if roads.walk[row, side] == 0 and width > 4 * _EDGE_IN:
@@ -169,14 +175,21 @@ def _offsets(
     )
 
 
-def _bus_borders(uses: LaneUses, lanes: tuple[int, int], *, count: int, left_hand: bool) -> set[int]:
-    """Numbers of the lines beside bus lanes, counted from the kerb of the forward lanes.
+def _borders_of(
+    chosen: tuple[tuple[int, ...], tuple[int, ...]],
+    lanes: tuple[int, int],
+    *,
+    count: int,
+    left_hand: bool,
+) -> set[int]:
+    """Numbers of the lines beside chosen lanes, counted from the kerb of the forward lanes.
 
-    lanes : number of lanes along the line, and against it
+    chosen : numbers of lanes along the line and against it, from left to right as driven
+    lanes  : number of lanes along the line, and against it
     """
     found = set()
     for side in (0, 1):
-        for lane in uses.bus[side]:
+        for lane in chosen[side]:
             from_kerb = lane if left_hand else lanes[side] - 1 - lane
             first = from_kerb if side == 0 else count - 1 - from_kerb
             found |= {first, first + 1}
@@ -255,7 +268,7 @@ def _strips(graph: RoadGraph, crossings: NDArray[np.object_]) -> dict[int, list[
 def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand: bool) -> SurfaceRows:
     """Painted bands across the lanes of edges: (edge, metres from its tail, kind of control)."""
     shapes, edges = [], []
-    divider = graph_lanes(graph).divider
+    divider = graph_lanes(graph, left_hand=left_hand).divider
     for edge, place, kind in lines:
         xy = graph.geometry[edge][:, :2]
         plan = polylines.length(xy)

@@ -37,6 +37,7 @@ class Stations:
     edge    : (r,) int64 edge of each row
     along   : (r,) float64 scene metres in plan from the edge's tail
     drawn   : (r,) bool, the row is a vertex of the edge's line, not an inserted point
+    place   : (r, 2) float64 scene metres of each row on its edge's line, which may end beside its nodes
     """
 
     xy: Float
@@ -44,6 +45,7 @@ class Stations:
     edge: Ints
     along: Float
     drawn: Bools
+    place: Float
 
     @property
     def segments(self) -> tuple[Ints, Ints, Float, Ints]:
@@ -105,7 +107,8 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     once = np.flatnonzero((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
     if not len(once):
         none = np.empty(0, np.int64)
-        return Stations(graph.node_xyz[:, :2], none, none, np.empty(0), np.empty(0, np.bool_))
+        empty = np.empty(0), np.empty(0, np.bool_), np.empty((0, 2))
+        return Stations(graph.node_xyz[:, :2], none, none, *empty)
     lines = [graph.geometry[edge][:, :2] for edge in once.tolist()]
     xy, of = np.concatenate(lines), np.repeat(np.arange(len(once)), [len(line) for line in lines])
     first, last = np.flatnonzero(np.diff(of, prepend=-1)), np.flatnonzero(np.diff(of, append=-1))
@@ -131,6 +134,7 @@ def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
         edge,
         corner[vertex] + share * metres[vertex],
         part == 0,
+        places,
     )
 
 

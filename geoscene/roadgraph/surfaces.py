@@ -84,7 +84,7 @@ def road_surfaces(
     strips = crossings.polygon[crossings.priority == crossings.priority.min(initial=np.inf)]
     paths = SurfaceRows.concatenate([square_surfaces(osm, frame), path_surfaces(osm, frame)])
     carriageways, count = _carriageway_rows(roads, edge, first=len(paths), area=area)
-    stretches = painted_stretches(roads)
+    stretches = painted_stretches(roads, left_hand=options.left_hand)
     lines = marking_rows(roads, stretches, edge=edge, left_hand=options.left_hand)
     stops = stop_rows(graph, roads, crossings=strips, left_hand=options.left_hand)
     taken = np.concatenate([strips, stops.polygon])
@@ -125,7 +125,9 @@ def _beside(roads: Carriageways) -> Float:
 def _junction_reach(roads: Carriageways) -> Float:
     """Upper bound (n,) in metres from each node to the border of its junction; 0 without one."""
     reach = np.zeros(len(roads.node_xy))
-    np.maximum.at(reach, roads.ends.ravel(), np.repeat(_beside(roads), 2) + JOINT)
+    starts, ends = (shapely.get_coordinates(shapely.get_point(roads.line, k)) for k in (0, -1))
+    off = np.linalg.norm(np.stack([starts, ends], axis=1) - roads.node_xy[roads.ends], axis=2)
+    np.maximum.at(reach, roads.ends.ravel(), (_beside(roads)[:, None] + off).ravel() + JOINT)
     reach[np.bincount(roads.ends.ravel(), minlength=len(reach)) < 2] = 0.0
     return reach
 

@@ -139,7 +139,8 @@ def symbol_rows(
     shapes, rows, sources = [], [], []
     for k, row in enumerate(own.row.tolist()):
         for side in (0, 1):
-            if roads.street[row].direction == (-1 if side == 0 else 1):
+            lanes = int((own.layout.own if side == 0 else own.layout.other)[k])
+            if roads.street[row].direction == (-1 if side == 0 else 1) and not lanes:
                 continue
             xy = shapely.get_coordinates(own.line[k])
             length = polylines.length(xy)
@@ -193,7 +194,8 @@ def _symbols(
     """
     row = int(stretch.row[0])
     street, uses, layout = roads.street[row], roads.uses[row], stretch.layout
-    lanes = int(layout.own[0] if side == 0 or street.direction else layout.other[0])
+    lanes = int(layout.own[0] if side == 0 else layout.other[0])
+    against = street.direction == (-1 if side == 0 else 1)  # only buses and bicycles ride there
     left = _middles(stretch, uses, lanes=lanes, side=side, left_hand=left_hand)
 
     turns = uses.turns[side]
@@ -210,11 +212,16 @@ def _symbols(
         for start in _repeat(travel, word("BUS"), kind="bus"):
             for lane in sorted(buses):
                 yield "busway", travel.laid(word("BUS"), start, left=left[lane])
-    if uses.speed and (enters or not uses.zone):
+    bicycles = {lane for lane in uses.bicycles[side] if lane < lanes}
+    if bicycles:
+        for start in _repeat(travel, bicycle(), kind="lane"):
+            for lane in sorted(bicycles):
+                yield "cycleway", travel.laid(bicycle(), start, left=left[lane])
+    if uses.speed and (enters or not uses.zone) and not against:
         for start in _repeat(travel, word(uses.speed), kind="speed"):
-            for lane in sorted(set(range(lanes)) - buses):
+            for lane in sorted(set(range(lanes)) - buses - bicycles):
                 yield "maxspeed", travel.laid(word(uses.speed), start, left=left[lane])
-    for which, cycle in enumerate(uses.cycle):
+    for which, cycle in enumerate(() if against else uses.cycle):
         on_left = which == side  # as seen in the direction of travel
         usual = street.direction != 0 or on_left == left_hand
         if cycle is None or usual == cycle.against:
@@ -233,10 +240,12 @@ def _middles(
     Of lanes that a cycle lane lies on, the middle of what it leaves.
     """
     layout = stretch.layout
-    width, half = float(layout.width[0]), float(layout.span[0]) / 2
+    borders = layout.borders[0, : int(layout.count[0]) + 1]
+    if side:
+        borders = -borders[::-1]
     from_kerb = np.arange(lanes) if left_hand else np.arange(lanes)[::-1]
     kept = 1.0 if left_hand else -1.0
-    edges = kept * (half - (from_kerb[:, None] + [0.0, 1.0]) * width)
+    edges = kept * borders[from_kerb[:, None] + [0, 1]]
     # Cycle lanes on the left and right, as seen in the direction of travel.
     beside = uses.cycle[::-1] if side else uses.cycle
     free = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Literal
 
@@ -14,8 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.lanes import graph_lanes
-from geoscene.roadgraph.routing import turns_back
+from geoscene.roadgraph.lanes import LaneLayout, edge_lanes, graph_lanes
+from geoscene.roadgraph.routing import HEADING_REACH, turns_back
+from geoscene.roadgraph.turn_lanes import lanes_by_turn
 from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.motion.random_route import random_edges
@@ -144,13 +146,16 @@ def _cut(line: Float, begin: float, *, end: float) -> Float:
     return polylines.cut(line, begin * total, end=end * total)
 
 
-def _joined_lanes(a: Float, b: Float, *, reach: float, change: float) -> tuple[Float, Float]:
+def _joined_lanes(a: Float, b: Float, *, reach: float) -> tuple[Float, Float]:
     """Two lanes that follow each other, joined within ``reach``.
 
-    Straight on, a lane that lies ``change`` metres further out than the other is left over five times that
-    length. In a turn the lanes are cut where they cross, or extended to where they meet.
+    Straight on, a lane that lies beside the other is left over five times the metres between them. In a turn
+    the lanes are cut where they cross, or extended to where they meet.
     """
     u, v = polylines.unit(a[-1, :2] - a[-2, :2]), polylines.unit(b[1, :2] - b[0, :2])
+    ahead = polylines.unit(u + v)
+    gap = b[0, :2] - a[-1, :2]
+    change = float(ahead[0] * gap[1] - ahead[1] * gap[0])
     if abs(change) > _STEP and u @ v > _STRAIGHT:
         long_a, long_b = polylines.length(a), polylines.length(b)
         taper = 2.5 * abs(change)
@@ -168,12 +173,26 @@ def _joined_lanes(a: Float, b: Float, *, reach: float, change: float) -> tuple[F
             return _cut(a, 0.0, end=max(at_one, 1e-6)), _cut(b, min(at_two, 1 - 1e-6), end=1.0)
     sine = u[0] * v[1] - u[1] * v[0]
     if abs(sine) > 0.2:
-        gap = b[0, :2] - a[-1, :2]
         on_a, on_b = (gap[0] * v[1] - gap[1] * v[0]) / sine, (gap[0] * u[1] - gap[1] * u[0]) / sine
         if 0 < on_a < reach and -reach < on_b < 0:
             corner = np.append(a[-1, :2] + on_a * u, 0.5 * (a[-1, 2] + b[0, 2]))
             return np.concatenate([a, corner[None]]), b
     return a, b
+
+
+def _turning_lane(graph: RoadGraph, layout: LaneLayout, *, edge: int, following: int, side: Side) -> int:
+    """Number from the kerb of the outermost lane of an edge for cars whose arrow leads into the next edge."""
+    left_hand = side == "left"
+    out = np.flatnonzero(graph.tail == graph.head[edge])
+    out = out[out != graph.twin[edge]]
+    _, leaves = polylines.end_headings(graph.geometry[edge], reach=HEADING_REACH)
+    enters = [polylines.end_headings(graph.geometry[e], reach=HEADING_REACH)[0] for e in out.tolist()]
+    turns = (np.array(enters) - leaves + np.pi) % (2 * np.pi) - np.pi
+    lanes = edge_lanes(graph, edge)
+    leading = lanes_by_turn(lanes, turns, left_hand=left_hand)[out.tolist().index(following)]
+    from_kerb = sorted(lane if left_hand else len(lanes) - 1 - lane for lane in leading)
+    closed = layout.closed[edge]
+    return next((lane for lane in from_kerb if not closed[lane]), int(layout.take([edge]).open_lane()[0]))
 
 
 def lane_route(
@@ -184,13 +203,18 @@ def lane_route(
     side: Side = "right",
     body_width: float = 1.82,
 ) -> Route:
-    """The route along edges, in the outer lane of each.
+    """The route along edges, in the outermost lane of each that is open to cars and leads into the next.
 
     edges : (k,) each follows from the one before
     ends  : true metres from the first edge's tail to the start, and from the last one's tail to the end
     """
     order = np.asarray(edges, np.int32)
-    offset = graph_lanes(graph).offsets(body_width=body_width, clearance=_KEEP)
+    layout = graph_lanes(graph, left_hand=side == "left")
+    chosen = layout.open_lane()
+    for edge, following in pairwise(order.tolist()):
+        if graph.lane_turns[edge]:
+            chosen[edge] = _turning_lane(graph, layout, edge=edge, following=following, side=side)
+    offset = layout.offsets(chosen, body_width=body_width, clearance=_KEEP)
     offset = offset * (-1.0 if side == "right" else 1.0)
     lanes: list[Float] = []
     for k, e in enumerate(order):
@@ -204,8 +228,7 @@ def lane_route(
     for k in range(len(order) - 1):
         if not rounds[k]:
             reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
-            change = float(offset[order[k + 1]] - offset[order[k]])
-            lanes[k], lanes[k + 1] = _joined_lanes(lanes[k], lanes[k + 1], reach=reach, change=change)
+            lanes[k], lanes[k + 1] = _joined_lanes(lanes[k], lanes[k + 1], reach=reach)
     sizes = np.array([len(lane) for lane in lanes])
     last = np.cumsum(sizes) - 1
     turns = last[rounds].tolist()

@@ -74,7 +74,7 @@ def lanes_of(
                 outside
     cut_nodes : ids of nodes from which streets continue that the graph does not have
     """
-    layout = graph_lanes(graph)
+    layout = graph_lanes(graph, left_hand=side == "left")
     single = layout.count == 1
     lane_width = np.where(single & layout.shared, graph.width / 2, layout.width) - _SIDE
     max_width = np.where(single & ~layout.shared, graph.width - 2 * _KERB, lane_width)
@@ -153,7 +153,7 @@ def lane_shift(lanes: Lanes, edge: int, *, lane: int, width: float, kerb: bool =
         half = (float(lanes.graph.width[edge]) - width) / 2
         room = max(half - _KERB, 0.0)
         return float(np.clip(half - 2 * _KERB, -room, room))
-    return float(lanes.layout.take(edge).offsets(lane, body_width=width, clearance=_KERB))
+    return float(lanes.layout.take([edge]).offsets(lane, body_width=width, clearance=_KERB)[0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +180,12 @@ def edge_name(graph: RoadGraph, edge: int) -> str:
     return f"{graph.osm_id[edge]} from {ends[0]} to {ends[1]}"
 
 
+def open_lanes(lanes: Lanes, edge: int, *, any_kind: bool = False) -> Ints:
+    """Numbers of the lanes of an edge that cars may use; with ``any_kind``, or without such lanes, of all."""
+    closed = lanes.layout.closed[edge, : int(lanes.count[edge])]
+    return np.arange(len(closed)) if any_kind or closed.all() else np.flatnonzero(~closed)
+
+
 def random_lanes(
     lanes: Lanes,
     rng: np.random.Generator,
@@ -189,11 +195,14 @@ def random_lanes(
     metres: float,
     inside: NDArray[np.bool_],
     width: float,
+    any_kind: bool = False,
 ) -> tuple[list[int], list[int]]:
     """Edges and lanes of a random drive from an edge, up to ``metres`` or out of the edges ``inside``.
 
     From the kerb lane, road users go straight on or turn towards the kerb; from the innermost lane straight
     on or away from it, if possible. Straight on is preferred.
+
+    any_kind : also use lanes that are closed to cars
     """
     edges, picked = [edge], [lane]
     far = float(lanes.graph.length[edge])
@@ -213,21 +222,22 @@ def random_lanes(
         weight = lanes.traffic_weight[ways] * np.where(np.abs(turns) < _STRAIGHT, 3.0, 1.0)
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
         weight = weight * np.where(lanes.leads_on[states], 1.0, 1e-9)
-        if lanes.count[edge] > 1:
+        here = open_lanes(lanes, edge, any_kind=any_kind)
+        if len(here) > 1:
             inward = turns * lanes.side > _STRAIGHT
             outward = turns * lanes.side < -_STRAIGHT
-            weight = np.where((lane > 0) & outward, 1e-6 * weight, weight)
-            weight = np.where((lane < lanes.count[edge] - 1) & inward, 1e-6 * weight, weight)
+            weight = np.where((lane > here[0]) & outward, 1e-6 * weight, weight)
+            weight = np.where((lane < here[-1]) & inward, 1e-6 * weight, weight)
         k = int(np.searchsorted(np.cumsum(weight), rng.random() * weight.sum(), side="right"))
         k = min(k, len(ways) - 1)
         state, following = int(states[k]), int(ways[k])
-        most = int(lanes.count[following]) - 1
+        there = open_lanes(lanes, following, any_kind=any_kind)
         if turns[k] * lanes.side > _STRAIGHT:
-            lane = most
+            lane = int(there[-1])
         elif turns[k] * lanes.side < -_STRAIGHT:
-            lane = 0
+            lane = int(there[0])
         else:
-            lane = min(lane, most)
+            lane = int(there[np.argmin(np.abs(there - lane))])
         edge = following
         edges.append(edge)
         picked.append(lane)

@@ -13,7 +13,15 @@ from geoscene.geometry import polylines
 from geoscene.typing import Float
 from lidar.geometry.random_streams import generator
 from lidar.motion.vehicle import DRY, GRAVITY, RoadConditions
-from lidar.traffic.lanes import STEP, ActorPath, Lanes, edge_name, path_along_lanes, random_lanes
+from lidar.traffic.lanes import (
+    STEP,
+    ActorPath,
+    Lanes,
+    edge_name,
+    open_lanes,
+    path_along_lanes,
+    random_lanes,
+)
 from lidar.traffic.surroundings import TrafficArea, entrances
 from lidar.traffic.sweep import body_poses, rectangles
 from lidar.world.actor_shapes import PAINTS, ActorShape, catalogue
@@ -215,7 +223,8 @@ def _trip(
         int(rng.choice(len(shares), p=np.array(list(shares.values())) / sum(shares.values())))
     ]
     driver = driver_on(DRIVERS[kind], road)
-    lane = 0 if driver.keeps_kerb else int(rng.integers(lanes.count[edge]))
+    usable = open_lanes(lanes, edge, any_kind=driver.keeps_kerb)
+    lane = 0 if driver.keeps_kerb else int(usable[rng.integers(len(usable))])
     shape, grow = random_shape(kind, rng), random_stretch(rng)
     pace = float(np.clip(rng.normal(1.0, 0.06), 0.85, 1.1)) * road.pace
     width = shape.width * grow[1]
@@ -225,7 +234,14 @@ def _trip(
     metres = min(top * (span[1] - span[0]), _MAX_LENGTH) + 60.0
     for _ in range(_TRIES):
         edges, picked = random_lanes(
-            lanes, rng, edge=edge, lane=lane, metres=metres, inside=area.near, width=width
+            lanes,
+            rng,
+            edge=edge,
+            lane=lane,
+            metres=metres,
+            inside=area.near,
+            width=width,
+            any_kind=driver.keeps_kerb,
         )
         whole = path_along_lanes(
             lanes,

@@ -28,6 +28,8 @@ def road_graph(nodes, pairs, *, twoway=True, width=7.0, speed=13.9, lanes=1.0, b
         "lanes": np.full(m, lanes),
         "width": np.full(m, width),
         "highway": np.full(m, "residential"),
+        "contraflow": np.zeros(m),
+        **{name: np.full(m, "") for name in ("lane_kinds", "lane_widths", "lane_turns")},
         "bridge": np.zeros(m, bool),
         "tunnel": np.zeros(m, bool),
     } | {name: np.asarray(value) for name, value in columns.items()}

@@ -279,3 +279,113 @@ def test_connecting_curve_is_near_an_arc_of_the_stated_length(heading, turn, cho
     assert curve.length == pytest.approx(arc, rel=0.06)
     c, s = np.cos(heading), np.sin(heading)
     np.testing.assert_allclose([c * u[-1] - s * v[-1], s * u[-1] + c * v[-1]], end, atol=1e-9)
+
+
+CROSSING = [(-200, 0), (0, 0), (200, 0), (0, 200), (0, -200)]
+ARMS = [(0, 1), (1, 2), (1, 3), (1, 4)]  # one road in; straight on, to the left, to the right
+
+
+def _crossing(kinds="", turns="", widths="", *, lanes=3.0, ahead=2.0):
+    """A one-way road of several lanes that ends at a crossing of two-way streets."""
+    oneway = [False, False, True, True]
+    graph = road_graph(CROSSING, ARMS, twoway=oneway, width=9.75)
+    count = np.where(graph.tail == 0, lanes, np.where(graph.twin < 0, ahead, 1.0))
+    first = graph.tail == 0
+    columns = {"lane_kinds": kinds, "lane_turns": turns, "lane_widths": widths}
+    texts = {name: np.where(first, text, "") for name, text in columns.items()}
+    return replace(graph, lanes=count.astype(float), **texts)
+
+
+def _lanes_by_target(path):
+    """Lanes of the first road that lead into each other road."""
+    document, _ = _roads(path)
+    road_of = {e.get("id"): e.find("link/successor").get("elementId") for e in document.iter("road")
+               if e.get("junction") != "-1"}  # fmt: skip
+    found: dict[str, list[int]] = {}
+    for connection in document.iter("connection"):
+        if connection.get("incomingRoad") == "1":
+            links = [int(link.get("from")) for link in connection.iter("laneLink")]
+            found.setdefault(road_of[connection.get("connectingRoad")], []).extend(links)
+    return {target: sorted(lanes, key=abs) for target, lanes in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("turns", "right_hand", "left_hand"),
+    [
+        # roads 2 straight on, 3 to the left, 4 to the right
+        ("left|through|right", {"2": [-2], "3": [-1], "4": [-3]}, {"2": [2], "3": [3], "4": [1]}),
+        ("left|left;through|right", {"2": [-2], "3": [-1], "4": [-3]}, {"2": [2], "3": [3], "4": [1]}),
+        ("left|through|through;right", {"2": [-2, -3], "3": [-1], "4": [-3]},
+         {"2": [1, 2], "3": [3], "4": [1]}),
+        ("left||", {"2": [-2, -3], "3": [-1], "4": [-3]}, {"2": [1, 2], "3": [3], "4": [1]}),
+        ("||right", {"2": [-1, -2], "3": [-1], "4": [-3]}, {"2": [2, 3], "3": [3], "4": [1]}),
+        ("left|none|right", {"2": [-2], "3": [-1], "4": [-3]}, {"2": [2], "3": [3], "4": [1]}),
+        ("||merge_to_left", {"2": [-1, -2, -3], "3": [-1], "4": [-2]}, {"2": [1, 2, 3], "3": [3], "4": [2]}),
+        ("slight_left|through|slight_right", {"2": [-2], "3": [-1], "4": [-3]},
+         {"2": [2], "3": [3], "4": [1]}),
+    ],
+)  # fmt: skip
+def test_lanes_lead_where_their_arrows_point(scene, tmp_path, turns, right_hand, left_hand):
+    turns = turns.replace("none", "")
+    for keeps_left, expected in ((False, right_hand), (True, left_hand)):
+        path = _write(_crossing(turns=turns), _keeping(scene, keeps_left), tmp_path)
+        assert _lanes_by_target(path) == expected
+        _check_links(path)
+
+
+def test_without_arrows_every_lane_leads_somewhere(scene, tmp_path):
+    path = _write(_crossing(), _keeping(scene, left_hand=False), tmp_path)
+    assert _lanes_by_target(path) == {"2": [-1, -2], "3": [-1], "4": [-3]}
+    ending = _write(_crossing(turns="|through|", ahead=1.0), _keeping(scene, left_hand=False), tmp_path)
+    assert {lane for lanes in _lanes_by_target(ending).values() for lane in lanes} == {-1, -2, -3}
+
+
+@pytest.mark.parametrize("keeps_left", [False, True])
+def test_lanes_for_buses_have_their_type_and_their_own_connections(scene, tmp_path, keeps_left):
+    kinds = "bus|driving|driving" if keeps_left else "driving|driving|bus"
+    path = _write(_crossing(kinds=kinds), _keeping(scene, keeps_left), tmp_path)
+    _, roads_by_id = _roads(path)
+    side = "left" if keeps_left else "right"
+    types = {
+        abs(int(lane.get("id"))): lane.get("type")
+        for lane in roads_by_id["1"].element.findall(f"lanes/laneSection/{side}/lane")
+    }
+    assert types == {1: "driving", 2: "driving", 3: "bus"}
+    through = [r for r in roads_by_id.values() if r.element.get("junction") != "-1"]
+    from_bus = [
+        lane.get("type")
+        for road in through
+        for lane in road.element.iter("lane")
+        if (before := lane.find("link/predecessor")) is not None
+        and abs(int(before.get("id"))) == 3
+        and road.element.find("link/predecessor").get("elementId") == "1"
+    ]
+    assert from_bus
+    assert set(from_bus) == {"bus"}
+    _check_links(path)
+
+
+def test_a_lane_for_buses_against_a_one_way_road_is_on_its_other_side(scene, tmp_path):
+    graph = road_graph([(0, 0), (200, 0)], [(0, 1)], twoway=False, width=9.75, lanes=2.0)
+    graph = replace(graph, contraflow=np.ones(1))
+    _, found = _roads(_write(graph, scene, tmp_path))
+    types = {int(lane.get("id")): lane.get("type") for lane in found["1"].element.iter("lane")}
+    assert types == {1: "bus", 0: "none", -1: "driving", -2: "driving"}
+    lanes = found["1"].lanes(0)
+    np.testing.assert_allclose(lanes[1][:, 1], [1.625, 4.875], atol=1e-5)
+    np.testing.assert_allclose(lanes[-2][:, 1], [-1.625, -4.875], atol=1e-5)
+
+
+@pytest.mark.parametrize("keeps_left", [False, True])
+def test_lanes_of_their_own_widths_are_continuous(scene, tmp_path, keeps_left):
+    graph = _crossing(widths="3|3.5|2.5", turns="left|through|right")
+    path = _write(graph, _keeping(scene, keeps_left), tmp_path)
+    assert _check_links(path) >= 8
+    _, found = _roads(path)
+    side = "left" if keeps_left else "right"
+    lanes = found["1"].element.findall(f"lanes/laneSection/{side}/lane")
+    lanes = [lane for lane in lanes if lane.get("type") == "driving"]
+    widths = [
+        float(lane.find("width").get("a")) for lane in sorted(lanes, key=lambda e: abs(int(e.get("id"))))
+    ]
+    assert widths == ([2.5, 3.5, 3.0] if keeps_left else [3.0, 3.5, 2.5])

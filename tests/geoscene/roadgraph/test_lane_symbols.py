@@ -202,8 +202,8 @@ def test_roads_without_paint_have_no_symbols(tags):
 )
 def test_odd_values_of_turn_lanes_are_read_or_reported(text):
     tags = {"highway": "primary", "oneway": "yes", "lanes": "2", "turn:lanes": text}
-    street, _ = read_street(tags)
-    uses, unread = read_lane_uses(tags, street)
+    street, unread = read_street(tags)
+    uses = read_lane_uses(tags, street)
     assert len(unread) == (text.count("|") != 1)
     assert all(turn in TURNS for lane in uses.turns[0] for turn in lane)
-    assert read_lane_uses({"highway": "primary"}, street)[0] == NO_USES
+    assert read_lane_uses({}, read_street({"highway": "primary"})[0]) == NO_USES

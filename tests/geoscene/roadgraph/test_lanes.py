@@ -173,9 +173,9 @@ def test_lane_markings_lie_between_driven_lanes(side: Side, tags):
     frame = Frame.at(0.001, 0.0)
     left_hand = side == "left"
     roads = read_carriageways(osm, frame, sidewalks="mapped", left_hand=left_hand)
-    _, painted, _, _ = _offsets(roads, painted_stretches(roads), left_hand=left_hand)
+    _, painted, _, _ = _offsets(roads, painted_stretches(roads, left_hand=left_hand), left_hand=left_hand)
     graph, _ = build_road_graph(osm, frame)
-    lanes = graph_lanes(graph)
+    lanes = graph_lanes(graph, left_hand=left_hand)
     ahead = graph.geometry[0][-1, 0] > graph.geometry[0][0, 0]
     driven = []
     for edge in range(2):

@@ -28,7 +28,8 @@ from geoscene.roadgraph.routing import (
     turn_states,
     turn_table,
 )
-from geoscene.roadgraph.tags import drivable, read_street, speed_limit
+from geoscene.roadgraph.speeds import speed_limit
+from geoscene.roadgraph.tags import drivable, read_street
 from geoscene.sources import read_osm
 from geoscene.sources.data import OsmData, Relation, TaggedNode, Way
 
@@ -140,6 +141,7 @@ def test_tags_decide_the_permitted_directions(tags, pairs):
         ("10 knots", 18.52, "maxspeed"),
         ("50;30", 30, "maxspeed"),
         ("walk", 7, "maxspeed"),
+        ("none", 130, "maxspeed"),
         ("DE:urban", 50, "zone"),
         ("DE:rural", 100, "zone"),
         ("RU:urban", 60, "zone"),
@@ -154,7 +156,7 @@ def test_speed_limits_as_mappers_write_them(text, kmh, source):
     assert told == source
 
 
-@pytest.mark.parametrize("text", ["none", "signals", "fast", "", "-5", "0", "XX:nowhere"])
+@pytest.mark.parametrize("text", ["signals", "fast", "", "-5", "0", "XX:nowhere"])
 def test_speed_limit_without_a_number_is_ignored(text):
     assert speed_limit(text) is None
 
