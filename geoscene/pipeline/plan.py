@@ -560,6 +560,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     boxes = np.concatenate(
         [
             carriageway_boxes(roads.carriageways),
+            shapely.bounds(made.polygon[np.char.startswith(made.osm_id, "node/")]).reshape(-1, 4),
             *(boxes for _, boxes, _ in found.values()),
             shapely.bounds(structures.polygon).reshape(-1, 4),
             shapely.bounds(wires.lines).reshape(-1, 4),

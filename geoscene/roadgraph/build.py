@@ -14,7 +14,7 @@ from geoscene.roadgraph.chains import RoadChain, Runs, add_controls, chains_of, 
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import lane_column
 from geoscene.roadgraph.streets import move_aside, read_streets
-from geoscene.roadgraph.tags import Street
+from geoscene.roadgraph.tags import Street, find_odd_diameters
 from geoscene.sources.data import OsmData, Relation, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
@@ -53,6 +53,7 @@ def build_road_graph(
     """
     options = options or RoadOptions()
     problems: list[Problem] = []
+    problems += find_odd_diameters(osm.points)
     ways, streets, remarks = read_streets(osm, private=options.private, left_hand=options.left_hand)
     problems += [
         Problem(osm_id, "road", "repaired", reason, detail)

@@ -28,8 +28,8 @@ class SurfaceRows(Columns):
     priority : (n,) float64
     osm_id   : (n,) str, the way, node or relation
     source   : (n,) str, sources of shape and material, as ``shape/material``: shape is ``width``,
-               ``est_width``, ``lanes`` or ``default`` (where the width comes from), ``sidewalk``, ``turn``,
-               ``cycleway``, ``busway``, ``maxspeed`` (tags),
+               ``est_width``, ``lanes`` or ``default`` (where the width comes from), ``diameter``,
+               ``sidewalk``, ``turn``, ``cycleway``, ``busway``, ``maxspeed`` (tags),
                ``area``, ``crossing`` (tag), ``control`` (a signal or sign); material is ``surface`` or
                ``default``
     place    : (n,) int8, 0 on the ground, 1 on a bridge, 2 in a tunnel

@@ -21,6 +21,7 @@ from geoscene.roadgraph.paths import crossing_rows, path_surfaces, rail_surfaces
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
 from geoscene.roadgraph.symbols import symbol_rows
+from geoscene.roadgraph.turning import turning_rows
 from geoscene.sources.data import OsmData
 from geoscene.typing import Float, Ints
 
@@ -92,7 +93,10 @@ def road_surfaces(
     covers = []
     if options.covers != "none":
         covers = [cover_rows(osm, roads, frame=frame, guess=options.covers == "guessed")]
-    others = SurfaceRows.concatenate([crossings, lines, stops, rail_surfaces(osm, frame), symbols, *covers])
+    turning = turning_rows(osm, roads)
+    others = SurfaceRows.concatenate(
+        [crossings, lines, stops, rail_surfaces(osm, frame), symbols, *covers, turning]
+    )
     paths.number[:] = np.arange(len(paths))
     others.number[:] = count + np.arange(len(others))
     rows = SurfaceRows.concatenate([paths, *carriageways, others])

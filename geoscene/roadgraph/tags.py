@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from geoscene.roadgraph.lane_tags import SHUT, Lanes, read_lanes, read_width
@@ -13,7 +14,9 @@ from geoscene.roadgraph.values import (
     remark_several,
     remark_unreadable,
 )
-from geoscene.sources.data import Tags
+from geoscene.sources.data import TaggedNode, Tags
+from geoscene.support.problems import Problem
+from geoscene.tags import parse_length
 
 CLASSES = (
     "motorway",
@@ -40,6 +43,12 @@ OTHER_CLASSES = ("busway", "bus_guideway", "raceway", "escape", "track")
 _NO = frozenset({"", "no", "false", "0"})
 # Values of tunnel at ground level: the road runs through a building or under a roof.
 _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "culvert", "flooded"}
+
+
+# Assumed: a car turns within 11 to 12 m from kerb to kerb, a loop leaves room for an island, and British
+# mini-roundabouts are 13 to 20 m wide.
+TURNING = {"turning_circle": 12.0, "turning_loop": 16.0, "mini_roundabout": 14.0}
+"""Values of ``highway`` of nodes where roads widen for turning, and metres of those of unknown diameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +149,28 @@ def read_street(tags: Tags, *, left_hand: bool = False) -> tuple[Street, Remarks
         ref=tags.get("ref", ""),
     )
     return street, remarks
+
+
+def read_diameter(tags: Tags, remarks: Remarks) -> float:
+    """Metres from kerb to kerb of a turning circle, a turning loop or a mini-roundabout."""
+    text = tags.get("diameter")
+    if text is not None:
+        metres = parse_length(text)
+        if metres is not None and 3 <= metres <= 80:
+            return metres
+        remark_unreadable(remarks, "diameter", text=text)
+    return TURNING[tags["highway"]]
+
+
+def find_odd_diameters(points: Sequence[TaggedNode]) -> list[Problem]:
+    """Problems of places to turn whose diameters cannot be read."""
+    problems = []
+    for point in points:
+        remarks: Remarks = []
+        if point.tags.get("highway") in TURNING:
+            read_diameter(point.tags, remarks)
+        problems += [Problem(point.osm_id, "road", "repaired", reason, text) for reason, text in remarks]
+    return problems
 
 
 def is_bridge(tags: Tags) -> bool:
