@@ -30,6 +30,10 @@ class BuildOptions:
     lod: Annotated[int, Parameter(converter=whole)] = 2
     """Level of detail of buildings: 0 blocks, 1 parts with flat roofs, 2 roofs."""
 
+    roofs: str = "guess"
+    """Roofs of buildings whose roof shape the map does not give: guess (gabled, hipped or flat, by
+    region, use, size and neighbours; marked as assumed), or flat."""
+
     relief: str = "plain"
     """Relief of surfaces: off (walls, roads and tunnels are smooth); plain (windows and doors are set back,
     kerbs drop at crossings, tunnels are lined, surfaces are rough); full (also small parts: balconies,
@@ -82,6 +86,8 @@ class BuildOptions:
             raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.relief not in RELIEFS:
             raise InputError(unknown_name("`relief`", self.relief, known=RELIEFS))
+        if self.roofs not in ("guess", "flat"):
+            raise InputError(f"`roofs` {self.roofs}: guess or flat")
         if self.dem_gaps not in ("error", "nearest"):
             raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
@@ -212,10 +218,16 @@ class ExportOptions:
     """mesh: model windows, doors and other openings of walls as geometry, for a scene built with relief;
     by default walls are planes."""
 
+    roofs: str | None = None
+    """Roofs of buildings whose shape the build guessed: guess, or flat (blocks of the mapped height with
+    plane walls); by default flat for CityJSON, GeoPackage, GeoJSON, GeoParquet and GeoTIFF, else guess."""
+
     height_offset: float | None = None
     """3D Tiles: metres added to all heights, such as the geoid height to make them ellipsoidal."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        if self.roofs not in (None, "guess", "flat"):
+            raise InputError(f"`roofs` {self.roofs}: guess or flat")
         if self.relief not in (None, MESH):
             raise InputError(f"`relief` {self.relief}: give {MESH}, or leave it out for plane walls")

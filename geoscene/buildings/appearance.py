@@ -122,6 +122,7 @@ class RoofTags:
     across        : roof:orientation=across
     angle_deg     : pitch, NaN if not tagged
     ignored       : tags whose values cannot be used, with the reasons
+    height        : metres, guessed with the shape; NaN for none
     """
 
     shape: str
@@ -131,6 +132,7 @@ class RoofTags:
     across: bool
     angle_deg: float
     ignored: tuple[str, ...]
+    height: float = np.nan
 
 
 def read_roof_tags(tags: Tags) -> RoofTags:

@@ -21,8 +21,10 @@ from geoscene.buildings.footprints import (
     project,
     remainder,
 )
+from geoscene.buildings.guesses import region_at
 from geoscene.buildings.heights import CLOUD_TOP, read_heights
 from geoscene.buildings.resolve import BuildingHeights, BuildingRow, resolve_heights, texts, with_support
+from geoscene.buildings.roof_guesses import guess_roofs
 from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags
@@ -64,6 +66,9 @@ def read_buildings(
     outlines = [r for r, repeats in zip(outlines, repeated, strict=True) if not repeats]
 
     rows = _assign_parts(outlines, parts, osm=osm, options=options, problems=problems)
+    if options.guess_roofs:
+        west, south, east, north = osm.bounds
+        rows = guess_roofs(rows, region_at((west + east) / 2, (south + north) / 2))
     table = _table(rows, osm.bounds, frame=frame, options=options, problems=problems)
     return _without_empty(table), sorted(problems)
 
@@ -244,7 +249,12 @@ def _table(
         min_height=heights.low,
         height=heights.high,
         roof_height=heights.roof,
-        roof_shape=texts([r.roof.shape for r in rows]),
+        roof_shape=texts(
+            [
+                "flat" if r.roof.assumed and height <= 0 else r.roof.shape
+                for r, height in zip(rows, heights.roof.tolist(), strict=True)
+            ]
+        ),
         roof_direction=np.pi / 2 - azimuth,
         roof_across=np.array([r.roof.across for r in rows], np.bool_),
         top=np.array(

@@ -57,9 +57,6 @@ _STOREY = {"small": 2.6, "low": 2.8, "tall": 3.1, "office": 3.6, "hall": 5.0, "s
 _BAY = (3.0, 2.8, 3.4, 1.8, 4.0, 5.0)
 """Assumed metres from window to window of each arrangement."""
 
-_WIDEST = 900.0
-"""Square metres from which a roof of unknown shape counts as flat; assumed."""
-
 _SOUTH_OF_FRANCE = 45.2
 """Degrees north below which the zone of France counts as Mediterranean; assumed."""
 
@@ -72,7 +69,7 @@ class AppearanceGuesses(Columns):
     wall, roof : (n,) str, names in ``palettes.toml``
     wall_color : (n, 3) uint8 sRGB
     roof_color : (n, 3) uint8 sRGB
-    pitched    : (n,) bool, the roof is or would usually be a pitched one
+    pitched    : (n,) bool
     storeys    : (n,) int64, at least 1: rounded tagged ones, or guessed from the walls' height
     windows    : (n,) int64, index into `WINDOWS`
     bay        : (n,) metres from window to window
@@ -119,16 +116,13 @@ def guess_looks(
     area        : (n,) square metres of the footprint
     walls       : (n,) metres, height of the walls up to the eaves
     levels      : (n,) tagged storeys, NaN if not tagged
-    roof_height : (n,) metres, 0 for a flat roof, NaN for one of unknown shape
+    roof_height : (n,) metres, 0 for a flat roof
     """
     draw = uniform_at(seeds(osm_id), np.zeros(len(osm_id), np.int64), count=7)
-    kind = _kinds(use, area=area, walls=walls)
+    kind = kinds_of(use, area=area, walls=walls)
     tables = palettes()
     of_region, of_kind = tables["regions"][region], tables["kinds"]
-    share = np.where(kind == "low", of_region["pitched_low"], of_region["pitched_tall"])
-    share[np.isin(kind, ("office", "hall"))] = 0.0
-    share[kind == "sacred"] = 1.0
-    pitched: Bools = (roof_height > 0) | (np.isnan(roof_height) & (draw[0] < share) & (area < _WIDEST))
+    pitched: Bools = roof_height > 0
     wall, roof = np.full(len(use), "", object), np.full(len(use), "", object)
     for name in KINDS:
         own, shelf = kind == name, of_kind.get(name, {})
@@ -160,7 +154,7 @@ def seeds(osm_id: Names) -> Ints:
     return np.array([int.from_bytes(some, "little", signed=True) for some in digests], np.int64)
 
 
-def _kinds(use: Names, *, area: Float, walls: Float) -> Names:
+def kinds_of(use: Names, *, area: Float, walls: Float) -> Names:
     """Kind (n,) of each building by its use, or by its size where that says little."""
     kind = np.full(len(use), "tall", object)
     plain = np.isin(use, ("yes", "residential", "", "retail"))

@@ -25,7 +25,10 @@ _HALLS = (
 
 _OPEN_BELOW = ("roof", "carport", "canopy")
 
-_SIGMA_ROOF = {"default": 0.5, "angle": 0.2}
+LOWEST_WALLS, LOWEST_ROOF = 2.2, 0.4
+"""Metres that walls below a guessed roof have at least, and below which a guessed roof is flat; assumed."""
+
+_SIGMA_ROOF = {"default": 0.5, "angle": 0.2, "assumed": 0.5}
 """Assumed standard deviation of a roof's height as a share of it, by its source."""
 
 _SLIT = 0.3
@@ -119,7 +122,17 @@ def resolve_heights(
             detail = f"roof of {h.roof[k]:g} m on {room:g} m"
             problems.append(Problem(rows[k].osm_id, "building", "repaired", "roof-over-height", detail))
         h.roof[k] = room if h.roof_source[k] in ("cloud", "tag", "levels") else 0.5 * room
+    _limit_guesses(rows, h)
     return h, problems
+
+
+def _limit_guesses(rows: Sequence[BuildingRow], h: BuildingHeights) -> None:
+    """Lower guessed roofs that leave too little for the walls below, in place; very low ones are flat."""
+    guessed = np.flatnonzero([row.roof.assumed and row.roof.shape != "flat" for row in rows])
+    room = h.high[guessed] - h.low[guessed]
+    roof = np.minimum(h.roof[guessed], np.minimum(room - LOWEST_WALLS, 0.5 * room))
+    h.roof[guessed] = np.where(roof < LOWEST_ROOF, 0.0, roof)
+    h.roof_source[guessed] = "assumed"
 
 
 def _repair_undersides(rows: Sequence[BuildingRow], h: BuildingHeights, *, problems: list[Problem]) -> None:
@@ -150,9 +163,12 @@ def _resolve_roofs(
         elif not np.isfinite(h.roof[k]):
             by_storeys = h.source[k] == "levels"
             walls = h.high[k] if by_storeys else np.inf
-            h.roof[k], h.roof_source[k] = default_roof_height(
-                row.roof, row.footprint, walls=walls, storey=options.level_height
-            )
+            if row.roof.assumed:
+                h.roof[k], h.roof_source[k] = min(row.roof.height, walls), "assumed"
+            else:
+                h.roof[k], h.roof_source[k] = default_roof_height(
+                    row.roof, row.footprint, walls=walls, storey=options.level_height
+                )
             if by_storeys:  # building:levels excludes the roof
                 h.high[k] += h.roof[k]
                 h.sigma[k] = np.hypot(h.sigma[k], _SIGMA_ROOF[h.roof_source[k]] * h.roof[k])

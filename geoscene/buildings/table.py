@@ -32,6 +32,7 @@ class BuildingOptions:
     strip         : metres; uncovered pieces of an outline with parts are left out where they are narrower
     reach         : metres within which known heights are used to infer a missing one
     canopy        : metres, thickness of roofs without walls (``building=roof``)
+    guess_roofs   : whether roofs without a tagged shape are guessed (`geoscene.buildings.roof_guesses`)
     """
 
     level_height: float = 3.0
@@ -39,6 +40,7 @@ class BuildingOptions:
     strip: float = 1.0
     reach: float = 400.0
     canopy: float = 0.4
+    guess_roofs: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +66,8 @@ class Buildings(Columns):
     height_source    : (n,) str: cloud, tag, est_height, levels, parts, outline, or inferred-<rule>
     height_sigma     : (n,) metres, one standard deviation of height
     min_height_source: (n,) str: tag, levels, canopy, or default (0)
-    roof_source      : (n,) str, source of roof_height: cloud, tag, levels, angle, default; assumed (unknown:
-                       flat)
+    roof_source      : (n,) str, source of roof_height: cloud, tag, levels, angle, default; assumed if the
+                       shape is not known, guessed or flat
     levels           : (n,) storeys above ground as tagged, NaN if not
     use              : (n,) str, the value of building or building:part
     name             : (n,) str

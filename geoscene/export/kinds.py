@@ -27,6 +27,7 @@ class ExportFormat:
     suffixes : of file names, the usual one first; none for a folder
     options  : fields of `ExportOptions` that it uses
     beside   : suffix of a second file that is written beside the first
+    roofs    : ``guess`` or ``flat``: guessed roofs, if the options do not choose
     """
 
     title: str
@@ -34,10 +35,13 @@ class ExportFormat:
     suffixes: tuple[str, ...]
     options: frozenset[str]
     beside: str = ""
+    roofs: str = "guess"
 
 
-def _kind(title: str, writer: str, *, suffixes: str, options: str = "", beside: str = "") -> ExportFormat:
-    return ExportFormat(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside)
+def _kind(
+    title: str, writer: str, *, suffixes: str, options: str = "", beside: str = "", roofs: str = "guess"
+) -> ExportFormat:
+    return ExportFormat(title, writer, tuple(suffixes.split()), frozenset(options.split()), beside, roofs)
 
 
 KINDS: Registry[ExportFormat] = Registry(
@@ -47,28 +51,43 @@ KINDS: Registry[ExportFormat] = Registry(
             "CityJSON 2.0",
             "cityjson:write_cityjson",
             suffixes=".city.json .cityjson",
-            options="crs layers relief",
+            options="crs layers relief roofs",
+            roofs="flat",
         ),
-        "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers relief"),
+        "glb": _kind("binary glTF 2.0", "glb:write_glb", suffixes=".glb", options="layers relief roofs"),
         "3dtiles": _kind(
-            "3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset relief"
+            "3D Tiles 1.1", "tiles3d:write_3dtiles", suffixes="", options="layers height_offset relief roofs"
         ),
         "obj": _kind(
             "Wavefront OBJ and MTL",
             "triangles:write_obj",
             suffixes=".obj",
-            options="layers relief",
+            options="layers relief roofs",
             beside=".mtl",
         ),
-        "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief"),
-        "stl": _kind("STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers relief"),
-        "gpkg": _kind("GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers"),
-        "geojson": _kind("GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers"),
+        "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief roofs"),
+        "stl": _kind(
+            "STL, solids only", "triangles:write_stl", suffixes=".stl", options="layers relief roofs"
+        ),
+        "gpkg": _kind(
+            "GeoPackage", "vector:write_gpkg", suffixes=".gpkg", options="crs layers roofs", roofs="flat"
+        ),
+        "geojson": _kind(
+            "GeoJSON", "vector:write_geojson", suffixes=".geojson", options="layers roofs", roofs="flat"
+        ),
         "geoparquet": _kind(
-            "GeoParquet", "vector:write_geoparquet", suffixes=".parquet .geoparquet", options="crs layers"
+            "GeoParquet",
+            "vector:write_geoparquet",
+            suffixes=".parquet .geoparquet",
+            options="crs layers roofs",
+            roofs="flat",
         ),
         "geotiff": _kind(
-            "GeoTIFF", "raster:write_geotiff", suffixes=".tif .tiff", options="layers model resolution"
+            "GeoTIFF",
+            "raster:write_geotiff",
+            suffixes=".tif .tiff",
+            options="layers model resolution roofs",
+            roofs="flat",
         ),
         "opendrive": _kind("OpenDRIVE 1.7", "opendrive:write_opendrive", suffixes=".xodr"),
         "sumo": _kind("SUMO network", "opendrive:write_sumo", suffixes=".net.xml"),
@@ -119,6 +138,9 @@ def export_scene(
     modelled = bool(given.pop("relief", None))
     if modelled:
         scene = scene.with_relief_mesh()
+    leveled = (given.pop("roofs", None) or kind.roofs) == "flat"
+    if leveled:
+        scene = scene.with_level_roofs()
     for path in (out, out.with_suffix(kind.beside)) if kind.beside else (out,):
         if path.exists() and not overwrite:
             raise InputError(f"{path}: exists; set `overwrite` to replace it")
@@ -129,7 +151,10 @@ def export_scene(
     write = load(f"geoscene.export.{kind.writer}")
     with exclusive(out) if kind.suffixes else nullcontext():  # writers of folders see to that
         summary: Summary = write(scene, out, **given, progress=progress)
-    return replace(summary, notes=(*summary.notes, _relief_note(scene))) if modelled else summary
+    notes = [_relief_note(scene)] if modelled else []
+    if leveled and (count := scene.count_guessed_roofs()):
+        notes.append(f"{count} roofs that the build guessed are flat here; `roofs` guess keeps them")
+    return replace(summary, notes=(*summary.notes, *notes))
 
 
 def _relief_note(scene: Scene) -> str:

@@ -100,8 +100,8 @@ class Rooftops(Columns):
 def plan_rooftops(buildings: Buildings, *, centre: tuple[float, float]) -> Rooftops:
     """Inferred rooftop objects of buildings by use, size and region.
 
-    Parapets are on flat roofs of 30 m2 and more, 3 m above the ground, of buildings that would not usually
-    have a pitched roof; chimneys and dormers on pitched roofs of houses.
+    Parapets are on flat roofs of 30 m2 and more, 3 m above the ground; chimneys and dormers on pitched roofs
+    of houses.
 
     centre : longitude and latitude of the map's middle, degrees
     """
@@ -114,13 +114,13 @@ def plan_rooftops(buildings: Buildings, *, centre: tuple[float, float]) -> Rooft
         area=area,
         walls=walls,
         levels=buildings.levels,
-        roof_height=np.where(buildings.roof_source == "assumed", np.nan, buildings.roof_height),
+        roof_height=buildings.roof_height,
         region=region,
     )
     seed = seeds(buildings.osm_id)
     draw = uniform_at(seed, np.full(len(seed), 7), count=5)
     house = np.isin(looks.kind, ("low", "tall"))
-    flat = (buildings.roof_height <= 0) & ~looks.pitched & ~np.isin(looks.kind, ("small", "sacred"))
+    flat = ~looks.pitched & ~np.isin(looks.kind, ("small", "sacred"))
     high = np.where(looks.kind == "low", 0.3 + 0.3 * draw[0], 0.5 + 0.5 * draw[0])
     sloped = buildings.roof_height > 0
     west, south, east, north = _NEW_YORK

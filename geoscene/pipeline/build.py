@@ -38,7 +38,7 @@ from geoscene.uses import USES
 _NOT_IN_TILES = frozenset({"name", "along", "reach", "use"})
 """Options on which no tile depends; some select the tiles to build."""
 
-_NOT_IN_GROUND = frozenset({"lod"})
+_NOT_IN_GROUND = frozenset({"lod", "roofs"})
 """Options on which only the solids of buildings depend."""
 
 STEEP = 0.2

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from geoscene.buildings import Buildings, read_buildings
+from geoscene.buildings import BuildingOptions, Buildings, read_buildings
 from geoscene.buildings.facades import FacadeSetting, read_setting
 from geoscene.buildings.heights import with_measured_tops
+from geoscene.buildings.roof_guesses import without_guess
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground import (
@@ -213,7 +214,10 @@ def make_plan(
 
     progress("buildings", 0, total=0)
     built = osm if "buildings" in options.only else replace(osm, areas=[], relations=[])
-    buildings = _collect(problems, read_buildings(built, frame))
+    buildings = _collect(
+        problems,
+        read_buildings(built, frame, options=BuildingOptions(guess_roofs=options.roofs == "guess")),
+    )
     extent = extent_of(frame, osm.bounds, footprints=buildings.footprint[: buildings.count])
     terrain = Terrain(frame)
     if options.dem:
@@ -265,6 +269,7 @@ def make_plan(
     )
     cuts = _collect(problems, passage_cuts(passages, buildings, base=base, height=local.height))
     buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures, cuts=cuts))
+    buildings = without_guess(buildings, np.array([len(some) > 0 for some in buildings.passages], np.bool_))
 
     rooftops = None
     if options.relief == "full":

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import shapely
@@ -27,6 +27,9 @@ from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
 from geoscene.uses import USES
+
+if TYPE_CHECKING:
+    from geoscene.scene.level_roofs import GuessedRoofs
 
 _PARTS = {"tiles": "tiles", "colors": "colours for cameras", "tables": "attributes of features"}
 """Parts that scenes for some uses lack, in words."""
@@ -125,6 +128,7 @@ class Scene(Previewed):
     frame    : the scene frame
     stored   : the directory in object storage, if it is there
     modelled : tiles are read with their facades as geometry
+    leveled  : guessed roofs are read as flat, in tiles and tables
     """
 
     path: Path
@@ -132,6 +136,7 @@ class Scene(Previewed):
     frame: Frame
     stored: StoredFolder | None = None
     modelled: bool = False
+    leveled: bool = False
 
     @property
     def files(self) -> SceneFiles:
@@ -259,6 +264,10 @@ class Scene(Previewed):
         path = self.files.tile(i, j)
         stated = self._tile_digests
         tile = read_tile(path, stated=None if stated is None else stated.get(path.name, ""))
+        if self.leveled and self.table_length("buildings"):
+            from geoscene.scene.level_roofs import level_tile  # noqa: PLC0415  (builds solids)
+
+            tile = level_tile(tile, self._guessed_roofs)
         if self.modelled and tile.relief is not None:
             from geoscene.buildings.facades.solids import relief_mesh  # noqa: PLC0415  (0.1 s)
 
@@ -306,6 +315,20 @@ class Scene(Previewed):
             raise InputError(f"{self.location}: has no relief; build it with `relief` plain or full")
         return replace(self, modelled=True)
 
+    def with_level_roofs(self) -> Scene:
+        """The scene with flat roofs in place of guessed ones; the walls below them have no openings."""
+        return replace(self, leveled=True)
+
+    def count_guessed_roofs(self) -> int:
+        """Number of buildings with guessed roofs other than flat ones."""
+        return len(self._guessed_roofs.feature) if self.table_length("buildings") else 0
+
+    @functools.cached_property
+    def _guessed_roofs(self) -> GuessedRoofs:
+        from geoscene.scene.level_roofs import find_guessed  # noqa: PLC0415
+
+        return find_guessed(replace(self, leveled=False).features("buildings"))
+
     def tiles(self, *, forests: bool = True) -> Iterator[Tile]:
         """All tiles, one at a time."""
         for i, j in self.tile_indices:
@@ -331,7 +354,12 @@ class Scene(Previewed):
         Raises SceneFormatError if the scene has no such feature.
         """
         path = self._verified(self.files.features)
-        return read_layer(path, layer, frame=self.frame, geometry=geometry, rows=rows)
+        table = read_layer(path, layer, frame=self.frame, geometry=geometry, rows=rows)
+        if self.leveled and layer == "buildings":
+            from geoscene.scene.level_roofs import level_columns  # noqa: PLC0415
+
+            table = replace(table, columns=level_columns(table.columns))
+        return table
 
     def schema(self, layer: str) -> Schema:
         """The geometry type and the columns of a layer; raises SceneFormatError as `features` does."""

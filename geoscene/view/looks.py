@@ -28,7 +28,7 @@ _DEFAULTS = (materials()["plaster"], materials()["roof_tile"], materials()["tar_
 """Materials of walls and roofs whose look is not mapped."""
 
 _COLUMNS = (
-    *("feature", "osm_id", "use", "base", "height", "roof_height", "roof_source", "levels"),
+    *("feature", "osm_id", "use", "base", "height", "roof_height", "levels"),
     *("wall_source", "roof_look_source"),
 )
 
@@ -136,7 +136,7 @@ def read_looks(scene: Scene) -> Looks:
         area=np.asarray(shapely.area(footprint), float),
         walls=walls,
         levels=levels,
-        roof_height=np.where(columns["roof_source"] == "assumed", np.nan, roof),
+        roof_height=roof,
         region=region,
     )
     storey = np.clip(walls / guesses.storeys, 2.0, 12.0)

@@ -158,7 +158,7 @@ def _pierced_walls(
     polygons = np.full(len(facades), None, object)
     points, places = dict[int, Float](), dict[int, Float]()
     for w, rings in enumerate(outlines):
-        if rings is None:
+        if not rings:  # touches itself, or has no face
             continue
         rims = cells.rim[cuts[w] : cuts[w + 1]]
         holes = rims[:, [[0, 1], [0, 3], [2, 3], [2, 1]]]

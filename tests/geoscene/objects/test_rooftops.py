@@ -189,11 +189,6 @@ def test_water_tanks_stand_on_high_roofs_of_new_york_alone():
         assert ("water_tank" in names) is some
 
 
-def test_a_house_of_a_region_of_pitched_roofs_has_no_parapet_though_its_roof_is_unknown():
-    rooftops = plan_rooftops(town(shapely.box(0, 0, 12, 9), {"building": "house"}), centre=BERLIN)
-    assert (rooftops.parapet > 0).sum() <= 6
-
-
 def test_what_stands_on_a_roof_depends_on_its_building_alone():
     every = town(shapely.box(0, 0, 14, 10), HOUSE)
     _, copies, _, _ = built(every)
