@@ -154,6 +154,17 @@ def class_codes() -> ClassCodes:
     return ClassCodes(kitti, nuscenes, waymo, asprs, color)
 
 
+def material_names(codes: NDArray[np.integer]) -> NDArray[np.object_]:
+    """Names (n,) of material codes."""
+    import numpy as np  # noqa: PLC0415
+
+    table = np.full(256, "", object)
+    for name, material in materials().items():
+        table[material.code] = name
+    names: NDArray[np.object_] = table[codes]
+    return names
+
+
 @dataclass(frozen=True, slots=True)
 class Material:
     """Optical properties of a surface material.

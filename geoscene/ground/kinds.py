@@ -14,7 +14,8 @@ class GroundKind:
     """Class, material and priority of a kind of ground.
 
     klass    : `geoscene.classes.Class`
-    material : name in `geoscene.classes.materials`, where no ``surface`` tag says otherwise
+    material : name in `geoscene.classes.materials`, `OPEN` or `FIELD`, where no ``surface`` tag says
+               otherwise
     tier     : 0..99, the higher covers the lower; within a tier the smaller polygon covers the larger
     width    : metres, for lines without a usable ``width``; 0 for areas
     body     : ``sea``, ``standing`` or ``river`` for water, else ""
@@ -27,10 +28,14 @@ class GroundKind:
     body: str = ""
 
 
-_BUILT = GroundKind(Class.TERRAIN, "soil", 10)
+OPEN, FIELD = "open", "field"
+"""Materials of built-up and of farmed land whose surface the map does not give: as usual in the region."""
+
+_BUILT = GroundKind(Class.TERRAIN, OPEN, 10)
+_BARE = GroundKind(Class.TERRAIN, "soil", 10)
 _PAVED = GroundKind(Class.PAVED, "paving", 11)
 _LOOSE = GroundKind(Class.TERRAIN, "gravel", 12)
-_FIELD = GroundKind(Class.TERRAIN, "soil", 20)
+_FIELD = GroundKind(Class.TERRAIN, FIELD, 20)
 _GREEN = GroundKind(Class.GRASS, "grass", 22)
 _LAWN = GroundKind(Class.GRASS, "grass", 26)
 _WOOD = GroundKind(Class.FOREST_FLOOR, "soil", 24)
@@ -51,12 +56,13 @@ SEA = GroundKind(Class.WATER, "water", 39, body="sea")
 
 AREAS: dict[str, dict[str, GroundKind]] = {
     "landuse": {
-        "residential": _BUILT, "construction": _BUILT, "brownfield": _BUILT, "military": _BUILT,
-        "farmyard": _BUILT, "landfill": _BUILT, "greenfield": _FIELD, "civil": _BUILT, "education": _BUILT,
+        "residential": _BUILT, "construction": _BARE, "brownfield": _BARE, "military": _BUILT,
+        "farmyard": _BARE, "landfill": _BARE, "greenfield": _BUILT, "civil": _BUILT, "education": _BUILT,
         "religious": _BUILT, "institutional": _BUILT, "plant_nursery": _FIELD,
         "commercial": _PAVED, "retail": _PAVED, "industrial": _PAVED, "garages": _PAVED, "depot": _PAVED,
         "port": _PAVED, "harbour": _PAVED, "quarry": _LOOSE,
-        "farmland": _FIELD, "farm": _FIELD, "vineyard": _FIELD, "orchard": _GREEN, "allotments": _GREEN,
+        "farmland": _FIELD, "farm": _FIELD, "vineyard": GroundKind(Class.TERRAIN, "soil", 20),
+        "orchard": _GREEN, "allotments": _GREEN,
         "forest": _WOOD, "meadow": _GREEN, "cemetery": _GREEN, "recreation_ground": _GREEN,
         "village_green": _GREEN, "grass": _LAWN, "flowerbed": GroundKind(Class.GRASS, "soil", 27),
         "basin": _STANDING, "reservoir": _STANDING, "salt_pond": _STANDING,

@@ -12,11 +12,22 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
-from geoscene.ground.kinds import SEA, GroundKind, area_kind, line_kind, read_surface
+from geoscene.ground.kinds import (
+    FIELD,
+    OPEN,
+    SEA,
+    GroundKind,
+    area_kind,
+    ground_class,
+    line_kind,
+    read_surface,
+)
+from geoscene.ground.land import TEMPERATE, Land
 from geoscene.ground.layers import Layers
 from geoscene.sources.data import Area, OsmData, Way
 from geoscene.support.columns import nth
 from geoscene.support.problems import Problem
+from geoscene.support.splitmix import number_of, uniform_at
 from geoscene.tags import parse_length
 from geoscene.typing import Float
 
@@ -33,7 +44,9 @@ _ROUND = 4  # segments of a quarter circle at corners
 _PRIORITY = -1.0  # below everything that is mapped
 
 
-def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
+def landcover(
+    osm: OsmData, frame: Frame, *, extent: Sequence[float], land: Land = TEMPERATE
+) -> tuple[Layers, list[Problem]]:
     """Land cover within the extent as `Layers`, and repaired or dropped features as problems.
 
     Areas by `kinds.AREAS`, lines of water, rail and stone widened by their ``width`` or their kind's, and
@@ -42,8 +55,9 @@ def landcover(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[L
     polygons, so that a lawn in a park shows.
 
     extent : (xmin, ymin, xmax, ymax) scene metres; polygons are cut there
+    land   : usual land of the region, for areas whose surface the map does not give (source ``assumed``)
     """
-    areas, problems = _areas(osm, frame, extent=extent)
+    areas, problems = _areas(osm, frame, extent=extent, land=land)
     lines, more = _lines(osm.ways, frame)
     coast = [way for way in osm.ways if way.tags.get("natural") == "coastline"]
     seas, still_more = sea(
@@ -80,7 +94,7 @@ def _layers(
     return Layers.of(
         polygons,
         klass=[klass for klass, _, _ in looks],
-        material=[materials()[name].code for _, name, _ in looks],
+        material=[0 if name in (OPEN, FIELD) else materials()[name].code for _, name, _ in looks],
         priority=tier + 0.99 / (1.0 + shapely.area(polygons) / 100.0),
         osm_id=[feature.osm_id for feature, _ in found],
         source=source or [given for _, _, given in looks],
@@ -88,7 +102,22 @@ def _layers(
     )
 
 
-def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Layers, list[Problem]]:
+def _assume(layers: Layers, found: Sequence[tuple[Area, GroundKind]], *, land: Land) -> Layers:
+    """The rows; those of `OPEN` and `FIELD` have the usual materials of the region."""
+    unknown = np.flatnonzero(layers.material == 0)
+    number = np.array([number_of(found[k][0].osm_id) for k in unknown.tolist()], np.int64)
+    farmed = np.array([found[k][1].material == FIELD for k in unknown.tolist()], np.bool_)
+    name = np.where(farmed, land.field_at(uniform_at(number, np.zeros_like(number), count=1)[0]), land.open)
+    klass, material, source = layers.klass.copy(), layers.material.copy(), layers.source.astype(object)
+    klass[unknown] = [ground_class(Class.TERRAIN, one) for one in name.tolist()]
+    material[unknown] = [materials()[one].code for one in name.tolist()]
+    source[unknown] = "assumed"
+    return replace(layers, klass=klass, material=material, source=source.astype(np.str_))
+
+
+def _areas(
+    osm: OsmData, frame: Frame, *, extent: Sequence[float], land: Land
+) -> tuple[Layers, list[Problem]]:
     """Land cover mapped as areas that intersect the extent."""
     found = [(area, kind) for area in osm.areas if (kind := area_kind(area.tags)) is not None]
     polygons = np.fromiter((area.geometry for area, _ in found), object)
@@ -101,7 +130,7 @@ def _areas(osm: OsmData, frame: Frame, *, extent: Sequence[float]) -> tuple[Laye
         reason = shapely.is_valid_reason(polygons[k])
         polygons[k] = shapely.make_valid(polygons[k], method="structure", keep_collapsed=False)
         problems.append(Problem(found[k][0].osm_id, "area", "repaired", "invalid-after-projection", reason))
-    return _layers(found, polygons), problems
+    return _assume(_layers(found, polygons), found, land=land), problems
 
 
 def _lines(ways: Sequence[Way], frame: Frame) -> tuple[Layers, list[Problem]]:

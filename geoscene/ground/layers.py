@@ -39,7 +39,7 @@ class Layers(Columns):
     osm_id   : (n,) str, "" for none
     source   : (n,) str, origin of class, material and shape: ``tags``, ``surface`` (material from the
                tag), ``width`` (a line with its mapped width), ``default-width`` (a line with an assumed one),
-               ``coastline``
+               ``coastline``, ``assumed`` (the material) and others that begin so (all of it)
     body     : (n,) str: kind of water, which decides its level: ``sea``, ``standing``, ``river``; else ""
     feature  : (n,) int32 feature number, -1 for none
     """

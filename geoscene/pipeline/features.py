@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings
 from geoscene.buildings.facades import FacadeSetting
-from geoscene.classes import Class, materials
+from geoscene.classes import Class, material_names
 from geoscene.ground import Layers
 from geoscene.objects.barriers import Barriers
 from geoscene.objects.furniture import Furniture
@@ -152,12 +152,3 @@ def wire_layer(wires: Wires) -> Layer:
 def class_names(codes: NDArray[np.integer]) -> NDArray[np.str_]:
     """Names of class codes in lower case."""
     return np.array([Class(k).name.lower() for k in codes], np.str_)
-
-
-def material_names(codes: NDArray[np.integer]) -> NDArray[np.str_]:
-    """Names of material codes."""
-    table = np.zeros(256, "U32")
-    for name, material in materials().items():
-        table[material.code] = name
-    names: NDArray[np.str_] = table[codes]
-    return names

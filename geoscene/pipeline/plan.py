@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import BuildingOptions, Buildings, read_buildings
 from geoscene.buildings.facades import FacadeSetting, read_setting
+from geoscene.buildings.guesses import palettes, region_at
 from geoscene.buildings.heights import with_measured_tops
 from geoscene.buildings.roof_guesses import without_guess
+from geoscene.classes import Class
 from geoscene.errors import InputError
 from geoscene.geometry.frames import Frame, extent_of, wrap_longitude
 from geoscene.ground import (
@@ -29,6 +31,7 @@ from geoscene.ground import (
     water_levels,
 )
 from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
+from geoscene.ground.land import Land, parcels
 from geoscene.ground.landcover import paved_fabric
 from geoscene.ground.partition import PRECISION
 from geoscene.ground.relief import Kerbs, Raised
@@ -121,6 +124,7 @@ _COVERS: dict[str, Literal["none", "mapped", "guessed"]] = {
     "plain": "mapped",
     "full": "guessed",
 }
+_POLAR = 67.0  # degrees of latitude beyond which open ground is tundra; assumed
 _MOVED = 40.0  # metres, more than trees and furniture are moved by and keep from other features
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
@@ -454,6 +458,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     osm, frame, extent, roads, options = place.osm, place.frame, place.extent, place.roads, place.options
     buildings, terrain = place.buildings, place.terrain
     footprints = buildings.footprint[: buildings.count]
+    land = _usual_land(osm)
     problems: list[Problem] = []
     made = road_surfaces(
         _only_roads(osm, options),
@@ -490,6 +495,8 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             buildings=buildings,
             passages=place.passages,
             made=made,
+            roads=roads,
+            land=land,
             only=options.only,
         ),
     )
@@ -537,6 +544,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     ground = _plan_ground(
         covers,
         roads,
+        land=land,
         extent=extent,
         terrain=terrain,
         options=options,
@@ -607,6 +615,7 @@ def _plan_ground(
     layers: Layers,
     roads: _Roads,
     *,
+    land: Land,
     extent: Bounds,
     terrain: Terrain,
     options: BuildOptions,
@@ -627,10 +636,18 @@ def _plan_ground(
         terrain=TerrainHeights(terrain.height, tolerance, terrain.lines)
         if terrain.grids and tolerance
         else None,
+        base=(Class.TERRAIN, land.open),
         kerbs=kerbs,
         raised=raised,
     )
     return ground if creases is None else cut_along(ground, creases)
+
+
+def _usual_land(osm: OsmData) -> Land:
+    """The usual land at a map's middle."""
+    centre = _checked_centre(osm)
+    region = palettes()["regions"][region_at(*centre)]
+    return Land("dry_grass" if abs(centre[1]) > _POLAR else region["open"], region["fields"])
 
 
 def _surfaces(
@@ -641,6 +658,8 @@ def _surfaces(
     buildings: Buildings,
     passages: Passages,
     made: RoadSurfaces,
+    roads: _Roads,
+    land: Land,
     only: Collection[str],
 ) -> tuple[tuple[Layers, Layers, Layers], list[Problem]]:
     """Land cover, road surfaces and building pads, as layers of the ground; numbers from 0 in each."""
@@ -649,8 +668,16 @@ def _surfaces(
     footprints = buildings.footprint[:count]
     parts = [paved_fabric(footprints)]
     if "landcover" in only:
-        cover, found = landcover(osm, frame, extent=extent)
-        parts.append(cover)
+        cover, found = landcover(osm, frame, extent=extent, land=land)
+        ground = roads.carriageways.place == 0
+        assumed = parcels(
+            land,
+            roads=roads.carriageways.line[ground],
+            width=roads.carriageways.width[ground],
+            buildings=footprints,
+            cover=cover,
+        )
+        parts = [assumed, *parts, cover]
         problems += found
     first = np.flatnonzero(np.diff(made.number, prepend=-1))  # of the parts of each shape
     surfaces = made.take(first)
