@@ -26,6 +26,7 @@ from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.time_scales import drive_ns
 from lidar.options import CONVERTED_FORMATS
+from lidar.parameters import split_items
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
 from lidar.simulation.record_clouds import sent_pulses, write_clouds
@@ -51,8 +52,9 @@ def convert(
     """Write a recorded drive to the folder ``out``, which appears when it is complete.
 
     source : directory or URL of the dataset
-    to     : layout of another dataset, a name in `layouts.EXPORTERS`; or a point-cloud format, a
-             name in `lidar.dataset.formats.FORMATS`, for the dataset with its clouds in this format
+    to     : layout of another dataset, a name in `layouts.EXPORTERS`, with its parameters as in
+             ``ros2:points=velodyne,imu=truth``; or a point-cloud format, a name in
+             `lidar.dataset.formats.FORMATS`, for the dataset with its clouds in this format
 
     Clouds get the bytes of a drive with that format, as far as the recorded ones keep all digits.
 
@@ -60,8 +62,13 @@ def convert(
     a dataset that lacks what the layout or format needs.
     """
     out = Path(out)
-    if to in EXPORTERS:
-        return EXPORTERS[to].export(open_dataset(source), out, overwrite=overwrite, progress=progress)
+    item, *others = split_items(to, [*EXPORTERS, *CONVERTED_FORMATS])
+    if others:
+        raise InputError(f"`to` {to}: give one layout or format")
+    if item.name in EXPORTERS:
+        return EXPORTERS[item.name].export(
+            open_dataset(source), out, overwrite=overwrite, progress=progress, values=item.values
+        )
     if to not in CONVERTED_FORMATS:
         known, removed = [*EXPORTERS, *CONVERTED_FORMATS], {**EXPORTERS.removed, **FORMATS.removed}
         raise InputError(unknown_name("`to`", to, known=known, removed=removed))

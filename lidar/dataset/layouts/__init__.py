@@ -7,14 +7,17 @@ from __future__ import annotations
 
 import importlib
 import shlex
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from geoscene.support.files import atomic_folder
 from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import Registry
 from lidar.errors import InputError
+from lidar.parameters import read_values
 
 if TYPE_CHECKING:
     from lidar.dataset.layout import Dataset
@@ -49,6 +52,7 @@ class Exporter:
     hint     : how to open the export; ``{path}`` stands for its folder, ``{quoted}`` for it in a shell,
                ``{date}`` for the time of the drive's start
     function : of the module
+    options  : class of the module, with parameters that follow the name; ``export`` takes it as ``options``
     """
 
     name: str
@@ -58,23 +62,37 @@ class Exporter:
     names: str
     hint: str
     function: str = "export"
+    options: str = ""
 
     def export(
-        self, dataset: Dataset, out: Path, *, overwrite: bool = False, progress: Progress = silent
+        self,
+        dataset: Dataset,
+        out: Path,
+        *,
+        overwrite: bool = False,
+        progress: Progress = silent,
+        values: Mapping[str, Any] = MappingProxyType({}),
     ) -> ExportSummary:
         """Write a dataset into the folder ``out``, which appears when it is complete.
 
-        Raises InputError if the folder exists and may not be overwritten, and DatasetError for a dataset that
-        lacks what the layout needs.
+        values : of the layout's parameters
+
+        Raises InputError for a parameter that the layout does not have and if the folder exists and may not
+        be overwritten, and DatasetError for a dataset that lacks what the layout needs.
         """
         if out.exists() and not overwrite:
             raise InputError(f"{out}: exists already; set `overwrite` to replace it")
         from lidar.dataset.checksums import write_checksums  # noqa: PLC0415
         from lidar.dataset.derived import write_export_provenance  # noqa: PLC0415
 
-        module = importlib.import_module(f"{__name__}.{self.module}")
+        module, more = importlib.import_module(f"{__name__}.{self.module}"), dict[str, Any]()
+        if values and not self.options:
+            raise InputError(f"`to` {self.name}: has no parameters, and not {', '.join(values)}")
+        if self.options:
+            kind = getattr(module, self.options)
+            more["options"] = kind(**read_values(kind, values))
         with atomic_folder(out, mark=self.mark, names=f"{self.names}|{_OURS}") as folder:
-            counts = getattr(module, self.function)(dataset, folder, progress=progress)
+            counts = getattr(module, self.function)(dataset, folder, progress=progress, **more)
             write_export_provenance(dataset, folder, by=f"convert --to {self.name}")
             write_checksums(folder)
         hint = self.hint.format(path=out, quoted=shlex.quote(str(out)), date=dataset.start)
@@ -157,6 +175,7 @@ _EXPORTERS = (
         names=r"foxglove\.json|drive\.mcap",
         hint="open {path}/drive.mcap with Foxglove and import the layout foxglove.json",
         function="export_for_foxglove",
+        options="RosOptions",
     ),
     Exporter(
         "mot",
@@ -187,10 +206,11 @@ _EXPORTERS = (
     Exporter(
         "ros2",
         "ros2",
-        "a ROS 2 recording (rosbag2) in MCAP",
+        "a ROS 2 recording (rosbag2) in MCAP; ros2:points=velodyne, ouster, livox or livox-custom, imu=truth",
         mark="metadata.yaml",
         names=r"metadata\.yaml|drive\.mcap",
         hint="play it with ros2 bag play {quoted}",
+        options="RosOptions",
     ),
     Exporter(
         "tum",

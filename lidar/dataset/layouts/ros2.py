@@ -15,7 +15,7 @@ from geoscene.support.files import write_json
 from geoscene.support.progress import Progress
 from lidar.dataset.layout import Dataset, reading_file
 from lidar.dataset.layouts.ros_messages import encode, typestore
-from lidar.dataset.layouts.ros_topics import BASE, MAP, ODOMETRY, RosDrive, Topic, topics_of
+from lidar.dataset.layouts.ros_topics import BASE, MAP, ODOMETRY, RosDrive, RosOptions, Topic, topics_of
 
 NAME = "drive"
 """Name of the file of messages."""
@@ -24,21 +24,23 @@ _VERSION = 8
 """Of the metadata: the newest that writes qualities of service as ROS 2 Humble reads them."""
 
 
-def export(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
+def export(dataset: Dataset, folder: Path, *, progress: Progress, options: RosOptions) -> dict[str, int]:
     """Write ``metadata.yaml`` and ``drive.mcap``; return the numbers of messages by type.
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """
-    return message_counts(write_recording(dataset, folder, progress=progress))
+    return message_counts(write_recording(dataset, folder, progress=progress, options=options))
 
 
-def write_recording(dataset: Dataset, folder: Path, *, progress: Progress) -> list[Topic]:
+def write_recording(
+    dataset: Dataset, folder: Path, *, progress: Progress, options: RosOptions
+) -> list[Topic]:
     """Write the topics of a dataset, ordered by time, into an empty folder; return the topics.
 
     The file of messages is MCAP with chunks compressed by zstd.
     """
     rosbag2 = need("rosbags.rosbag2", "ros")
-    drive = RosDrive(dataset)
+    drive = RosDrive(dataset, options)
     topics = topics_of(drive)
     bag = rosbag2.Writer(folder / NAME, version=_VERSION, storage_plugin=rosbag2.StoragePlugin.MCAP)
     bag.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
@@ -108,12 +110,14 @@ def message_counts(topics: list[Topic]) -> dict[str, int]:
     return {"topics": len(topics), **counts}
 
 
-def export_for_foxglove(dataset: Dataset, folder: Path, *, progress: Progress) -> dict[str, int]:
+def export_for_foxglove(
+    dataset: Dataset, folder: Path, *, progress: Progress, options: RosOptions
+) -> dict[str, int]:
     """Write ``drive.mcap`` and ``foxglove.json``; return the numbers of messages by type.
 
     Raises DatasetError for damaged files, and MissingExtraError without rosbags.
     """
-    topics = write_recording(dataset, folder, progress=progress)
+    topics = write_recording(dataset, folder, progress=progress, options=options)
     (folder / "metadata.yaml").unlink()
     write_json(folder / "foxglove.json", layout(topics))
     return message_counts(topics)

@@ -6,7 +6,7 @@ Times are integer nanoseconds since 1970 (UTC), which header stamps hold as seco
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,21 +18,65 @@ from geoscene.typing import Float
 from lidar.dataset.formats.table import Table
 from lidar.sensors.rig.patterns.repeating import Scan2d
 
-_FIELDS = {
-    "x": ("x", np.float32),
-    "y": ("y", np.float32),
-    "z": ("z", np.float32),
-    "intensity": ("intensity", np.float32),
-    "t": ("time_ns", np.uint32),
-    "ring": ("ring", np.uint16),
-    "label": ("label", np.uint16),
-    "instance": ("instance", np.int32),
-    "velocity": ("velocity", np.float32),
-}
-"""Fields of a cloud: the column of a point table and its type; velocity of FMCW scanners only."""
+Fields = dict[str, tuple[type[np.generic], Callable[[Table, int], NDArray[Any]]]]
+"""Fields of a cloud: type, and values by the point table and the stamp in nanoseconds."""
 
-_DATATYPES = {np.uint16: 4, np.int32: 5, np.uint32: 6, np.float32: 7}
+
+def _copied(column: str) -> Callable[[Table, int], NDArray[Any]]:
+    return lambda table, _: table[column]
+
+
+_PLACE: Fields = {name: (np.float32, _copied(name)) for name in ("x", "y", "z", "intensity")}
+_RING: Fields = {"ring": (np.uint16, _copied("ring"))}
+_EXTRA: Fields = {
+    "label": (np.uint16, _copied("label")),
+    "instance": (np.int32, _copied("instance")),
+    "velocity": (np.float32, _copied("velocity")),
+}
+
+POINTS: dict[str, Fields] = {
+    "velodyne": _PLACE | _RING | {"time": (np.float32, lambda table, _: table["time_ns"] * 1e-9)},
+    "ouster": _PLACE
+    | {
+        "t": (np.uint32, _copied("time_ns")),
+        "reflectivity": (np.uint16, lambda table, _: np.rint(table["intensity"])),
+        "ring": (np.uint8, _copied("ring")),
+        "range": (np.uint32, lambda table, _: np.rint(table["range"] * 1e3)),
+    },
+    "livox": _PLACE
+    | {
+        "tag": (np.uint8, lambda table, _: _tag(table)),
+        "line": (np.uint8, _copied("ring")),
+        "timestamp": (np.float64, lambda table, stamp_ns: stamp_ns + table["time_ns"].astype(np.int64)),
+    },
+}
+"""Fields of clouds by the driver that publishes the same: velodyne (ros-drivers), ouster (ouster-ros), livox
+(livox_ros_driver2, PointXYZRTLT). PCL fills a member of a point only where name and type agree."""
+
+CUSTOM = "livox-custom"
+"""Layout of livox_ros_driver2's own message, which is no PointCloud2."""
+
+_DATATYPES = {np.uint8: 2, np.uint16: 4, np.int32: 5, np.uint32: 6, np.float32: 7, np.float64: 8}
 """Constants of sensor_msgs/PointField."""
+
+_CUSTOM_POINT = "livox_ros_driver2/msg/CustomPoint"
+CUSTOM_MESSAGE = "livox_ros_driver2/msg/CustomMsg"
+_CUSTOM = {
+    _CUSTOM_POINT: "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "uint8 reflectivity\nuint8 tag\nuint8 line",
+    CUSTOM_MESSAGE: "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+    "uint8[3] rsvd\nlivox_ros_driver2/CustomPoint[] points",
+}
+"""Definitions of livox_ros_driver2."""
+
+_CUSTOM_RECORD = np.dtype(
+    [
+        ("offset_time", "<u4"),
+        ("xyz", "<f4", 3),
+        *((name, "u1") for name in ("reflectivity", "tag", "line", "_")),
+    ]
+)
+"""A point of its message in CDR: each begins at a multiple of four bytes."""
 
 _DISTORTIONS = {"pinhole": "plumb_bob", "fisheye": "equidistant"}
 """Names of our camera models in sensor_msgs/distortion_models."""
@@ -59,11 +103,16 @@ _GREY = (0.5, 0.5, 0.5)
 def typestore() -> Any:
     """The message types; raises MissingExtraError without rosbags."""
     module = need("rosbags.typesys", "ros")
-    return module.get_typestore(module.Stores.ROS2_HUMBLE)
+    store = module.get_typestore(module.Stores.ROS2_HUMBLE)
+    for name, text in _CUSTOM.items():
+        store.register(module.get_types_from_msg(text, name))
+    return store
 
 
-def encode(message: Any) -> memoryview:
-    """The bytes of a message, CDR in little-endian order."""
+def encode(message: Any) -> memoryview | bytes:
+    """The bytes of a message, CDR in little-endian order; of a message in bytes these."""
+    if isinstance(message, bytes):
+        return message
     packed: memoryview = typestore().serialize_cdr(message, message.__msgtype__, little_endian=True)
     return packed
 
@@ -92,21 +141,27 @@ def _quaternion(quat_xyzw: ArrayLike) -> Any:
     return _make("geometry_msgs/msg/Quaternion", *np.asarray(quat_xyzw, float).tolist())
 
 
-def point_cloud(table: Table, stamp_ns: int, *, frame_id: str) -> Any:
+def point_cloud(table: Table, stamp_ns: int, *, frame_id: str, points: str) -> Any:
     """A PointCloud2 of a point table in the sensor frame, one row of points in the order of firing.
 
-    Fields, packed without gaps: x, y, z (float32, metres), intensity (float32, 0 to 255), t (uint32,
-    nanoseconds after the stamp), ring, label (uint16), instance (int32), and the velocity (float32, m/s) of
-    FMCW scanners.
+    points : layout, a name in `POINTS`
+
+    The fields of the layout are packed without gaps: x, y, z (metres) and intensity (0 to 255), the time
+    since the stamp (``time``, seconds; ``t``, nanoseconds) or since 1970 (``timestamp``, nanoseconds), ring
+    or ``line``, reflectivity (0 to 255), range (mm). Label, instance, and the velocity (m/s) of FMCW scanners
+    follow.
+
+    Raises ValueError for more rings than the layout can number.
     """
-    kept = {field: row for field, row in _FIELDS.items() if row[0] in table}
-    rows = np.empty(len(table["x"]), np.dtype([(field, kind) for field, (_, kind) in kept.items()]))
-    for field, (column, _) in kept.items():
-        rows[field] = table[column]
+    kept = POINTS[points] | {name: row for name, row in _EXTRA.items() if name in table}
+    rows = np.empty(len(table["x"]), np.dtype([(name, kind) for name, (kind, _) in kept.items()]))
+    _check_rings(table, byte=points != "velodyne")
+    for name, (_, values) in kept.items():
+        rows[name] = values(table, stamp_ns)
     assert rows.dtype.fields is not None  # noqa: S101
     fields = [
-        _make("sensor_msgs/msg/PointField", field, rows.dtype.fields[field][1], _DATATYPES[kind], 1)
-        for field, (_, kind) in kept.items()
+        _make("sensor_msgs/msg/PointField", name, rows.dtype.fields[name][1], _DATATYPES[kind], 1)
+        for name, (kind, _) in kept.items()
     ]
     step = rows.dtype.itemsize
     return _make(
@@ -121,6 +176,37 @@ def point_cloud(table: Table, stamp_ns: int, *, frame_id: str) -> Any:
         rows.view(np.uint8),
         True,
     )
+
+
+def custom_cloud(table: Table, stamp_ns: int, *, frame_id: str) -> bytes:
+    """The bytes of livox_ros_driver2's CustomMsg of a point table: times in nanoseconds since the stamp.
+
+    rosbags packs points one by one, which takes seconds a cloud.
+
+    Raises ValueError for more than 256 lines.
+    """
+    _check_rings(table, byte=True)
+    rows = np.zeros(len(table["x"]), _CUSTOM_RECORD)
+    rows["offset_time"], rows["line"], rows["tag"] = table["time_ns"], table["ring"], _tag(table)
+    rows["reflectivity"] = np.rint(table["intensity"])
+    rows["xyz"] = np.column_stack([table[axis] for axis in "xyz"])
+    header, reserved, points = _header(stamp_ns, frame_id), np.zeros(3, np.uint8), list[Any]()
+    head = _make(CUSTOM_MESSAGE, header, stamp_ns, len(rows), 0, reserved, points)
+    packed = bytes(encode(head))  # ends with the number of points
+    return packed[:-4] + len(rows).to_bytes(4, "little") + rows.tobytes()[: -1 if len(rows) else None]
+
+
+def _tag(table: Table) -> NDArray[np.uint8]:
+    """Livox' tags (n,): the number of the return in bits 4 and 5, no confidence that is low."""
+    echo = table.get("echo", np.ones(len(table["x"]), np.uint8))
+    return (np.clip(echo.astype(np.int64) - 1, 0, 3) << 4).astype(np.uint8)
+
+
+def _check_rings(table: Table, *, byte: bool) -> None:
+    if byte and table["ring"].max(initial=0) > 255:
+        raise ValueError(
+            f"ring {table['ring'].max()}, and this layout has rings to 255; give points=velodyne"
+        )
 
 
 def laser_scan(
@@ -214,16 +300,28 @@ def fix(
     return _make("sensor_msgs/msg/NavSatFix", header, status, lat, lon, height, covariance, int(known))
 
 
-def imu(gyro: Float, accel: Float, *, stamp_ns: int, frame_id: str, variances: tuple[float, float]) -> Any:
-    """An Imu of angular rates and specific forces (3,) in the unit's axes, without an orientation.
+def imu(
+    gyro: Float,
+    accel: Float,
+    *,
+    stamp_ns: int,
+    frame_id: str,
+    variances: tuple[float, float],
+    quat_xyzw: Float | None = None,
+) -> Any:
+    """An Imu of angular rates and specific forces (3,) in the unit's axes.
 
     variances : of each axis, (rad/s)^2 and (m/s^2)^2; 0 if unknown
+    quat_xyzw : attitude of the unit in a frame with x east, y north, z up; without it the covariance of the
+                orientation begins with -1 (REP 145)
     """
-    none = np.zeros(9)
-    none[0] = -1.0  # no orientation
+    covariance = np.zeros(9)
+    covariance[0] = -1.0 if quat_xyzw is None else 0.0
     rates, forces = (np.eye(3).ravel() * variance for variance in variances)
-    header, turn = _header(stamp_ns, frame_id), _quaternion((0, 0, 0, 1))
-    return _make("sensor_msgs/msg/Imu", header, turn, none, _vector(gyro), rates, _vector(accel), forces)
+    header, turn = _header(stamp_ns, frame_id), _quaternion((0, 0, 0, 1) if quat_xyzw is None else quat_xyzw)
+    return _make(
+        "sensor_msgs/msg/Imu", header, turn, covariance, _vector(gyro), rates, _vector(accel), forces
+    )
 
 
 def odometry(

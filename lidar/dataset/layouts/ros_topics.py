@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,6 +28,7 @@ from lidar.errors import DatasetError, LidarError
 from lidar.geometry.attitude import OPTICAL, OPTICAL_QUAT, body_rates, matrix_from_quat, quat_from_matrix
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
+from lidar.parameters import Parameters, parameter
 from lidar.sensors.navigation.measurements import fix_variances
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.patterns.repeating import Scan2d
@@ -75,10 +76,34 @@ class Topic:
 
 
 @dataclass(frozen=True)
+class RosOptions(Parameters):
+    """Choices of a recording."""
+
+    points: str = parameter(
+        "auto",
+        "fields of clouds, those of a driver; auto: of the scanner's maker, velodyne for others",
+        among=("auto", *ros.POINTS, ros.CUSTOM),
+    )
+    imu: str = parameter(
+        "none",
+        "orientation in messages of inertial units: none, or the true attitude",
+        among=("none", "truth"),
+    )
+
+    def layout_of(self, sensor: Mapping[str, Any]) -> str:
+        """Layout of the points of a scanner's entry of ``calibration.json``."""
+        if self.points != "auto":
+            return self.points
+        maker = str(sensor.get("model", "")).partition(" ")[0].lower()
+        return maker if maker in ros.POINTS else "velodyne"
+
+
+@dataclass(frozen=True)
 class RosDrive:
     """A drive and what all of its topics share."""
 
     dataset: Dataset
+    options: RosOptions = RosOptions()
 
     @functools.cached_property
     def base_ns(self) -> int:
@@ -203,11 +228,21 @@ def _imu(drive: RosDrive, name: str) -> list[Topic]:
     if spec is not None:
         variances = spec.gyro_noise**2 * spec.rate_hz, spec.accel_noise**2 * spec.rate_hz
     samples = read_samples(drive.dataset.paths.measurements(name))
+    quat: Float | None = None
+    if drive.options.imu == "truth":
+        mount = mount_of(drive.sensors[name])
+        poses = drive.trajectory.at(samples.time_ns).mounted(mount.translation, mount.rotation)
+        quat = quat_from_matrix(poses.rotation)
 
     def make(k: int) -> Any:
         stamp_ns, frame = drive.stamp(samples.time_ns[k]), drive.names[name]
         return ros.imu(
-            samples.gyro[k], samples.accel[k], stamp_ns=stamp_ns, frame_id=frame, variances=variances
+            samples.gyro[k],
+            samples.accel[k],
+            stamp_ns=stamp_ns,
+            frame_id=frame,
+            variances=variances,
+            quat_xyzw=None if quat is None else quat[k],
         )
 
     topic = f"/{drive.names[name]}/data_raw"
@@ -248,9 +283,14 @@ def _scanner(drive: RosDrive, name: str) -> list[Topic]:
     frame_id, flat = drive.names[name], drive.flat_scanners
     ends = clouds.time_ns + round(1e9 / float(clouds.sensor["rate_hz"]))
 
+    points = drive.options.layout_of(clouds.sensor)
+
     def cloud(row: int) -> Any:
-        table = cloud_points(clouds.files[row])
-        return ros.point_cloud(table, drive.stamp(clouds.time_ns[row]), frame_id=frame_id)
+        table, stamp_ns = cloud_points(clouds.files[row]), drive.stamp(clouds.time_ns[row])
+        with reading_file(clouds.files[row]):
+            if points == ros.CUSTOM:
+                return ros.custom_cloud(table, stamp_ns, frame_id=frame_id)
+            return ros.point_cloud(table, stamp_ns, frame_id=frame_id, points=points)
 
     def scan(row: int) -> Any:
         table, sensor = cloud_points(clouds.files[row]), flat[name].sensor
@@ -269,7 +309,8 @@ def _scanner(drive: RosDrive, name: str) -> list[Topic]:
         rows = read_boxes(drive.dataset.paths.frame_boxes(name, int(clouds.frames[row])), COLUMNS)
         return ros.markers(rows, drive.stamp(clouds.time_ns[row]), frame_id=MAP, scale=drive.scale)
 
-    found = [Topic(f"/{frame_id}/points", "sensor_msgs/msg/PointCloud2", ends, cloud, "clouds")]
+    kind = ros.CUSTOM_MESSAGE if points == ros.CUSTOM else "sensor_msgs/msg/PointCloud2"
+    found = [Topic(f"/{frame_id}/points", kind, ends, cloud, "clouds")]
     if name in flat:
         found.append(Topic(f"/{frame_id}/scan", "sensor_msgs/msg/LaserScan", ends, scan, "scans"))
     others = [other for other, s in drive.sensors.items() if s["kind"] == "lidar" and other not in flat]

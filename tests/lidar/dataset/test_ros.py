@@ -11,6 +11,7 @@ import pytest
 from helpers.scenes import same_files
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -25,7 +26,7 @@ from lidar.dataset.ground_truth import COLUMNS, read_boxes
 from lidar.dataset.layout import open_dataset, read_rows
 from lidar.dataset.layouts import EXPORTERS, ros_topics
 from lidar.dataset.layouts.ros_messages import laser_scan, point_cloud, typestore
-from lidar.dataset.layouts.ros_topics import RosDrive, ros_name, topics_of
+from lidar.dataset.layouts.ros_topics import RosDrive, RosOptions, ros_name, topics_of
 from lidar.dataset.navigation_files import FixHeights, read_fixes
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png
 from lidar.errors import DatasetError, FormatError, InputError
@@ -187,7 +188,7 @@ class Tree:
         return out
 
 
-DTYPES = {4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4"}
+DTYPES = {2: np.uint8, 8: np.float64, 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4"}
 
 
 def points(cloud):
@@ -202,6 +203,83 @@ def points(cloud):
     return rows
 
 
+def nanoseconds(rows):
+    """Times of points since their stamp."""
+    return np.rint(rows["time"].astype(float) * 1e9).astype(np.int64)
+
+
+F4, U1, U2, U4, F8 = 7, 2, 4, 6, 8
+PCL = {
+    "velodyne": {"x": F4, "y": F4, "z": F4, "intensity": F4, "ring": U2, "time": F4},
+    "ouster": {"x": F4, "z": F4, "intensity": F4, "t": U4, "reflectivity": U2, "ring": U1, "range": U4},
+    "livox": {"x": F4, "z": F4, "intensity": F4, "tag": U1, "line": U1, "timestamp": F8},
+}
+"""Members of points of drivers by name and PointField's constant: PCL fills those that agree."""
+
+
+@pytest.mark.parametrize("layout", PCL)
+def test_points_have_the_fields_of_a_driver(recorded, tmp_path, layout):
+    convert(recorded.path, tmp_path / "bag", to=f"ros2:points={layout},imu=truth")
+    rows = list(by_rosbags(tmp_path / "bag"))
+    clouds = [message for topic, _, message in rows if topic == "/lidar_top/points"]
+    assert {f.name: f.datatype for f in clouds[0].fields}.items() >= PCL[layout].items()
+    table, found = read_table(next(recorded.files("lidar-top", FORMATS["pcd"]))[1]), points(clouds[0])
+    time_ns, ring = {
+        "velodyne": lambda: (nanoseconds(found), found["ring"]),
+        "ouster": lambda: (found["t"], found["ring"]),
+        "livox": lambda: (found["timestamp"] - ns(clouds[0].header), found["line"]),
+    }[layout]()
+    np.testing.assert_allclose(
+        time_ns, table["time_ns"], atol=260
+    )  # float64 nanoseconds since 1970, here and in the file
+    np.testing.assert_array_equal(ring, table["ring"])
+    if layout == "ouster":
+        np.testing.assert_allclose(found["range"] / 1e3, table["range"], atol=6e-4)
+        np.testing.assert_allclose(found["reflectivity"], table["intensity"], atol=0.51)
+    imu = [message for topic, _, message in rows if topic == "/imu/data_raw"]
+    poses, mount = recorded.trajectory(), np.array(recorded.sensors()["imu"]["vehicle_from_sensor"])
+    for message in imu[:: max(len(imu) // 5, 1)]:
+        turn = poses.at([ns(message.header) - BASE_NS]).mounted(mount[:3, 3], mount[:3, :3]).rotation[0]
+        q = message.orientation
+        np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), turn, atol=1e-9)
+        assert message.orientation_covariance[0] == 0
+
+
+def test_the_message_of_livox_has_the_points(recorded, tmp_path):
+    convert(recorded.path, tmp_path / "bag", to="ros2:points=livox-custom")
+    with AnyReader([tmp_path / "bag"]) as reader:
+        (connection,) = [c for c in reader.connections if c.topic == "/lidar_top/points"]
+        assert connection.msgtype == "livox_ros_driver2/msg/CustomMsg"
+        raw = next(data for _, _, data in reader.messages([connection]))
+        message = reader.deserialize(raw, connection.msgtype)
+    table = read_table(next(recorded.files("lidar-top", FORMATS["pcd"]))[1])
+    assert message.point_num == len(message.points) == len(table["x"])
+    assert message.timebase == ns(message.header)
+    for field, column in (("offset_time", "time_ns"), ("x", "x"), ("z", "z"), ("line", "ring")):
+        np.testing.assert_array_equal([getattr(p, field) for p in message.points], table[column])
+
+
+def test_points_are_those_of_the_scanners_driver_by_default():
+    found = {m: RosOptions().layout_of({"model": m}) for m in ("Ouster OS1-128", "Livox Avia", "Hesai OT128")}
+    assert list(found.values()) == ["ouster", "livox", "velodyne"]
+    assert RosOptions(points="velodyne").layout_of({"model": "Ouster OS1-128"}) == "velodyne"
+
+
+@pytest.mark.parametrize(
+    ("to", "says"),
+    [
+        ("ros2:points=velodine", "points = 'velodine' is none of"),
+        ("ros2:point=velodyne", "parameter 'point' is unknown; is points meant"),
+        ("kitti:points=velodyne", "`to` kitti: has no parameters, and not points"),
+        ("ros2,kitti", "give one layout"),
+    ],
+)
+def test_unknown_parameters_of_layouts_are_refused(recorded, tmp_path, to, says):
+    with pytest.raises(InputError, match=says):
+        convert(recorded.path, tmp_path / "out", to=to)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(("name", "topic"), [("lidar-top", "lidar_top"), ("front", "front")])
 def test_clouds_are_the_recorded_ones_bit_for_bit(recorded, messages, name, topic):
     clouds, times = messages[f"/{topic}/points"], recorded.sample_times(name)
@@ -212,9 +290,10 @@ def test_clouds_are_the_recorded_ones_bit_for_bit(recorded, messages, name, topi
         assert len(rows) > 100
         assert ns(cloud.header) == BASE_NS + times[frame]
         assert cloud.header.frame_id == topic
-        for field, column in {**{k: k for k in rows.dtype.names}, "t": "time_ns"}.items():
-            np.testing.assert_array_equal(rows[field], table[column], strict=False)
-        assert {"x", "y", "z", "intensity", "t", "ring", "label", "instance"} == set(rows.dtype.names)
+        for field in set(rows.dtype.names) - {"time"}:
+            np.testing.assert_array_equal(rows[field], table[field], strict=False)
+        np.testing.assert_allclose(nanoseconds(rows), table["time_ns"], atol=4)  # float32 of 0.1 s
+        assert {"x", "y", "z", "intensity", "time", "ring", "label", "instance"} == set(rows.dtype.names)
         assert all(rows.dtype[k] == np.float32 for k in ("x", "y", "z", "intensity"))
 
 
@@ -223,8 +302,8 @@ def test_log_times_never_go_back_and_no_message_is_logged_before_it_is_complete(
         logged = [log_ns for _, log_ns, _ in rows]
         assert logged == sorted(logged)
     for log_ns, cloud in messages["/lidar_top/points"]:
-        assert int(points(cloud)["t"].max()) > 90_000_000, "the scanner turns for a tenth of a second"
-        assert ns(cloud.header) + int(points(cloud)["t"].max()) <= log_ns
+        assert int(nanoseconds(points(cloud)).max()) > 90_000_000, "the scanner turns for a tenth of a second"
+        assert ns(cloud.header) + int(nanoseconds(points(cloud)).max()) <= log_ns
     for log_ns, image in messages["/ahead/image_raw/compressed"]:
         assert log_ns - ns(image.header) == 2_000_000 + 120 * 10_000, "half the exposure and half the rows"
 
@@ -333,7 +412,7 @@ def test_laser_returns_fall_on_the_pixels_of_what_they_hit(recorded, messages):
         rows = points(cloud)
         rows = rows[(np.abs(rows["y"]) < 0.5 * rows["x"]) & ~np.isin(rows["label"], moving)]
         eye = np.linalg.inv(tree.vehicle(ns(image.header)) @ tree.mount(image.header.frame_id))
-        turns = np.array([eye @ tree.vehicle(ns(cloud.header) + int(t)) for t in rows["t"]])
+        turns = np.array([eye @ tree.vehicle(ns(cloud.header) + int(t)) for t in nanoseconds(rows)])
         xyz1 = np.column_stack([rows[k] for k in "xyz"] + [np.ones(len(rows))]) @ tree.mount("lidar_top").T
         seen = np.einsum("nij,nj->ni", turns, xyz1)[:, :3]
         u, v = np.rint(brown(info, seen)).astype(int).T
@@ -364,7 +443,7 @@ def test_a_scan_has_the_nearest_return_of_each_beam(messages):
         gaps = np.linalg.norm(xy[:, None] - np.column_stack([rows["x"], rows["y"]])[None], axis=2)
         assert gaps.min(axis=1).max() < 1e-4
         fired = np.arange(len(ranges))[hit] * scan.time_increment
-        np.testing.assert_allclose(rows["t"][gaps.argmin(axis=1)] * 1e-9, fired, atol=2e-6)
+        np.testing.assert_allclose(nanoseconds(rows)[gaps.argmin(axis=1)] * 1e-9, fired, atol=2e-6)
 
 
 def test_of_two_returns_of_a_beam_the_nearer_one_is_in_the_scan():
@@ -497,7 +576,8 @@ def test_the_same_drive_gives_the_same_bytes(recorded, bags, tmp_path):
 def test_fmcw_clouds_have_velocities():
     table = {k: np.zeros(2, np.float32) for k in ("x", "y", "z", "intensity", "velocity")}
     table |= {k: np.zeros(2, np.int64) for k in ("time_ns", "ring", "label", "instance")}
-    cloud = point_cloud(table | {"velocity": np.array([1.5, -2.5], np.float32)}, 0, frame_id="a")
+    table["velocity"] = np.array([1.5, -2.5], np.float32)
+    cloud = point_cloud(table, 0, frame_id="a", points="velodyne")
     np.testing.assert_array_equal(points(cloud)["velocity"], [1.5, -2.5])
 
 
