@@ -84,6 +84,7 @@ from geoscene.roadgraph.relief import (
 )
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
+from geoscene.roadgraph.tags import find_unused_inclines
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
@@ -379,6 +380,8 @@ def _plan_roads(
     road_options = RoadOptions(left_hand=side == "left")
     graph = _collect(problems, build_road_graph(mapped, frame, options=road_options))
     problems += find_odd_layers(mapped.ways)
+    if not terrain.grids:
+        problems += find_unused_inclines(mapped.ways)
     surveyed = 0.0 < terrain.spacing <= _SURVEYED
     obstacles = find_obstacles(osm, frame)
     graph = profile(graph, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))

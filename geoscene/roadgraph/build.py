@@ -166,6 +166,7 @@ def _edges(
         layer_source=np.array([s.layer_source for s, _ in side], np.str_),
         bridge=np.array([s.bridge for s, _ in side], np.bool_),
         tunnel=np.array([s.tunnel for s, _ in side], np.bool_),
+        roundabout=np.array([s.roundabout for s, _ in side], np.bool_),
         highway=np.array([s.highway for s, _ in side], np.str_),
         name=np.array([s.name for s, _ in side], np.str_),
         ref=np.array([s.ref for s, _ in side], np.str_),

@@ -255,7 +255,7 @@ def _kinds(tags: Tags) -> list[str]:
     if len(values) > 1:
         return list(dict.fromkeys(kind for value in values for kind in _kinds({**tags, "highway": value})))
     kind = values[0]
-    if kind not in ("traffic_signals", "stop", "give_way", "crossing"):
+    if kind not in ("traffic_signals", "stop", "give_way", "mini_roundabout", "crossing"):
         return []
     crossing = tags.get("crossing", "no" if kind != "crossing" else "unknown")
     kinds = [kind] if kind != "crossing" or crossing != "no" else []

@@ -37,6 +37,7 @@ class RoadGraph:
     layer    : (m,) int8
     layer_source : (m,) str: ``layer``, ``level``, ``bridge``, ``tunnel`` or ``default`` (ground)
     bridge, tunnel : (m,) bool
+    roundabout : (m,) bool, the edge is a part of a roundabout
     highway  : (m,) str
     name     : (m,) str, "" if none
     ref      : (m,) str, "" if none
@@ -60,7 +61,8 @@ class RoadGraph:
 
     control_edge   : (c,) int32
     control_offset : (c,) float64, true metres in plan from the edge's tail
-    control_kind   : (c,) str: ``traffic_signals``, ``stop``, ``give_way`` or ``crossing``
+    control_kind   : (c,) str: ``traffic_signals``, ``stop``, ``give_way``, ``mini_roundabout`` or
+                     ``crossing``
     """
 
     node_id: Ints
@@ -84,6 +86,7 @@ class RoadGraph:
     layer_source: NDArray[np.str_]
     bridge: Bools
     tunnel: Bools
+    roundabout: Bools
     highway: NDArray[np.str_]
     name: NDArray[np.str_]
     ref: NDArray[np.str_]

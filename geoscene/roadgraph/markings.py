@@ -35,6 +35,9 @@ _CLEAR = 1.0
 _STRIP_BEFORE = 12.0
 _EDGED = frozenset({"motorway", "trunk", "primary", "secondary"})
 
+_YIELDING = ("give_way", "mini_roundabout")
+"""Controls with a broken line."""
+
 _SOLID, _BROKEN, _BUS, _ADVISORY = range(4)
 _STYLES = ((_LINE, 0.0, 0.0), (_LINE, _DASH, _GAP), (_WIDE, 0.0, 0.0), (_LINE, _SHORT, _SHORT))
 """Lines by style: width, length of dashes (0 for solid ones) and of gaps."""
@@ -214,7 +217,7 @@ def _dashes(lines: NDArray[np.object_], *, dash: float, gap: float) -> tuple[NDA
 def stop_rows(
     graph: RoadGraph, roads: Carriageways, *, crossings: NDArray[np.object_], left_hand: bool
 ) -> SurfaceRows:
-    """Stop lines before signals and stop signs, and broken ones before give-way signs.
+    """Stop lines before signals and stop signs, broken ones before give-way signs and mini-roundabouts.
 
     They cross the lanes of their direction at the mapped signal or sign, but outside the junction ahead and
     before its crossings.
@@ -279,7 +282,7 @@ def _across(graph: RoadGraph, lines: list[tuple[int, float, str]], *, left_hand:
         far = float(graph.width[edge]) / 2 - _EDGE_IN
         near = float(divider[edge]) + _LINE if graph.twin[edge] >= 0 else -far
         sign = 1.0 if left_hand else -1.0
-        count = 1 if kind != "give_way" else max(int((far - near) / 0.8), 1)
+        count = 1 if kind not in _YIELDING else max(int((far - near) / 0.8), 1)
         stops = np.linspace(near, far, count + 1)
         fill = 1.0 if count == 1 else 0.6
         for a, b in zip(stops[:-1], stops[:-1] + np.diff(stops) * fill, strict=True):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +15,7 @@ from geoscene.roadgraph.values import (
     remark_several,
     remark_unreadable,
 )
-from geoscene.sources.data import TaggedNode, Tags
+from geoscene.sources.data import TaggedNode, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
 
@@ -41,6 +42,7 @@ OTHER_CLASSES = ("busway", "bus_guideway", "raceway", "escape", "track")
 """Values of ``highway`` with a carriageway that is not for the public."""
 
 _NO = frozenset({"", "no", "false", "0"})
+_ROUNDABOUT = ("roundabout", "circular")
 # Values of tunnel at ground level: the road runs through a building or under a roof.
 _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "culvert", "flooded"}
 
@@ -77,6 +79,7 @@ class Street:
     layer_source: str
     bridge: bool
     tunnel: bool
+    roundabout: bool
     name: str
     ref: str
 
@@ -145,6 +148,7 @@ def read_street(tags: Tags, *, left_hand: bool = False) -> tuple[Street, Remarks
         layer_source=layer_source,
         bridge=is_bridge(tags),
         tunnel=is_tunnel(tags),
+        roundabout=tags.get("junction") in _ROUNDABOUT,
         name=tags.get("name", ""),
         ref=tags.get("ref", ""),
     )
@@ -171,6 +175,17 @@ def find_odd_diameters(points: Sequence[TaggedNode]) -> list[Problem]:
             read_diameter(point.tags, remarks)
         problems += [Problem(point.osm_id, "road", "repaired", reason, text) for reason, text in remarks]
     return problems
+
+
+def find_unused_inclines(ways: Sequence[Way]) -> list[Problem]:
+    """Problems of roads whose ``incline`` has a number, on maps without heights: these are level."""
+    return [
+        Problem(
+            way.osm_id, "road", "repaired", "incline", f"incline={text}: level, for want of elevation data"
+        )
+        for way in ways
+        if drivable(way.tags) and re.search(r"\d", text := way.tags.get("incline", ""))
+    ]
 
 
 def is_bridge(tags: Tags) -> bool:
@@ -238,5 +253,5 @@ def _direction(tags: Tags, remarks: Remarks) -> int:
             return 1
         if tags.get(f"{key}:forward") == "no":
             return -1
-    implied = road_class(tags) == "motorway" or tags.get("junction") in ("roundabout", "circular")
+    implied = road_class(tags) == "motorway" or tags.get("junction") in _ROUNDABOUT
     return 1 if implied and value is None else 0

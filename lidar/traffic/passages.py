@@ -14,6 +14,8 @@ from lidar.traffic.junctions import JunctionPlan, road_rank, signal_group, zone_
 from lidar.traffic.lanes import STEP, ActorPath
 from lidar.traffic.trips import Trip
 
+_TURN = 0.5  # radians from which on traffic turns
+_ON_ROUNDABOUT, _ENTERING = -1.0, 20.0  # ranks of traffic on a roundabout, and of that which enters one
 _LINE_REACH = 20.0  # metres before a junction within which lines to stop at are heeded
 _LINE_ROOM = 4.0  # metres before the middle of a crossing, or a signal, at which the front of a vehicle stops
 
@@ -57,13 +59,28 @@ def passages(
             rows[-1][5] = routes.setdefault((int(rows[-1][5]), -1, *through), len(routes))
             continue
         bend = (float(path.heading[behind]) - heading + np.pi) % (2 * np.pi) - np.pi
-        rank = 2.0 * road_rank(str(graph.highway[entry]) if entry >= 0 else "") + 0.5 * (abs(bend) > 0.5)
-        signs = graph.control_kind[graph.control_edge == entry]
-        rank += 3.0 if np.isin(signs, ("stop", "give_way")).any() else 0.0
+        rank = _rank(graph, entry, turns=abs(bend) > _TURN)
         group = signal_group(plan, z, heading=heading)
         halt = group < 0 and _stops(graph, entry)
         rows.append([start, end, stop, z, group, routes.setdefault(through, len(routes)), rank, float(halt)])
     return np.array(rows, float).reshape(-1, 8)
+
+
+def _rank(graph: RoadGraph, edge: int, *, turns: bool) -> float:
+    """Rank of the traffic that comes from an edge, lower goes first.
+
+    Traffic on a roundabout goes before that which enters it; all that enters a mini-roundabout is equal, and
+    waits for those who are in it. Else it is by class, signs, and whether it turns.
+    """
+    if edge < 0:
+        return 2.0 * road_rank("") + 0.5 * turns
+    if graph.roundabout[edge]:
+        return _ON_ROUNDABOUT
+    signs = graph.control_kind[graph.control_edge == edge]
+    if "mini_roundabout" in signs or graph.roundabout[graph.tail == graph.head[edge]].any():
+        return _ENTERING
+    yields = bool(np.isin(signs, ("stop", "give_way")).any())
+    return 2.0 * road_rank(str(graph.highway[edge])) + 0.5 * turns + 3.0 * yields
 
 
 def _stops(graph: RoadGraph, edge: int) -> bool:

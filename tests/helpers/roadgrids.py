@@ -32,6 +32,7 @@ def road_graph(nodes, pairs, *, twoway=True, width=7.0, speed=13.9, lanes=1.0, b
         **{name: np.full(m, "") for name in ("lane_kinds", "lane_widths", "lane_turns")},
         "bridge": np.zeros(m, bool),
         "tunnel": np.zeros(m, bool),
+        "roundabout": np.zeros(m, bool),
     } | {name: np.asarray(value) for name, value in columns.items()}
     text = np.full(m, "default")
     return RoadGraph(

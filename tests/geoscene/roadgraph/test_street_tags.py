@@ -5,6 +5,8 @@ import pytest
 import shapely
 
 from geoscene.geometry.frames import Frame
+from geoscene.options import BuildOptions
+from geoscene.pipeline.build import build
 from geoscene.roadgraph import RoadOptions, build_road_graph, profile
 from geoscene.roadgraph.carriageways import read_carriageways
 from geoscene.roadgraph.lanes import graph_lanes
@@ -25,7 +27,7 @@ LINE = (1, 2, 3)
 def extract(*ways, points=()):
     lonlat = {n: np.array(FRAME.to_geographic(*xy)) for n, xy in PLACES.items()}
     return OsmData(
-        bounds=(9.9, 49.9, 10.1, 50.1),
+        bounds=(9.998, 49.998, 10.002, 50.002),
         ways=[
             Way(f"way/{k}", tags, np.array(nodes), np.array([lonlat[n] for n in nodes]))
             for k, (tags, nodes) in enumerate(ways)
@@ -410,3 +412,18 @@ def test_a_control_at_the_first_node_of_a_way_for_those_who_leave_it_is_reported
 def test_a_node_of_two_kinds_controls_by_both():
     graph, _ = graph_of((ROAD, LINE), points=[(2, {"highway": "crossing;traffic_signals"})])
     assert sorted(graph.control_kind.tolist()) == ["crossing"] * 2 + ["traffic_signals"] * 2
+
+
+def test_inclines_of_maps_without_heights_are_reported(tmp_path):
+    steep, up, path = (
+        (ROAD | {"incline": "10%"}, (1, 2)),
+        (ROAD | {"incline": "up"}, (2, 3)),
+        ({"highway": "footway", "incline": "12%"}, (2, 4)),
+    )
+    osm = extract(steep, up, path, ({"highway": "service", "incline": "-8 %"}, (2, 5)))
+    build(osm, tmp_path / "scene", options=BuildOptions(relief="off"))
+    rows = [
+        line for line in (tmp_path / "scene" / "problems.csv").read_text().splitlines() if "incline" in line
+    ]
+    assert [row.split(",")[0] for row in rows] == ["way/0", "way/3"]
+    assert "incline=10%" in rows[0]
