@@ -90,7 +90,17 @@ USES: Mapping[str, Use] = {
         "road graph and tables in plan only",
         tiles=False,
         tables=dict.fromkeys(
-            ("buildings", "landcover", "road_surfaces", "roads", "trees", "furniture", "barriers"), Needed()
+            (
+                "buildings",
+                "passages",
+                "landcover",
+                "road_surfaces",
+                "roads",
+                "trees",
+                "furniture",
+                "barriers",
+            ),
+            Needed(),
         ),
     ),
 }

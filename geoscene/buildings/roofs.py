@@ -63,7 +63,7 @@ INWARD: dict[str, Profile] = {
 GABLE_SHARE = {"gabled": 1.0, "gambrel": 1.0, "round": 1.0, "saltbox": 1.0, "half-hipped": 0.5}
 """Share by which the hip ends of a skeleton are raised to gables."""
 
-_FALLBACK = {"onion": "a dome", "saltbox": "gabled", "pyramidal": "hipped", "cone": "hipped"}
+_FALLBACK = {"onion": "dome", "saltbox": "gabled", "pyramidal": "hipped", "cone": "hipped"}
 """Shape that replaces another one on the skeleton."""
 
 RADIAL: dict[str, Profile] = {

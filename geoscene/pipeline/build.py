@@ -5,7 +5,7 @@ from __future__ import annotations
 import glob
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from geoscene.ground import tile_span
 from geoscene.ground.kerbs import count_covers, count_kerbs
 from geoscene.objects.shapes import leaf_area_density, shapes
 from geoscene.options import BuildOptions
+from geoscene.pipeline.features import with_built_shapes
 from geoscene.pipeline.limits import height_limit, places, scale_limit
 from geoscene.pipeline.plan import BuildPlan, make_plan
 from geoscene.pipeline.reach import AreaOf
@@ -95,6 +96,7 @@ def build(
             reports.append(report)
             progress("tiles", len(reports), total=len(tiles))
         problems += [p for r in sorted(reports, key=lambda r: (r.i, r.j)) for p in r.problems]
+        plan = replace(plan, layers=with_built_shapes(plan.layers, problems))
         writer.finish(
             frame=plan.frame,
             layers=plan.layers,
@@ -198,7 +200,7 @@ def scene_manifest(
         "roads": {"driving_side": plan.side[0], "driving_side_source": plan.side[1]},
         "counts": _counts(plan, reports, problems=problems),
         **({} if plan.relief == "off" else {"relief": _relief(plan, reports)}),
-        "heights": _tally(plan.buildings.height_source[: plan.buildings.count]),
+        "heights": _tally(plan.layers[0].columns["height_source"]),
         "leaf_area_density": leaf_area_density(with_relief=plan.relief != "off"),
         "forests": plan.forests.to_json() if plan.forests else None,
         "roofs": _tally(plan.buildings.roof_shape[plan.buildings.drawn]),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +22,11 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.scene.geopackage import Layer
 from geoscene.structures import Passages, Structures
+from geoscene.support.problems import Problem
+from geoscene.typing import Bools, Ints
+
+_SAME = 0.005
+"""Metres within which heights of a building and of its parts are the same."""
 
 
 def _columns(table: Any, names: str, **computed: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -62,6 +69,75 @@ def building_layers(
             columns = {"building": buildings.outline, **columns}
         layers.append(Layer(name, buildings.footprint[rows], {k: v[rows] for k, v in columns.items()}))
     return layers
+
+
+def with_built_shapes(layers: Sequence[Layer], problems: Sequence[Problem]) -> list[Layer]:
+    """The layers with heights, roofs and plans of buildings as they were built.
+
+    A roof that had to be replaced has the shape of the one that was built (``roof_source`` fallback). A
+    building that its parts replace has their plan, the lowest of their undersides, and top and roof of the
+    highest (``height_source`` parts where the height differs).
+
+    problems : of the build, with the replaced roofs
+    """
+    tables = {layer.name: layer for layer in layers}
+    whole, parts = tables["buildings"], tables["building_parts"]
+    of = np.asarray(parts.columns["building"], np.int64)
+    replaced, flattened = {}, set()
+    for problem in problems:
+        if problem.reason == "roof-fallback":
+            replaced[problem.osm_id] = problem.detail.partition(" roof made ")[2].partition(",")[0]
+        elif problem.reason in ("flat-roof", "cleaned-footprint"):
+            flattened.add(problem.osm_id)
+    flat = np.isin(whole.columns["osm_id"].astype(str), sorted(flattened))
+    whole = _with_roofs(whole, replaced, flat=flat)
+    parts = _with_roofs(parts, replaced, flat=flat[of])
+    tables |= {"buildings": _as_parts(whole, parts, of=of), "building_parts": parts}
+    return list(tables.values())
+
+
+def _with_roofs(layer: Layer, replaced: Mapping[str, str], *, flat: Bools) -> Layer:
+    """A layer of buildings or parts with replaced roofs, by id, and flat ones (n,)."""
+    ids, shape = layer.columns["osm_id"], layer.columns["roof_shape"].copy()
+    pitched = layer.columns["roof_height"] > 0
+    made = np.array([replaced.get(str(name), "") for name in ids], object)
+    changed = pitched & (made != "") & (made != shape)
+    shape[changed] = made[changed]
+    shape[pitched & flat] = "flat"
+    changed |= pitched & flat
+    source = layer.columns["roof_source"].copy()
+    source[changed] = "fallback"
+    height = np.where(changed & (shape == "flat"), 0.0, layer.columns["roof_height"])
+    columns = {"roof_shape": shape, "roof_height": height, "roof_source": source}
+    return replace(layer, columns={**layer.columns, **columns})
+
+
+def _as_parts(whole: Layer, parts: Layer, *, of: Ints) -> Layer:
+    """The layer of buildings, those with parts as these are; ``of`` (p,) is the building of each part."""
+    if not len(of):
+        return whole
+    columns, shapes = {name: values.copy() for name, values in whole.columns.items()}, whole.geometry.copy()
+    place = np.arange(len(of))
+    for name, key in (("height", -parts.columns["height"]), ("min_height", parts.columns["min_height"])):
+        order = np.lexsort((place, key, of))
+        chosen = order[np.unique(of[order], return_index=True)[1]]
+        building = of[chosen]
+        own, theirs = whole.columns[name][building], parts.columns[name][chosen]
+        differs = np.abs(own - theirs) > _SAME
+        row, part = building[differs], chosen[differs]
+        columns[name][row] = theirs[differs]
+        if name == "height":
+            columns["height_source"][row] = "parts"
+            columns["height_sigma"][row] = parts.columns["height_sigma"][part]
+            for roof in ("roof_shape", "roof_height", "roof_source"):
+                columns[roof][building] = parts.columns[roof][chosen]
+        else:
+            columns["min_height_source"][row] = parts.columns["min_height_source"][part]
+    order = np.argsort(of, kind="stable")
+    rows, first = np.unique(of[order], return_index=True)
+    for row, members in zip(rows.tolist(), np.split(order, first[1:]), strict=True):
+        shapes[row] = shapely.union_all(parts.geometry[members])
+    return Layer(whole.name, shapes, columns)
 
 
 def ground_layer(name: str, ground: Layers) -> Layer:
