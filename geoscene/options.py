@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from geoscene.errors import InputError
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
+from geoscene.support.option_values import take_values
 from geoscene.support.registry import unknown_name
 from geoscene.uses import MESH, RELIEFS, USES
 
@@ -82,6 +83,7 @@ class BuildOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if self.lod not in (0, 1, 2):
             raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
         if self.relief not in RELIEFS:
@@ -137,6 +139,7 @@ class CloudOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if self.prefer not in ("cloud", "tags"):
             raise InputError(f"`prefer` {self.prefer}: cloud or tags")
         given = [name for name in _OF_CLOUDS if getattr(self, name)]
@@ -165,6 +168,7 @@ class BuildTradeoffOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if not 0.1 <= self.resolution <= 100:
             raise InputError(f"`resolution` {self.resolution:g}: give 0.1 to 100 metres")
         if not 1 <= self.repetitions <= 20:
@@ -187,6 +191,7 @@ class ViewOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if not self.max_mb > 0:
             raise InputError(f"`max_mb` {self.max_mb:g}: must be more than 0")
 
@@ -227,6 +232,7 @@ class ExportOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if self.roofs not in (None, "guess", "flat"):
             raise InputError(f"`roofs` {self.roofs}: guess or flat")
         if self.relief not in (None, MESH):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
@@ -19,6 +20,7 @@ from geoscene.classes import Class
 from geoscene.options import KINDS, BuildOptions, Degrees
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
 from geoscene.support.digests import recipe_digest
+from geoscene.support.option_values import Reader, brief, listed, take_values
 from geoscene.support.registry import unknown_name
 from geoscene.support.urls import redacted
 from geoscene.uses import RELIEFS
@@ -26,7 +28,7 @@ from lidar.dataset.formats import FORMATS, LABELS
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import InputError
 from lidar.geometry.time_scales import LONGEST_S
-from lidar.parameters import split_pairs
+from lidar.parameters import split_pairs, value_text
 from lidar.sensors.rig.imu_grades import PRESETS
 
 if TYPE_CHECKING:
@@ -133,7 +135,11 @@ def _waypoint(word: str) -> tuple[float, float] | None:
 
 
 def _time(_: object, tokens: Sequence[Token]) -> datetime:
-    text = tokens[0].value
+    return read_time(tokens[0].value)
+
+
+def read_time(text: str) -> datetime:
+    """The time of an ISO 8601 text, UTC unless it states a zone; raises ValueError for others."""
     if re.search(r":\d\d:60", text):
         raise ValueError(
             f"{text}: a drive cannot start within a leap second; give the second before or after"
@@ -219,21 +225,15 @@ def _settings(_: object, tokens: Sequence[Token]) -> tuple[tuple[str, str], ...]
 
 
 def _stages(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.signal.registry import read_stages  # noqa: PLC0415
-
-    return read_stages([token.value for token in tokens]).stages
+    return tuple(_stages_of([token.value for token in tokens]))
 
 
 def _attacks(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.signal.registry import read_attacks  # noqa: PLC0415
-
-    return read_attacks([token.value for token in tokens])
+    return tuple(_attacks_of([token.value for token in tokens]))
 
 
 def _weather(_: object, tokens: Sequence[Token]) -> Any:
-    from lidar.signal.weather.setting import read_weather  # noqa: PLC0415
-
-    return tuple(setting for token in tokens for setting in read_weather(token.value))
+    return tuple(_weather_of([token.value for token in tokens]))
 
 
 _STAGE = Parameter(name="--stage", converter=_stages, n_tokens=1, accepts_keys=False, metavar="STAGE")
@@ -263,6 +263,119 @@ def _traffic(_: object, tokens: Sequence[Token]) -> Any:
     return read_traffic(tokens[0].value)
 
 
+def _taken_route(value: Any) -> Any:
+    """A route of Python code: random, a path, or two or more places."""
+    if isinstance(value, Path) or (isinstance(value, str) and not value):
+        return value
+    if isinstance(value, str | os.PathLike):
+        text = os.fspath(value).strip()
+        words = text.split()
+        if text != "random" and not (len(words) > 1 and all(map(_waypoint, words))):
+            return Path(text)
+        return text if text == "random" else [_waypoint(word) for word in words]
+    places = [_place(one) for one in listed(value)]
+    if len(places) < 2:
+        raise ValueError("give two or more places")
+    return places
+
+
+def _place(value: Any) -> tuple[float, float]:
+    """A place of a route, of Python code."""
+    place = _waypoint(value) if isinstance(value, str) else tuple(map(float, listed(value)))
+    if place is None or len(place) != 2 or not (abs(place[0]) <= 90 and abs(place[1]) <= 180):
+        raise ValueError(f"{brief(value)} is no latitude and longitude in degrees")
+    return place
+
+
+def _taken_time(value: Any) -> datetime | None:
+    """A time of Python code, with its zone."""
+    if value is None or (isinstance(value, datetime) and value.tzinfo is not None):
+        return value
+    if isinstance(value, datetime):
+        return value.replace(tzinfo=UTC)
+    if isinstance(value, str):
+        return read_time(value)
+    raise ValueError("give a datetime, or an ISO 8601 time such as 2026-06-21T08:00:00")
+
+
+def _taken_traffic(value: Any) -> Any:
+    """Traffic of Python code."""
+    from lidar.traffic.options import TrafficFile, TrafficOptions, read_traffic  # noqa: PLC0415
+
+    if value is None or isinstance(value, TrafficOptions | TrafficFile):
+        return value
+    if isinstance(value, str | os.PathLike):
+        return read_traffic(os.fspath(value))
+    raise ValueError("give a text such as on or on:vehicles=20, a TrafficOptions or a TrafficFile")
+
+
+def _taken_settings(value: Any) -> tuple[tuple[str, str], ...]:
+    """Settings of Python code: NAME=VALUE, a dictionary, or pairs."""
+    if isinstance(value, str):
+        return tuple(split_pairs(value))
+    found: list[tuple[str, str]] = []
+    for pair in value.items() if isinstance(value, Mapping) else listed(value):
+        if isinstance(pair, str):
+            found += split_pairs(pair)
+            continue
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError("give NAME=VALUE, or a dictionary")
+        found.append((str(pair[0]), value_text(pair[1])))
+    return tuple(found)
+
+
+def _taken_stages(read: Callable[[list[str]], Iterable[Any]]) -> Reader:
+    """A reader of stages of Python code: texts as on the command line, or stages that were read."""
+
+    def reader(value: Any) -> tuple[Any, ...]:
+        from lidar.signal.registry import NamedStage, Stages, number_stages  # noqa: PLC0415
+
+        if isinstance(value, Stages):
+            return value.stages
+        taken: list[Any] = []
+        for one in [value] if isinstance(value, str | os.PathLike | NamedStage) else listed(value):
+            if isinstance(one, str | os.PathLike):
+                taken += read([os.fspath(one)])
+            elif isinstance(one, NamedStage):
+                taken.append(one)
+            else:
+                raise TypeError("give texts as on the command line, or what read_stages returns")
+        return number_stages(taken)
+
+    return reader
+
+
+def _weather_of(texts: list[str]) -> Iterable[Any]:
+    from lidar.signal.weather.setting import read_weather  # noqa: PLC0415
+
+    return chain.from_iterable(map(read_weather, texts))
+
+
+def _stages_of(texts: list[str]) -> Iterable[Any]:
+    from lidar.signal.registry import read_stages  # noqa: PLC0415
+
+    return read_stages(texts).stages
+
+
+def _attacks_of(texts: list[str]) -> Iterable[Any]:
+    from lidar.signal.registry import read_attacks  # noqa: PLC0415
+
+    return read_attacks(texts)
+
+
+_STAGE_READERS = {
+    "stages": _taken_stages(_stages_of),
+    "weather": _taken_stages(_weather_of),
+    "attacks": _taken_stages(_attacks_of),
+}
+_READERS = _STAGE_READERS | {
+    "route": _taken_route,
+    "settings": _taken_settings,
+    "start": _taken_time,
+    "traffic": _taken_traffic,
+}
+"""How options of Python code are read, by name."""
+
 _ROADS = ("dry", "by-weather", "wet", "snow", "ice")
 """What vehicles drive on."""
 
@@ -275,8 +388,10 @@ _NOT_IN_RECIPE = ("relief", "device", "stages", "weather", "attacks", "road", "w
 class DriveOptions:
     """Options of a drive. The dataset stores them; its bytes depend on all but ``workers`` and ``scheduler``.
 
-    In Python, ``route`` is ``random``, a path or a list of (latitude, longitude) in degrees, ``settings``
-    holds (name, text) pairs and ``traffic`` a `TrafficOptions` or `TrafficFile`.
+    In Python all options take the texts of the command line, several of them also as a list, and paths.
+    ``route`` may be a list of (latitude, longitude) in degrees, ``settings`` a dictionary, ``start`` a
+    `datetime` (UTC unless it states a zone), ``traffic`` a `TrafficOptions` or `TrafficFile`, and
+    ``weather``, ``attacks`` and ``stages`` what `read_weather`, `read_attacks` and `read_stages` return.
     """
 
     route: Annotated[Spec, Parameter(converter=_route, metavar="ROUTE"), SEVERAL] = ""
@@ -392,13 +507,14 @@ class DriveOptions:
     need the scene's and the output folder under the same paths. The bytes do not depend on it."""
 
     def __post_init__(self) -> None:
-        """Validate the options, and enter ``relief`` and ``device`` among the settings."""
-        for short in ("relief", "device"):
-            if value := getattr(self, short):
-                if any(name == short for name, _ in self.settings):
-                    raise InputError(f"`{short}` {value}: `settings` {short} is given, too; give one of both")
-                object.__setattr__(self, "settings", (*self.settings, (short, value)))
-                object.__setattr__(self, short, "")
+        """Take the options, validate them, and enter ``relief`` and ``device`` among the settings."""
+        take_values(self, error=InputError, readers=_READERS)
+        for name in ("relief", "device"):
+            if value := getattr(self, name):
+                if any(given == name for given, _ in self.settings):
+                    raise InputError(f"`{name}` {value}: `settings` {name} is given, too; give one of both")
+                object.__setattr__(self, "settings", (*self.settings, (name, value)))
+                object.__setattr__(self, name, "")
         if self.duration is not None and not 0.1 <= self.duration <= LONGEST_S:
             raise InputError(
                 f"`duration` {self.duration}: give 0.1 to {LONGEST_S:.0f} seconds (four hours), and record"
@@ -589,6 +705,7 @@ class AccuracyOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         if self.accuracy:
             read_accuracy(self.accuracy)
         if self.budget:
@@ -647,6 +764,10 @@ class PlaceOptions:
     scene_cache: Path | None = None
     """Folder of the scenes that drives build; ~/.cache/geoscene/scenes by default."""
 
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        take_values(self, error=InputError)
+
     def build_options(self, name: str, *, relief: str) -> BuildOptions:
         """Options of the build, with a title of the scene; raises InputError for invalid ones.
 
@@ -697,6 +818,7 @@ class TradeoffOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _check_whole(self, frames=(2, 1000), pulses=(100, 10**7), pixels=(256, 10**7))
         _check_whole(self, reference_rays=(7, 665), repetitions=(3, 100))
 
@@ -778,6 +900,7 @@ class MapOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _check_words(self, color=COLORS, echo=ECHOES, tile_format=TILE_FORMATS)
         _check_positive(self, voxel=" of metres", resolution=" of metres")
         if self.outliers is not None:
@@ -844,6 +967,7 @@ class OdometryOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError, readers={"settings": _taken_settings})
         others = [name for name in METHODS if name != "fused"]
         _check_words(self, method=METHODS, relative=("", "none", *others), imu_grade=("", *PRESETS))
         if self.method != "fused" and (self.relative or self.imu_grade):
@@ -891,6 +1015,7 @@ class PlaybackOptions(_OfFrames):
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _ = self.limits
         if self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
@@ -914,6 +1039,7 @@ class PlotOptions(_OfFrames):
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _ = self.limits
         _check_positive(self, resolution=" of metres")
 
@@ -951,6 +1077,7 @@ class FilmOptions(_OfFrames):
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _check_words(self, show=SHOWN, view=FILM_VIEWS, color=FILM_COLORS)
         _ = self.limits
         if self.every < 1:
@@ -991,6 +1118,7 @@ class EvaluateOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _check_words(self, align=ALIGNMENTS, associate=("interpolated", "nearest"))
         if self.max_gap is not None and not 0 <= self.max_gap < math.inf:
             raise InputError(f"`max_gap` {self.max_gap:g}: give seconds, 0 or more")
@@ -1005,6 +1133,10 @@ class ConvertOptions:
     """Options of a conversion of a dataset."""
 
     to: Annotated[str, Parameter(help=_LAYOUTS)]
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        take_values(self, error=InputError)
 
 
 @Parameter(name="*")
@@ -1029,6 +1161,7 @@ class ApplyOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError, readers=_STAGE_READERS)
         if not self.all_stages:
             raise InputError("give one or more of `stages`, `weather` and `attacks`")
 
@@ -1070,6 +1203,7 @@ class DefendOptions:
 
     def __post_init__(self) -> None:
         """Validate the options."""
+        take_values(self, error=InputError)
         _check_words(self, fuse=FUSE)
         if self.calibrate and (self.fuse != "harmonic" or self.calibration is not None):
             raise InputError("`calibrate`: leave out `fuse` and `calibration`")
@@ -1092,6 +1226,10 @@ class SignOptions:
     """Metres between coordinates of the same bit of the watermark; points move by at most half of it along
     each axis. The same to sign and to verify."""
 
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        take_values(self, error=InputError)
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, slots=True)
@@ -1101,6 +1239,10 @@ class DenoiseOptions:
     methods: Annotated[tuple[str, ...], Parameter(name="--method"), NAMED]
     """Filters, separated by commas: statistical, dror, dsor, lior, ddior; NAME or NAME:KEY=VALUE,KEY=VALUE.
     docs/reference/weather.md lists their parameters."""
+
+    def __post_init__(self) -> None:
+        """Validate the options."""
+        take_values(self, error=InputError)
 
 
 def classes_of(names: Iterable[str], *, option: str = "without") -> list[int]:

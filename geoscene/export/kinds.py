@@ -12,7 +12,7 @@ import numpy as np
 
 from geoscene.errors import InputError
 from geoscene.options import ExportOptions
-from geoscene.scene import Scene
+from geoscene.scene import Scene, SceneLike, open_scene
 from geoscene.support.files import exclusive
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import Registry, load
@@ -109,7 +109,7 @@ def kind_of(out: Path) -> str:
 
 @shows_progress
 def export_scene(
-    scene: Scene,
+    scene: SceneLike,
     out: str | Path,
     *,
     options: ExportOptions = ExportOptions(),
@@ -122,6 +122,7 @@ def export_scene(
     layers without contents, and if a file exists and may not be overwritten; MissingExtraError where an
     optional package is needed.
     """
+    scene = open_scene(scene)
     out = Path(out)
     name = kind_of(out) if options.kind is None else options.kind
     kind = KINDS.find(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
@@ -13,7 +14,7 @@ import numpy as np
 import shapely
 
 from geoscene import __version__
-from geoscene.errors import SourceNotFoundError
+from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.geometry.frames import wrap_longitude
 from geoscene.ground import tile_span
 from geoscene.ground.kerbs import count_covers, count_kerbs
@@ -29,9 +30,10 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene, open_scene
 from geoscene.scene.layout import SCHEMA
 from geoscene.scene.writer import SceneWriter
-from geoscene.sources import SOURCES, OsmData, credits_of
+from geoscene.sources import SOURCES, OsmData, credits_of, read_osm
 from geoscene.support.cluster import DaskCluster
 from geoscene.support.digests import file_digest, sources_digest, value_digest
+from geoscene.support.option_values import expect
 from geoscene.support.problems import Problem, summarise
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.uses import USES
@@ -48,7 +50,7 @@ STEEP = 0.2
 
 @shows_progress
 def build(
-    osm: OsmData,
+    osm: OsmData | str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     out: str | Path,
     *,
     options: BuildOptions = BuildOptions(),
@@ -64,6 +66,7 @@ def build(
     An interrupted build resumes when repeated. A build that overwrites a scene reuses its unchanged tiles.
     The bytes depend neither on ``workers`` or ``cluster`` nor on earlier builds.
 
+    osm     : a map that was read, or files of one, as for `read_osm`
     workers : processes that build tiles
     cluster : whose workers build the tiles instead, see `geoscene.support.cluster.connect`
 
@@ -73,6 +76,10 @@ def build(
     Raises SourceNotFoundError for an empty extract, FrameError for an unsuitable CRS and SceneFormatError for
     a directory that must not be overwritten.
     """
+    expect(options, BuildOptions, name="options", error=InputError)
+    if not isinstance(osm, OsmData):
+        progress("reading the map", 0, total=0)
+        osm = read_osm(osm)
     if not (osm.areas or osm.ways):
         raise SourceNotFoundError(f"{osm.source or 'the extract'}: has no features to build a scene from")
     with SceneWriter(Path(out), overwrite=overwrite) as writer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -23,6 +24,7 @@ from geoscene.scene.geopackage import Layer, Schema, database_digest, read_layer
 from geoscene.scene.tile_files import Tile, read_shapes, read_tile, with_forests
 from geoscene.support.digests import digest, file_digest, value_digest
 from geoscene.support.files import write_atomically
+from geoscene.support.option_values import brief
 from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Float, Ints
@@ -142,6 +144,22 @@ class Scene(Previewed):
     def files(self) -> SceneFiles:
         """Paths of the files."""
         return SceneFiles(self.path, self.stored)
+
+    def __repr__(self) -> str:
+        """What the scene is and holds, in a few lines."""
+        counts, bounds = self.manifest.get("counts", {}), self.manifest.get("bounds", (0, 0, 0, 0))
+        name = f" ({self.manifest['name']})" if self.manifest.get("name") else ""
+        parts = [f"{bounds[2] - bounds[0]:,.0f} m x {bounds[3] - bounds[1]:,.0f} m"]
+        parts += [f"{len(self.manifest.get('tiles', ())):,} tiles", f"{counts.get('solids', 0):,} buildings"]
+        parts += [f"{counts.get('road_km', 0):,.1f} km of roads"]
+        lines = [f"Scene {self.location}{name}: {', '.join(parts)}"]
+        if isinstance(self.frame, Frame):
+            lines.append(f"  {self.frame.name}, heights {self.frame.vertical}")
+        return "\n".join([*lines, f"  {self.manifest.get('attribution', '')}"]).rstrip()
+
+    def __fspath__(self) -> str:
+        """The directory, so that a scene can be given for its path."""
+        return str(self.path)
 
     @property
     def location(self) -> str:
@@ -373,14 +391,24 @@ class Scene(Previewed):
         return read_graphml(path, self.frame)
 
 
-def open_scene(path: str | Path) -> Scene:
+SceneLike = str | os.PathLike[str]
+"""Directory or URL of a scene, or an opened one."""
+
+
+def open_scene(path: SceneLike) -> Scene:
     """Open a scene directory, of this machine or at a URL (``s3://``, ``gs://``, ``file://``).
+
+    Opened scenes are returned as they are.
 
     Files of a scene at a URL are fetched when they are read, into a folder of the user's cache.
 
     Raises SceneFormatError if it is not a scene, is unfinished, or has another schema version, and
     StorageError if the storage cannot be reached or has no scene there.
     """
+    if isinstance(path, Scene):
+        return path
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"`scene` {brief(path)}: give the directory or URL of a scene, or an opened one")
     if url := url_of(path):
         return _open_stored(url)
     folder = Path(path)

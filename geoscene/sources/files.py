@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -183,7 +184,10 @@ def _read(path: Path, progress: Progress) -> Collector:
 
 
 def read_osm(
-    path: str | Path | Sequence[str | Path], *, bounds: Bounds | None = None, progress: Progress = iter
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    *,
+    bounds: Bounds | None = None,
+    progress: Progress = iter,
 ) -> OsmData:
     """The features of OpenStreetMap extracts: XML or Overpass JSON (plain, gzip, bzip2), PBF, or o5m.
 
@@ -209,7 +213,7 @@ def read_osm(
         A file is not an OpenStreetMap file, is truncated or damaged, the bounds are invalid, or different
         objects of two files have the same negative id.
     """
-    paths = [Path(path)] if isinstance(path, (str, Path)) else [Path(p) for p in path]
+    paths = [Path(path)] if isinstance(path, str | os.PathLike) else [Path(p) for p in path]
     if bounds is not None:
         bounds = checked_bounds(bounds)
     collector = Collector()

@@ -10,6 +10,7 @@ import base64
 import errno
 import hashlib
 import json
+import os
 import re
 import secrets
 import shutil
@@ -37,12 +38,12 @@ _AT_ONCE = 8
 _fetching = threading.Lock()
 
 
-def url_of(path: str | Path) -> str:
+def url_of(path: str | os.PathLike[str]) -> str:
     """The URL of a folder, mended where `pathlib` has collapsed ``s3://``; empty for a local path.
 
     Raises InputError for a URL that ends after its protocol.
     """
-    found = _URL.fullmatch(str(path))
+    found = _URL.fullmatch(os.fspath(path))
     if not found:
         return ""
     scheme, rest = found.groups()
@@ -51,9 +52,9 @@ def url_of(path: str | Path) -> str:
     return f"{scheme}://{'/' if scheme == 'file' else ''}{rest}".rstrip("/")
 
 
-def shown(path: Path) -> str:
+def shown(path: str | os.PathLike[str]) -> str:
     """A path or URL as it is given on the command line, without secrets."""
-    return without_secrets(url_of(path) or str(path))
+    return without_secrets(url_of(path) or os.fspath(path))
 
 
 def cache_folder() -> Path:

@@ -12,7 +12,7 @@ from geoscene.errors import InputError
 from geoscene.export.kinds import Summary
 from geoscene.export.objects import attribution
 from geoscene.options import ViewOptions
-from geoscene.scene import Scene
+from geoscene.scene import Scene, SceneLike, open_scene
 from geoscene.support.files import atomic_file, atomic_folder, exclusive, spool
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Ints
@@ -26,7 +26,7 @@ _SCRIPTS = ("data.js", "facades.js", "shaders.js", "draw.js", "panel.js")
 
 @shows_progress
 def view_scene(
-    scene: Scene,
+    scene: SceneLike,
     out: str | Path,
     *,
     options: ViewOptions = ViewOptions(),
@@ -43,6 +43,7 @@ def view_scene(
     unknown layer, and a file that would be too large; the message then gives the bounds of a part that would
     fit.
     """
+    scene = open_scene(scene)
     out = Path(out)
     scene.require("tiles", "tables")
     if out.suffix or out.is_file():

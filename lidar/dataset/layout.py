@@ -36,12 +36,13 @@ from geoscene.errors import reading
 from geoscene.geometry.frames import Frame
 from geoscene.support.digests import digest
 from geoscene.support.files import delete_leftovers, write_json
+from geoscene.support.option_values import brief, listed
 from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import Format
-from lidar.errors import DatasetError, LidarError
+from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_files import MANIFEST, read_trajectory
 from lidar.sensors.rig.names import names_folder
@@ -166,6 +167,24 @@ class Dataset(Previewed):
     stored: StoredFolder | None = None
     _fetched: set[Path] = field(default_factory=set, repr=False, compare=False)
 
+    def __repr__(self) -> str:
+        """What the drive is and recorded, in a few lines."""
+        about = self.manifest
+        done, frames = about.get("frames_done", 0), about.get("frames", 0)
+        parts = [f"{done:,} of {frames:,} frames" if done != frames else f"{frames:,} frames"]
+        parts += [f"{about.get('duration_ns', 0) / 1e9:.1f} s", f"{about.get('length_m', 0):,.0f} m"]
+        scene, points = about.get("scene", {}), about.get("points", {})
+        of = {name: f"{count:,} frames" for name, count in about.get("sensor_frames", {}).items()}
+        of |= {name: f"{of.get(name, '')}, {count:,} points".lstrip(", ") for name, count in points.items()}
+        lines = [f"Dataset {self.path if self.stored is None else self.stored.name}: {', '.join(parts)}"]
+        lines.append(f"  rig {about.get('rig', '')}, scene {scene.get('name') or scene.get('path', '')}")
+        lines.append(f"  start {about.get('start_time', '')}")
+        return "\n".join([*lines, *(f"  {name}: {text}" for name, text in of.items())])
+
+    def __fspath__(self) -> str:
+        """The directory, so that a dataset can be given for its path."""
+        return str(self.path)
+
     @property
     def frame(self) -> Frame:
         """The scene frame that poses are in."""
@@ -244,14 +263,22 @@ class Dataset(Previewed):
         return path
 
 
-def open_dataset(path: str | Path) -> Dataset:
-    """Open a dataset directory, finished or not, or one at a URL.
+DatasetLike = str | os.PathLike[str]
+"""Directory or URL of a dataset, or an opened one."""
+
+
+def open_dataset(path: DatasetLike) -> Dataset:
+    """Open a dataset directory, finished or not, or one at a URL; opened ones pass.
 
     Files at a URL are fetched into the user's cache: tables now, folders of frames when they are read.
 
     Raises DatasetError if it is not a dataset or has another schema version, and StorageError if the storage
     cannot be reached or has no dataset there.
     """
+    if isinstance(path, Dataset):
+        return path
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"`dataset` {brief(path)}: give the directory or URL of a dataset, or an opened one")
     folder, stored = Path(path), None
     if url := url_of(path):
         stored, folder = StoredFolder(url), cache_folder() / "datasets" / digest(url.encode())
@@ -275,6 +302,14 @@ def open_dataset(path: str | Path) -> Dataset:
             if not all(isinstance(count, int) for count in counts.values()):
                 raise ValueError("counts that are no whole numbers")
     return dataset
+
+
+def opened_datasets(datasets: DatasetLike | Sequence[DatasetLike]) -> list[Dataset]:
+    """One or several datasets, opened; raises InputError for none, and as `open_dataset` does."""
+    given = [datasets] if isinstance(datasets, str | os.PathLike) else listed(datasets)
+    if not given:
+        raise InputError("`datasets`: give one or more directories that lidar drive wrote")
+    return [open_dataset(one) for one in given]
 
 
 def reading_file(path: Path) -> AbstractContextManager[None]:

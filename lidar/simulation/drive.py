@@ -17,9 +17,10 @@ import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
-from geoscene.scene import Scene
+from geoscene.scene import SceneLike
 from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.files import exclusive, json_bytes, write_json
+from geoscene.support.option_values import expect
 from geoscene.support.progress import Aside, Progress, displayed, shows_progress
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
@@ -40,6 +41,7 @@ from lidar.simulation.frame_loop import (
 from lidar.simulation.metadata import write_metadata
 from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.recording import MeasuredCloud, MeasuredImages, Recording
+from lidar.simulation.scene_source import opened_for
 from lidar.world.world import Worlds
 
 Show = Callable[[MeasuredCloud | MeasuredImages], None]
@@ -83,7 +85,7 @@ class DriveSummary:
 
 @shows_progress
 def drive(
-    scene: Scene,
+    scene: SceneLike,
     out: str | Path,
     *,
     options: DriveOptions,
@@ -96,6 +98,7 @@ def drive(
 ) -> DriveSummary:
     """Drive a route through a scene and write the dataset; an unfinished one of the same options is finished.
 
+    scene : opened, its directory or URL, or a map file, of which the needed part is built
     notes : further entries of ``dataset.json``
     check : called when all frames are recorded; returns entries that replace or join the notes
     plan  : of the same scene and options; made here by default
@@ -104,6 +107,8 @@ def drive(
 
     Raises InputError (also as RouteError, RigError, DatasetError) for what cannot be driven or written.
     """
+    expect(options, DriveOptions, name="options", error=InputError)
+    scene = opened_for(scene, options, progress=progress)
     if live is not None and options.scheduler:
         raise InputError("`live` shows frames that this machine records; leave out `scheduler`")
     began, out = time.perf_counter(), Path(out)

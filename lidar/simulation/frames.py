@@ -12,7 +12,8 @@ from typing import TypeVar
 import numpy as np
 
 from geoscene.drawing.previews import card
-from geoscene.scene import Scene
+from geoscene.scene import SceneLike
+from geoscene.support.option_values import expect
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.errors import InputError
@@ -30,6 +31,7 @@ from lidar.simulation.frame_loop import check_attackers, measure_frame, run_jobs
 from lidar.simulation.metadata import observed_fixes
 from lidar.simulation.plan import DrivePlan, SensorFrame, plan_drive
 from lidar.simulation.recording import Columns, MeasuredCloud, MeasuredImages, Recording
+from lidar.simulation.scene_source import opened_for
 from lidar.simulation.situations import situation_of_unit
 from lidar.world.world import Worlds
 
@@ -151,13 +153,17 @@ class Simulation:
 
 
 @shows_progress
-def simulate(scene: Scene, options: DriveOptions, *, progress: Progress = displayed) -> Simulation:
+def simulate(scene: SceneLike, options: DriveOptions, *, progress: Progress = displayed) -> Simulation:
     """A drive through a scene whose frames are made one by one and not written.
 
     They are those that `lidar.drive` records with the same options, of which formats and labels do not count.
 
+    scene : opened, its directory or URL, or a map file, of which the needed part is built
+
     Raises InputError (also as RouteError, RigError) for what cannot be driven.
     """
+    expect(options, DriveOptions, name="options", error=InputError)
+    scene = opened_for(scene, options, progress=progress)
     if options.scheduler:
         raise InputError("`scheduler`: frames that are not written are simulated by threads; leave it out")
     plan = plan_drive(scene, options, progress=progress)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from geoscene.options import CloudOptions
-from geoscene.scene import Scene, open_scene
+from geoscene.scene import Scene, SceneLike, open_scene
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import url_of
 from lidar.errors import InputError
@@ -61,3 +62,10 @@ def open_scene_or_map(
     if changed:
         raise InputError(f"`{changed[0]}`: is for maps, and {path} is a directory; leave it out")
     return OpenedScene(open_scene(path))
+
+
+def opened_for(scene: SceneLike, drive: DriveOptions, *, progress: Progress) -> Scene:
+    """The scene of a drive of Python code: opened, of a directory or URL, or of a map file."""
+    if not isinstance(scene, str | os.PathLike) or isinstance(scene, Scene) or url_of(scene):
+        return open_scene(scene)
+    return open_scene_or_map(Path(scene), drive, progress=progress).scene

@@ -34,7 +34,7 @@ from lidar.dataset.foreign import (
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.ground_truth import read_truth
-from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.errors import DatasetError, InputError
@@ -95,7 +95,7 @@ class ApplySummary:
 
 @shows_progress
 def apply_stages(
-    source: str | Path,
+    source: DatasetLike,
     out: str | Path,
     *,
     options: ApplyOptions,

@@ -20,7 +20,7 @@ from lidar.dataset.checksums import write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset, derived_from
 from lidar.dataset.formats import ALL, FORMATS, Format
 from lidar.dataset.formats.table import Table, table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, reading_file
 from lidar.dataset.layouts import EXPORTERS, ExportSummary
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
@@ -47,7 +47,7 @@ _SEQUENCE = ("calib.txt", "times.txt", "poses.txt")
 
 @shows_progress
 def convert(
-    source: str | Path, out: str | Path, *, to: str, overwrite: bool = False, progress: Progress = displayed
+    source: DatasetLike, out: str | Path, *, to: str, overwrite: bool = False, progress: Progress = displayed
 ) -> ExportSummary:
     """Write a recorded drive to the folder ``out``, which appears when it is complete.
 

@@ -23,7 +23,7 @@ from lidar.dataset.derived import read_folder_provenance
 from lidar.dataset.foreign import foreign_clouds, read_foreign_stages
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.journal import read_journal
-from lidar.dataset.layout import Dataset, Paths, open_dataset, opened_rows, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, opened_rows, reading_file
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import OPTICAL, euler_from_quat, quat_from_matrix
 from lidar.signal.registry import ATTACKS
@@ -64,7 +64,7 @@ class _Sizes:
 
 
 @shows_progress
-def describe(path: str | Path, *, full: bool = False, progress: Progress = displayed) -> dict[str, Any]:
+def describe(path: DatasetLike, *, full: bool = False, progress: Progress = displayed) -> dict[str, Any]:
     """Describe a dataset, or a folder with clouds of KITTI or nuScenes, as a JSON document.
 
     Only metadata and sizes are read.

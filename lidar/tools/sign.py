@@ -15,7 +15,7 @@ from lidar.dataset.checksums import add_to_checksums, write_checksums
 from lidar.dataset.derived import check_target, complete_folder, copy_dataset, derived_from
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import table_cloud
-from lidar.dataset.layout import Dataset, Paths, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.laser.cloud import Cloud
@@ -59,7 +59,7 @@ def cells_of(cloud: Cloud, *, sensor: str, frame: int) -> WatermarkCells:
 
 @shows_progress
 def sign_dataset(
-    source: str | Path,
+    source: DatasetLike,
     out: str | Path | None,
     *,
     watermark: WatermarkKey | None = None,

@@ -17,7 +17,7 @@ from geoscene.support.columns import Columns
 from geoscene.support.processes import run_tasks
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Bools, Float, Ints
-from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, opened_datasets
 from lidar.dataset.recorded import Stream, cloud_points, instance_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.tools.detection.clusters import PLAIN, find_clusters
@@ -87,7 +87,7 @@ class Trained:
 
 @shows_progress
 def train(
-    datasets: Sequence[str | Path],
+    datasets: DatasetLike | Sequence[DatasetLike],
     out: str | Path,
     *,
     seed: int = 0,
@@ -111,7 +111,8 @@ def train(
     scikit-learn.
     """
     need("sklearn", "learn")
-    jobs = _jobs([open_dataset(path) for path in datasets], every=every)
+    opened = opened_datasets(datasets)
+    jobs = _jobs(opened, every=every)
     found: dict[int, Examples] = {}
     progress("clusters", 0, total=len(jobs))
     for number, examples in run_tasks(_examples, jobs, workers=workers):
@@ -120,7 +121,7 @@ def train(
     parts = [found[number] for number in sorted(found)]
     data = Examples.concatenate(parts)
     counts = {kind: int((data.kind == row).sum()) for row, kind in enumerate(CLASSES)}
-    _check(counts, datasets)
+    _check(counts, opened)
     data = data.take(np.isin(data.kind, [row for row, kind in enumerate(CLASSES) if counts[kind] >= FEWEST]))
     left_out = _left_out(data, seed=seed, trees=trees, progress=progress)
     chosen = {
@@ -139,7 +140,7 @@ def train(
             "trees": trees,
             "every": every,
             "clusters": counts,
-            "drives": _drives(datasets),
+            "drives": _drives(opened),
         },
     )
     model.write(Path(out))
@@ -215,8 +216,8 @@ def examples_of(table: dict[str, NDArray[Any]]) -> tuple[NDArray[np.float32], In
     return features(scan), kind
 
 
-def _check(counts: dict[str, int], datasets: Sequence[str | Path]) -> None:
-    where = str(datasets[0]) if len(datasets) == 1 else f"{len(datasets)} datasets"
+def _check(counts: dict[str, int], datasets: Sequence[Dataset]) -> None:
+    where = str(datasets[0].path) if len(datasets) == 1 else f"{len(datasets)} datasets"
     if not any(counts[kind] for kind in CLASSES[1:]):
         raise InputError(f"{where}: no road users in the clouds; drive with `traffic`")
     if counts["vehicle"] < FEWEST or counts["nothing"] < FEWEST:
@@ -273,11 +274,10 @@ def _best_threshold(probability: Float, true: Bools) -> tuple[float, float, floa
     return best
 
 
-def _drives(datasets: Sequence[str | Path]) -> list[dict[str, Any]]:
+def _drives(datasets: Sequence[Dataset]) -> list[dict[str, Any]]:
     """Drives that a model was trained on: their names, scenes, seeds, scanners, and credits of the maps."""
     rows = []
-    for path in datasets:
-        dataset = open_dataset(path)
+    for dataset in datasets:
         manifest, recipe = dataset.manifest, dataset.manifest["recipe"]
         rows.append(
             {

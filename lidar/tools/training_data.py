@@ -14,7 +14,7 @@ from geoscene.classes import Class
 from geoscene.typing import Float, Ints
 from lidar.dataset.formats.table import Table
 from lidar.dataset.ground_truth import read_boxes
-from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, opened_datasets
 from lidar.dataset.png import read_png
 from lidar.dataset.recorded import Stream, cloud_points, color_images, instance_clouds, nearest, still_points
 from lidar.errors import DatasetError, InputError
@@ -22,6 +22,9 @@ from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 
 Sample = dict[str, Any]
+
+_SHOWN = 7
+"""Lines of a description."""
 
 _BOX = (
     *("id", "ego_x", "ego_y", "ego_z", "length", "width", "height", "ego_yaw"),
@@ -92,6 +95,23 @@ class TrainingData(Sequence[Any]):
     min_points: int
     transform: Callable[[Sample], Any] | None
     _trajectories: dict[int, Trajectory] = field(default_factory=dict, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        """How many samples there are, of which drives and sensors, in a few lines."""
+        numbers = self.rows[:, 0]
+        lines = [
+            f"TrainingData: {len(self):,} samples; points: {', '.join(self.columns)}"
+            + ("" if self.deskewed else "; not de-skewed")
+        ]
+        for number, drive in enumerate(self.drives):
+            count = int((numbers == number).sum())
+            sensors = ", ".join([drive.clouds.name, *drive.images])
+            boxes = "" if drive.boxes else ", no boxes"
+            frames = f"{count:,} of {len(drive.clouds.files):,} frames"
+            lines.append(f"  {drive.dataset.path}: {frames} of {sensors}{boxes}")
+        if len(lines) > _SHOWN:
+            lines[_SHOWN:] = [f"  ... and {len(lines) - _SHOWN} more drives"]
+        return "\n".join(lines)
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -193,7 +213,7 @@ class TrainingData(Sequence[Any]):
 
 
 def training_data(
-    datasets: str | Path | Iterable[str | Path],
+    datasets: DatasetLike | Sequence[DatasetLike],
     *,
     sensor: str = "",
     cameras: Sequence[str] = (),
@@ -204,7 +224,7 @@ def training_data(
 ) -> TrainingData:
     """The labelled frames of drives, for training.
 
-    datasets   : a directory that `lidar.drive` wrote, or several
+    datasets   : what `lidar.drive` wrote, as its directory or opened, or several
     sensor     : name of the scanner; by default the first one of each drive
     cameras    : names of the cameras whose images are read, too
     columns    : of the points: x, y, z, intensity, ring, time_ns, range, incidence, echo, velocity and others
@@ -216,10 +236,8 @@ def training_data(
     Raises DatasetError for drives without labelled clouds in the sensor frame (format ``pcd``), and
     InputError for an unknown sensor.
     """
-    paths = [datasets] if isinstance(datasets, str | Path) else list(datasets)
-    if not paths:
-        raise InputError("`datasets`: give one or more directories that lidar drive wrote")
-    drives = tuple(_drive(open_dataset(path), sensor, cameras=cameras) for path in paths)
+    cameras, columns = ((one,) if isinstance(one, str) else one for one in (cameras, columns))
+    drives = tuple(_drive(dataset, sensor, cameras=cameras) for dataset in opened_datasets(datasets))
     rows = [(k, row) for k, drive in enumerate(drives) for row in range(len(drive.clouds.files))]
     numbers = np.array(rows, np.int64).reshape(-1, 2)
     return TrainingData(drives, numbers, tuple(columns), deskewed, min_points, transform)

@@ -13,7 +13,7 @@ from geoscene.support.digests import digest
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.storage import StoredFolder, cache_folder, shown, url_of
 from lidar.dataset.checksums import CHECKSUMS, differences, read_checksums
-from lidar.dataset.layout import Dataset, Paths, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.tools.integrity.chain import ChainReport, Finding, block_text, verify_chain
 from lidar.tools.integrity.keys import Signer
@@ -158,7 +158,7 @@ def _findings(found: tuple[Finding, ...]) -> str:
 
 @shows_progress
 def verify_dataset(
-    path: str | Path,
+    path: DatasetLike,
     *,
     watermark: WatermarkKey | None = None,
     signer: Signer | None = None,
@@ -193,7 +193,7 @@ def verify_dataset(
     return VerifyReport(marks, chain)
 
 
-def _checksum_report(path: str | Path, *, progress: Progress) -> ChecksumReport:
+def _checksum_report(path: DatasetLike, *, progress: Progress) -> ChecksumReport:
     folder = Path(path)
     if url := url_of(path):
         folder = cache_folder() / "datasets" / digest(url.encode())

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.drawing.report import Column, ReportTable, table_of
-from geoscene.scene import Scene, open_scene
+from geoscene.scene import Scene, SceneLike, open_scene
 from geoscene.support.columns import write_columns
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.dataset.derived import check_target
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, DatasetLike, opened_datasets
 from lidar.dataset.png import write_png
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.random_streams import generator
@@ -32,11 +32,12 @@ from lidar.tools.defences.calibration import (
     fuse_verdicts,
     fused_threshold,
     joint_of,
+    read_calibration,
     tail_of,
 )
 from lidar.tools.defences.defence import Verdict
 from lidar.tools.defences.observation import RecordedScans, read_scans
-from lidar.tools.defences.registry import Judged, NamedDefence, able, judged_frames
+from lidar.tools.defences.registry import Judged, NamedDefence, able, judged_frames, read_defences
 from lidar.tools.defences.scores import (
     FALSE_ALARMS,
     LEVELS,
@@ -47,6 +48,7 @@ from lidar.tools.defences.scores import (
     score,
 )
 from lidar.tools.detection import RULES, Detector
+from lidar.tools.detection.learned import read_detector
 
 _MARK = "defend.json"
 """File of a directory of verdicts: the scores."""
@@ -117,41 +119,55 @@ class Defended:
 
 @shows_progress
 def defend(
-    datasets: Sequence[Dataset],
-    defences: Sequence[NamedDefence],
+    datasets: DatasetLike | Sequence[DatasetLike],
+    defences: str | Sequence[str | NamedDefence],
     *,
-    calibration: Calibration,
-    detector: Detector = RULES,
+    calibration: Calibration | str | Path | None = None,
+    detector: Detector | str = RULES,
     rule: str = "",
-    scene: Scene | None = None,
-    out: Path | None = None,
+    scene: SceneLike | None = None,
+    out: str | Path | None = None,
     overwrite: bool = False,
     seed: int = 0,
     progress: Progress = displayed,
 ) -> Defended:
     """Judge datasets by defences, score the verdicts and write them to ``out``, all of them or none.
 
-    calibration : of the same detector
-    detector  : that gives the boxes
+    defences  : also texts, as `read_defences` takes them
+    calibration : of the same detector, or its file; by default the one that comes with the program
+    detector  : that gives the boxes, also as `read_detector` takes it
     rule      : of `calibration.FUSIONS`, by which verdicts of several are also fused; none if empty
     overwrite : replace a directory with former verdicts; other files there are kept
 
     Raises InputError if the data lack what a defence needs, before anything is judged.
     """
+    opened, chosen = opened_datasets(datasets), taken_defences(defences)
+    detector = read_detector(detector) if isinstance(detector, str) else detector
+    if not isinstance(calibration, Calibration):
+        calibration = read_calibration(Path(calibration) if calibration else None, detector=detector)
     calibration.check(detector)
-    for dataset in datasets:
+    scene, out = None if scene is None else open_scene(scene), None if out is None else Path(out)
+    for dataset in opened:
         if out is not None:
             check_target(out, source=dataset.path, overwrite=overwrite)
     with nullcontext() if out is None else atomic_folder(out, mark=_MARK, names=_NAMES) as part:
-        job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+        job = _job(opened, chosen, scene=scene, seed=seed, detector=detector)
         rule = rule if len(job.defences) > 1 else ""
         found = _judge(job, calibration, rule=rule, out=part, progress=progress)
         if part is not None:
-            document = found.document() | {"datasets": [str(d.path) for d in datasets], "fusion": rule}
+            document = found.document() | {"datasets": [str(d.path) for d in opened], "fusion": rule}
             document |= {"calibration": calibration.note}
             document |= {"detector": {"name": detector.name, "identity": detector.identity}}
             write_json(part / _MARK, document | {"options": [n.to_json() for n in job.defences]})
     return found
+
+
+def taken_defences(defences: str | Sequence[str | NamedDefence]) -> list[NamedDefence]:
+    """Defences of Python code: texts as on the command line, or defences that were read."""
+    chosen: list[NamedDefence] = []
+    for one in [defences] if isinstance(defences, str) else defences:
+        chosen += read_defences([one]) if isinstance(one, str) else [one]
+    return chosen
 
 
 def _judge(
@@ -225,20 +241,22 @@ def _with_interval(values: tuple[float, float, float]) -> str:
 
 @shows_progress
 def calibrate(
-    datasets: Sequence[Dataset],
-    defences: Sequence[NamedDefence],
+    datasets: DatasetLike | Sequence[DatasetLike],
+    defences: str | Sequence[str | NamedDefence],
     *,
-    out: Path,
-    detector: Detector = RULES,
-    scene: Scene | None = None,
+    out: str | Path,
+    detector: Detector | str = RULES,
+    scene: SceneLike | None = None,
     seed: int = 0,
     progress: Progress = displayed,
 ) -> Calibration:
     """Write the calibration of defences on datasets without attacks to a TOML file.
 
-    Raises DatasetError if a frame was attacked.
+    Parameters are those of `defend`. Raises DatasetError if a frame was attacked.
     """
-    job = _job(datasets, defences, scene=scene, seed=seed, detector=detector)
+    detector = read_detector(detector) if isinstance(detector, str) else detector
+    scene, out = None if scene is None else open_scene(scene), Path(out)
+    job = _job(opened_datasets(datasets), taken_defences(defences), scene=scene, seed=seed, detector=detector)
     tally, names = DefenceTally(), []
     for _, scans, judged in job.judged(progress):
         truth = attack_truth(scans, judged.frame)

@@ -32,7 +32,7 @@ from lidar.dataset.foreign import (
 )
 from lidar.dataset.formats import Format, read_table
 from lidar.dataset.ground_truth import read_truth
-from lidar.dataset.layout import Dataset, Paths, open_dataset, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.physics.origin import Origin
@@ -40,7 +40,7 @@ from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of
 from lidar.signal.truth import Altered, cloud_truth, trace_unaltered, write_truth
 from lidar.simulation.boxes import merge_box_files
-from lidar.tools.denoise.filters import Bools, Filter
+from lidar.tools.denoise.filters import Bools, Filter, read_methods
 from lidar.tools.rerecord import recorded_cloud, recording_again, richest_format, write_altered
 
 _BYTES = {"kitti": 16, "nuscenes": 20}
@@ -150,8 +150,8 @@ def _fixed(value: float) -> str:
 
 @shows_progress
 def denoise(
-    source: str | Path,
-    methods: Mapping[str, Filter],
+    source: DatasetLike,
+    methods: Mapping[str, Filter] | str,
     *,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -169,6 +169,7 @@ def denoise(
     Raises InputError for several filters with ``out``, and DatasetError for data that cannot be read.
     """
     source = Path(source)
+    methods = read_methods([methods]) if isinstance(methods, str) else methods
     if out is None:
         return Denoised(source, None, _scores(source, methods, out=None, progress=progress))
     out = Path(out)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, displayed, shows_progress
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.dataset.layouts.kitti import CORNERS, OBJECTS, outline
 from lidar.dataset.layouts.kitti_drive import KittiDrive, read_drive
 from lidar.dataset.layouts.nuscenes import streams_of, table_frame
@@ -20,7 +20,9 @@ from lidar.dataset.recorded import Stream, still_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Trajectory
+from lidar.tools.detection import RULES
 from lidar.tools.detection.detector import Detections, Detector
+from lidar.tools.detection.learned import read_detector
 from lidar.tools.evaluation.nuscenes_detection import samples_of
 
 LAYOUTS = ("kitti", "nuscenes")
@@ -45,23 +47,26 @@ class _Cloud:
 
 @shows_progress
 def detect(
-    dataset: Dataset,
-    out: Path,
+    dataset: DatasetLike,
+    out: str | Path,
     *,
     layout: str,
-    detector: Detector,
+    detector: Detector | str = RULES,
     overwrite: bool = False,
     progress: Progress = displayed,
 ) -> dict[str, int]:
     """Write what a detector finds in the clouds of a dataset; return the numbers of frames and of boxes.
 
-    layout : ``kitti``: ``NNNNNN.txt`` of each frame in the folder ``out``, of what is in the image of camera
-             2; ``nuscenes``: ``results.json`` of the key frames in it
+    detector : or its name, or a model's file, as for `read_detector`
+    layout   : ``kitti``: ``NNNNNN.txt`` of each frame in the folder ``out``, of what is in the image of
+             camera 2; ``nuscenes``: ``results.json`` of the key frames in it
 
     Clouds are without the vehicle's motion. Front and rear are not told apart, nor are velocities known.
 
     Raises InputError for a folder that exists, and DatasetError for a dataset without the data.
     """
+    dataset, out = open_dataset(dataset), Path(out)
+    detector = read_detector(detector) if isinstance(detector, str) else detector
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     if layout == "kitti":

@@ -17,7 +17,7 @@ from geoscene.errors import need
 from geoscene.support.files import atomic_path
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float, Ints
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.dataset.recorded import Images, Stream, frames_within, images_of, scanner_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
@@ -68,7 +68,7 @@ class FilmSummary:
 
 @shows_progress
 def film(
-    dataset: Dataset,
+    dataset: DatasetLike,
     out: str | Path,
     *,
     options: FilmOptions = FilmOptions(),
@@ -80,6 +80,7 @@ def film(
     Raises InputError for what cannot be shown, DatasetError for a dataset without it, and MissingExtraError
     for an MP4 without PyAV.
     """
+    dataset = open_dataset(dataset)
     out = Path(out)
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")

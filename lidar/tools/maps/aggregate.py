@@ -14,12 +14,13 @@ from geoscene.classes import class_codes
 from geoscene.drawing.previews import DARK, PreviewPlan, around, card
 from geoscene.scene import open_scene
 from geoscene.support.files import atomic_folder, exclusive
+from geoscene.support.option_values import expect
 from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.derived import write_map_provenance
 from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.errors import InputError
 from lidar.options import MapOptions
 from lidar.tools.maps.colors import ImageColors, distinct, ramp
@@ -89,7 +90,7 @@ class MapSummary:
 
 @shows_progress
 def aggregate(
-    dataset: Dataset,
+    dataset: DatasetLike,
     out: str | Path,
     *,
     options: MapOptions = MapOptions(),
@@ -110,6 +111,8 @@ def aggregate(
 
     Raises InputError for an unknown scanner or suffix, and DatasetError for a dataset without clouds.
     """
+    dataset = open_dataset(dataset)
+    expect(options, MapOptions, name="options", error=InputError)
     out = Path(out)
     _check(out, tiles=options.tiles is not None)
     if out.exists() and not overwrite:

@@ -17,7 +17,7 @@ from geoscene.support.files import replaced_folder
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Ints
 from lidar.dataset.derived import check_target
-from lidar.dataset.layout import Dataset, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options import OdometryOptions
 from lidar.sensors.rig.imu_grades import PRESETS, Noise
@@ -169,7 +169,7 @@ class OdometrySummary:
 
 @shows_progress
 def estimate_motion(
-    path: str | Path,
+    path: DatasetLike,
     out: str | Path,
     *,
     options: OdometryOptions,

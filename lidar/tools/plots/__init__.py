@@ -16,7 +16,7 @@ from lidar.options import PlotOptions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Chart
 
-    from lidar.dataset.layout import Dataset
+    from lidar.dataset.layout import DatasetLike
 
 WIDE = (1180, 300)
 """Pixels of a panel of the width of a page."""
@@ -81,7 +81,7 @@ FIGURES: Registry[Figure] = Registry("figure", {row.name: row for row in _FIGURE
 
 @shows_progress
 def plot(
-    dataset: Dataset,
+    dataset: DatasetLike,
     what: str,
     *,
     out: str | Path,
@@ -96,6 +96,9 @@ def plot(
     Raises InputError for an unknown figure and options that it does not take, and DatasetError for a dataset
     that lacks what it shows.
     """
+    from lidar.dataset.layout import open_dataset  # noqa: PLC0415 - of no use to who lists figures
+
+    dataset = open_dataset(dataset)
     row, out = FIGURES.find(what), Path(out)
     for name in ("sensor", "frames", "resolution"):
         if name not in row.takes and getattr(options, name) != getattr(PlotOptions(), name):

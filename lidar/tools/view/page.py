@@ -14,7 +14,7 @@ from typing import IO, Any
 from geoscene.support.files import atomic_file, exclusive, spool
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.view.assembly import check_page, write_blob, write_page
-from lidar.dataset.layout import Dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.errors import InputError, LidarError
 from lidar.options import PlaybackOptions
 from lidar.tools.view.drive import Drive
@@ -51,7 +51,7 @@ class PageSummary:
 
 @shows_progress
 def view_drive(
-    dataset: Dataset,
+    dataset: DatasetLike,
     out: str | Path,
     *,
     options: PlaybackOptions = PlaybackOptions(),
@@ -67,6 +67,7 @@ def view_drive(
     dataset does not have, and for a page that would be too large; the message then gives a selection that
     would fit. Raises DatasetError for damaged files and a dataset without clouds in the sensor frame.
     """
+    dataset = open_dataset(dataset)
     out = Path(out)
     check_page(out, overwrite=overwrite)
     drive = Drive(dataset, options)
