@@ -43,7 +43,8 @@ Assumed: rock towers of that slope and height are wider, and single posts that a
 _MARGIN = 3
 """Posts read beyond the scene on each side."""
 
-_REMEDY = "give an elevation file that GDAL reads, such as GeoTIFF or .hgt"
+_REMEDY = "give GeoTIFF or .hgt, as gdal_translate writes"
+
 
 _AT_ONCE = 1000
 """Footprints whose ground is looked up at once: some 300,000 places, which bounds the memory."""
@@ -258,6 +259,11 @@ def gdal_name(path: Path) -> str:
     return f"/vsizip/{path.resolve()}/{names[0]}"
 
 
+def driver_of(name: str) -> str:
+    """GDAL's driver for a name of `gdal_name`; others, such as VRT, read other files and networks."""
+    return "SRTMHGT" if name.lower().endswith(".hgt") else "GTiff"
+
+
 def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ellipsoidal"] | None) -> _Raster:
     """Metadata of a file, completed by the caller's where it has none."""
     import rasterio  # noqa: PLC0415 - slow to import
@@ -266,7 +272,7 @@ def _open(path: Path, *, unit: str | None, vertical: Literal["orthometric", "ell
     with (
         reading(path, InputError, remedy=_REMEDY),
         rasterio.Env(GTIFF_REPORT_COMPD_CS="YES"),
-        rasterio.open(name) as source,
+        rasterio.open(name, driver=driver_of(name)) as source,
     ):
         if source.crs is None:
             raise InputError(f"{path}: no CRS in it; assign one, as with: gdal_edit.py -a_srs EPSG:4326 FILE")
@@ -386,7 +392,10 @@ def _read(group: Sequence[_Raster], frame: Frame, *, bounds: Sequence[float]) ->
         end = np.minimum(high - shift, raster.shape[::-1])
         if (begin >= end).any():
             continue
-        with reading(raster.path, InputError, remedy=_REMEDY), rasterio.open(raster.name) as source:
+        with (
+            reading(raster.path, InputError, remedy=_REMEDY),
+            rasterio.open(raster.name, driver=driver_of(raster.name)) as source,
+        ):
             found = source.read(1, window=Window(*begin, *(end - begin)))
         void = ~np.isfinite(found)
         if raster.nodata is not None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import math
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError
 from geoscene.sources.data import Bounds, Progress, Tags
 from geoscene.support.problems import Problem
+from geoscene.support.untrusted import open_unpacked
 from geoscene.typing import Bools, Float, Ints
 
 Members = tuple[tuple[str, int, str], ...]
@@ -28,7 +27,6 @@ UNITS = 10_000_000
 UNKNOWN = 2**31 - 1
 """Value of a missing coordinate."""
 
-OPEN: dict[str, Callable[..., Any]] = {"": open, ".gz": gzip.open, ".bz2": bz2.open}
 """How to open a file by the suffix of its compression."""
 
 LONGEST_TAG = 1024
@@ -284,7 +282,7 @@ def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progre
     Raises ValueError or OSError for a damaged file.
     """
     try:
-        with OPEN[form.removeprefix("osm")](path, "rb") as file:
+        with open_unpacked(path, form.removeprefix("osm")) as file:
             deleting = False  # in the section of OsmChange for what was deleted
             for event, item in progress(ET.iterparse(file, ("start", "end"))):  # noqa: S314 - expat limits entities
                 if item.tag == "delete":

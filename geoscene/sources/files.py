@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources.assemble import features
 from geoscene.sources.data import Bounds, OsmData, Progress, Tags
-from geoscene.sources.elements import OPEN, Collector, collect_answer, collect_xml
+from geoscene.sources.elements import Collector, collect_answer, collect_xml
 from geoscene.sources.extent import checked_bounds
+from geoscene.support.untrusted import TooLargeError, open_unpacked
 
 _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf) or Overpass JSON"
 
@@ -37,7 +38,7 @@ def _format_of(path: Path) -> str:
     for magic, suffix in ((b"\x1f\x8b", ".gz"), (b"BZh", ".bz2")):
         if head.startswith(magic):
             packed = suffix
-            with OPEN[suffix](path, "rb") as content:
+            with open_unpacked(path, suffix) as content:
                 head = content.read(64)
     if head[4:6] == b"\x0a\x09" and head[6:15] == b"OSMHeader":
         return "pbf"
@@ -117,7 +118,7 @@ def _collect(path: Path, progress: Progress) -> Collector:
     file_format = _format_of(path)
     collector = Collector()
     if file_format.startswith("json"):
-        with OPEN[file_format.removeprefix("json")](path, "rb") as content:
+        with open_unpacked(path, file_format.removeprefix("json")) as content:
             collect_answer(json.load(content), collector)
         return collector
     file = osmium.io.File(str(path), file_format)
@@ -145,7 +146,7 @@ def _collect(path: Path, progress: Progress) -> Collector:
 def _has_deletions(path: Path, file_format: str) -> bool:
     """Whether objects of an XML file are marked by an editor as deleted, which libosmium does not tell."""
     mark, tail = re.compile(rb"""\baction\s*=\s*["']delete["']"""), b""
-    with OPEN[file_format.removeprefix("osm")](path, "rb") as content:
+    with open_unpacked(path, file_format.removeprefix("osm")) as content:
         while block := content.read(1 << 20):
             if mark.search(tail + block):
                 return True
@@ -171,6 +172,8 @@ def _read(path: Path, progress: Progress) -> Collector:
         collector = _collect(path, progress)
     except InputError as error:
         raise error if str(path) in str(error) else InputError(f"{path}: {error}; {_HELP}") from None
+    except TooLargeError as error:
+        raise InputError(f"{path}: {error}") from None
     except PermissionError as error:
         raise InputError(f"{path}: may not be read; give its permissions to this user") from error
     except MemoryError:

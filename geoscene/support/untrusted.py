@@ -1,13 +1,21 @@
-"""Archives of arrays, and TOML, that may be damaged or hostile: they raise errors and reserve no memory."""
+"""Archives of arrays, compressed files and TOML that may be damaged or hostile.
+
+They raise errors, reserve no memory for what they only state, and are unpacked to a limit.
+"""
 
 from __future__ import annotations
 
+import bz2
 import functools
+import gzip
+import os
 import threading
 import tomllib
 import zipfile
 import zlib
-from io import BytesIO
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader, BytesIO, RawIOBase
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +36,75 @@ _LONGEST = 10_000
 """Bytes of a header at most, as NumPy has it."""
 
 
+VARIABLE = "GEOSCENE_UNPACK_RATIO"
+"""Environment variable with the greatest ratio of a file's size unpacked and packed."""
+
+_RATIO = 50.0
+"""The ratio by default: extracts of maps are unpacked to 20 times their size at most, tiles to 5 times."""
+
+_ALWAYS = 2**26
+"""Bytes to which any file may be unpacked."""
+
+
+class TooLargeError(ValueError):
+    """A file that would be unpacked to far more than its size."""
+
+
+def unpacked_limit(packed: int) -> float:
+    """Bytes to which a file of some bytes may be unpacked.
+
+    Raises TooLargeError for a value of `VARIABLE` that is no ratio.
+    """
+    text = os.environ.get(VARIABLE, "")
+    try:
+        ratio = float(text or _RATIO)
+    except ValueError:
+        ratio = 0.0
+    if not ratio >= 1:
+        raise TooLargeError(f"{VARIABLE}={text}: give a ratio of 1 or more, such as 200, or inf")
+    return max(_ALWAYS, packed * ratio)
+
+
+def _too_large(packed: int) -> TooLargeError:
+    return TooLargeError(
+        f"is unpacked to more than {unpacked_limit(packed) / 2**20:.0f} MiB from {packed / 2**20:.1f} MiB,"
+        f" as files made to fill the memory are; set {VARIABLE} to a greater ratio if that is right"
+    )
+
+
+class _Limited(RawIOBase):
+    """An unpacked stream that ends with TooLargeError beyond a number of bytes."""
+
+    def __init__(self, file: IO[bytes], packed: int) -> None:
+        self._file, self._packed, self._left = file, packed, unpacked_limit(packed)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._file.read(len(buffer))
+        buffer[: len(data)] = data
+        self._left -= len(data)
+        if self._left < 0:
+            raise _too_large(self._packed)
+        return len(data)
+
+
+@contextmanager
+def open_unpacked(path: Path, packing: str) -> Iterator[IO[bytes]]:
+    """Yield the bytes of a file that is packed by ``.gz`` or ``.bz2``, or not at all (empty).
+
+    Reading beyond `unpacked_limit` raises TooLargeError; damage raises the errors of gzip and bz2.
+    """
+    with path.open("rb") as raw:
+        if not packing:
+            yield raw
+            return
+        unpack: Any = {".gz": gzip.open, ".bz2": bz2.open}[packing]
+        with unpack(raw, "rb") as file, BufferedReader(_Limited(file, path.stat().st_size)) as limited:
+            yield limited
+
+
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz file by name; none of objects.
 
@@ -38,6 +115,9 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     """
     with zipfile.ZipFile(source) as archive:
         entries = [entry for entry in archive.infolist() if entry.filename.endswith(".npy")]
+        packed = sum(entry.compress_size for entry in entries)
+        if sum(entry.file_size for entry in entries) > unpacked_limit(packed):
+            raise _too_large(packed)
         return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
 
 

@@ -117,9 +117,10 @@ def coarse_elevation(path: Path, out: Path, *, factor: int) -> Path:
     import rasterio  # noqa: PLC0415 - slow to import
     from rasterio.enums import Resampling  # noqa: PLC0415
 
-    from geoscene.ground.terrain import gdal_name  # noqa: PLC0415
+    from geoscene.ground.terrain import driver_of, gdal_name  # noqa: PLC0415
 
-    with rasterio.open(gdal_name(path)) as source:
+    name = gdal_name(path)
+    with rasterio.open(name, driver=driver_of(name)) as source:
         rows, columns = (max(side // factor, 2) for side in source.shape)
         values = source.read(1, out_shape=(rows, columns), resampling=Resampling.average, masked=True)
         a, across, down = source.transform, source.width / columns, source.height / rows

@@ -5,7 +5,6 @@ See "FCD Output", "Vehicle Type Parameter Defaults" and "Geo-Coordinates" in SUM
 
 from __future__ import annotations
 
-import gzip
 import re
 import xml.etree.ElementTree as ET
 import zlib
@@ -13,11 +12,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, cast
+from typing import IO, TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.support.untrusted import TooLargeError, open_unpacked
 from geoscene.typing import Float
 from lidar.errors import FormatError
 
@@ -148,12 +148,14 @@ def _class_of(kind: str) -> str:
 def _open_file(path: Path) -> Iterator[IO[bytes]]:
     """An XML file, gzipped or not; raises FormatError if it cannot be read."""
     try:
-        with path.open("rb") as raw, gzip.open(raw) as unpacked:
+        with path.open("rb") as raw:
             packed = raw.read(2) == b"\x1f\x8b"
-            raw.seek(0)
-            yield cast("IO[bytes]", unpacked) if packed else raw
+        with open_unpacked(path, ".gz" if packed else "") as file:
+            yield file
     except FileNotFoundError:
         raise FormatError(f"{path} does not exist") from None
+    except TooLargeError as error:
+        raise FormatError(f"{path}: {error}") from None
     except (OSError, EOFError, zlib.error) as error:
         raise FormatError(f"{path}: cannot be read: {error}") from None
     except (ET.ParseError, LookupError) as error:  # also of an unknown encoding

@@ -314,3 +314,17 @@ def test_two_srtm_tiles_meet_without_a_seam_at_50_north(shared_dem):
     assert step.max() < 0.5
     with pytest.raises(InputError, match=r"48\.\d % of the scene is not covered"):
         open_terrain(paths[:1], frame, bounds=(-1500, -1500, 1500, 1500))
+
+
+def test_a_format_that_names_other_files_is_refused(tmp_path):
+    """GDAL recognises a VRT by its contents, and reads it from where it says, such as the network."""
+    source = tmp_path / "heights.tif"
+    source.write_text(
+        '<VRTDataset rasterXSize="9" rasterYSize="9"><SRS>EPSG:4326</SRS>'
+        "<GeoTransform>24.9, 0.01, 0, 60.2, 0, -0.01</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource>'
+        "<SourceFilename>/vsicurl/http://127.0.0.1:9/a.tif</SourceFilename><SourceBand>1</SourceBand>"
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with pytest.raises(InputError, match=r"heights\.tif: damaged .*give GeoTIFF or \.hgt"):
+        open_terrain([source], Frame.at(24.945, 60.168), bounds=(-100, -100, 100, 100))

@@ -769,3 +769,17 @@ def test_nodes_of_pbf_files_are_read_with_any_ids_in_any_order(tmp_path, ids):
     where = dict(zip(ids, places, strict=True))  # of equal ids the last counts
     np.testing.assert_allclose(osm.ways[0].lonlat, [where[i] for i in sorted(set(ids))], atol=1e-7)
     assert {p.osm_id for p in osm.points} == {f"node/{i}" for i in ids[1:]}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b'{"elements": [' + b" " * 2**26,
+        b"<osm version='0.6'>" + b"<node id='1' lat='1' lon='1'/>\n" * 2**22 + b"</osm>",
+    ],
+)
+def test_a_file_that_unpacks_to_gigabytes_is_refused(tmp_path, data):
+    path = tmp_path / "a.gz"
+    path.write_bytes(gzip.compress(data))
+    with pytest.raises(InputError, match=r"a\.gz: is unpacked to more than 64 MiB"):
+        read_osm(path)

@@ -1,5 +1,7 @@
 """Archives of arrays and TOML that lie about their size or nest without end."""
 
+import bz2
+import gzip
 import io
 import tomllib
 import tracemalloc
@@ -12,7 +14,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from geoscene.scene.tile_files import pack
-from geoscene.support.untrusted import DAMAGED_ARCHIVE, read_arrays, read_toml
+from geoscene.support.untrusted import (
+    DAMAGED_ARCHIVE,
+    VARIABLE,
+    TooLargeError,
+    open_unpacked,
+    read_arrays,
+    read_toml,
+)
 
 KINDS = st.sampled_from(["f4", "f8", "i4", "u1", "i8", "?", "U3"])
 
@@ -76,3 +85,29 @@ def test_columns_of_tiles_are_files_as_numpy_writes_them(array, by_columns):
         io.BytesIO(pack({"a": np.asfortranarray(array) if by_columns else array}))
     ) as archive:
         assert archive.read("a.npy") == plain.getvalue()
+
+
+@pytest.mark.parametrize(("pack_bytes", "packing"), [(gzip.compress, ".gz"), (bz2.compress, ".bz2")])
+def test_a_file_is_unpacked_to_a_limit(tmp_path, monkeypatch, pack_bytes, packing):
+    path, size = tmp_path / "a", 2**26 + 10
+    path.write_bytes(pack_bytes(b" " * size))
+
+    def length():
+        with open_unpacked(path, packing) as file:
+            return sum(map(len, iter(lambda: file.read(2**20), b"")))
+
+    with pytest.raises(TooLargeError, match=f"unpacked to more than 64 MiB .* set {VARIABLE}"):
+        length()
+    monkeypatch.setenv(VARIABLE, "inf")
+    assert length() == size
+
+
+def test_an_archive_is_unpacked_to_a_limit(monkeypatch):
+    archive = packed(a=np.zeros(2**26 + 10, np.uint8))
+    with pytest.raises(TooLargeError, match=VARIABLE):
+        read_arrays(archive)
+    monkeypatch.setenv(VARIABLE, "5000")
+    assert len(read_arrays(archive)["a"]) == 2**26 + 10
+    monkeypatch.setenv(VARIABLE, "many")
+    with pytest.raises(TooLargeError, match="GEOSCENE_UNPACK_RATIO=many: give a ratio"):
+        read_arrays(archive)

@@ -224,3 +224,9 @@ def test_times_of_a_trajectory_that_are_no_times_are_refused_at_once(time, tmp_p
     (tmp_path / "a.tum").write_text(f"1.5 0 0 0 0 0 0 1\n{time} 0 0 0 0 0 0 1\n")
     with pytest.raises(LidarError, match=r"a\.tum"):
         read_tum(tmp_path / "a.tum")
+
+
+def test_traffic_that_unpacks_to_gigabytes_is_refused(tmp_path):
+    (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(b"<fcd-export>" + b" " * (2**26 + 10)))
+    with pytest.raises(LidarError, match=r"fcd\.xml\.gz: is unpacked to more than 64 MiB"):
+        read_fcd(tmp_path / "fcd.xml.gz")
