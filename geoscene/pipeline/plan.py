@@ -85,6 +85,7 @@ from geoscene.roadgraph.relief import (
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.roadgraph.tags import find_unused_inclines
+from geoscene.roadgraph.walls import Walls
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
@@ -232,7 +233,12 @@ def make_plan(
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
-    roads = _plan_roads(osm, frame, options=options, terrain=terrain, problems=problems)
+    walls = Walls.of(
+        buildings.footprint[: buildings.count],
+        np.array(buildings.osm_id[: buildings.count], np.str_),
+        min_height=buildings.min_height[: buildings.count],
+    )
+    roads = _plan_roads(osm, frame, options=options, terrain=terrain, walls=walls, problems=problems)
     passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
     reach, area = Reach.of(options, roads.graph, frame=frame), None
     route = None if reach is None else reach.line
@@ -370,7 +376,13 @@ class _Roads:
 
 
 def _plan_roads(
-    osm: OsmData, frame: Frame, *, options: BuildOptions, terrain: Terrain, problems: list[Problem]
+    osm: OsmData,
+    frame: Frame,
+    *,
+    options: BuildOptions,
+    terrain: Terrain,
+    walls: Walls,
+    problems: list[Problem],
 ) -> _Roads:
     """Road graph with heights, and carriageways."""
     mapped = _only_roads(osm, options)
@@ -378,7 +390,7 @@ def _plan_roads(
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"
     road_options = RoadOptions(left_hand=side == "left")
-    graph = _collect(problems, build_road_graph(mapped, frame, options=road_options))
+    graph = _collect(problems, build_road_graph(mapped, frame, options=road_options, walls=walls))
     problems += find_odd_layers(mapped.ways)
     if not terrain.grids:
         problems += find_unused_inclines(mapped.ways)
@@ -390,7 +402,9 @@ def _plan_roads(
     if uneven:
         height = graded_ground(graph, terrain.height, level=not terrain.grids, surveyed=surveyed)
     sidewalks = SurfaceOptions().sidewalks
-    carriageways = read_carriageways(mapped, frame, sidewalks=sidewalks, left_hand=side == "left")
+    carriageways = read_carriageways(
+        mapped, frame, sidewalks=sidewalks, left_hand=side == "left", walls=walls
+    )
     return _Roads(graph, carriageways, side, source, height, uneven)
 
 

@@ -15,6 +15,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import lane_column
 from geoscene.roadgraph.streets import move_aside, read_streets
 from geoscene.roadgraph.tags import Street, find_odd_diameters
+from geoscene.roadgraph.walls import Walls
 from geoscene.sources.data import OsmData, Relation, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Ints
@@ -41,7 +42,7 @@ class RoadOptions:
 
 
 def build_road_graph(
-    osm: OsmData, frame: Frame, *, options: RoadOptions | None = None
+    osm: OsmData, frame: Frame, *, options: RoadOptions | None = None, walls: Walls | None = None
 ) -> tuple[RoadGraph, list[Problem]]:
     """The drivable graph of a map on level ground (z = 0), and the problems repaired or dropped.
 
@@ -50,11 +51,15 @@ def build_road_graph(
     (class, name, width, lanes and their uses, limit, direction, layer, bridge, tunnel); ways of equal tags
     are joined. Nodes are sorted by id, edges follow the order of the ways; the two edges of a two-way street
     are consecutive.
+
+    walls : of buildings that streets of unknown width yield to
     """
     options = options or RoadOptions()
     problems: list[Problem] = []
     problems += find_odd_diameters(osm.points)
-    ways, streets, remarks = read_streets(osm, private=options.private, left_hand=options.left_hand)
+    ways, streets, remarks = read_streets(
+        osm, frame, private=options.private, left_hand=options.left_hand, walls=walls
+    )
     problems += [
         Problem(osm_id, "road", "repaired", reason, detail)
         for osm_id, found in remarks
@@ -139,7 +144,9 @@ def _edges(
     geometry = np.empty(len(rows), object)
     for edge, (number, against) in enumerate(rows):
         geometry[edge] = lines[number][::-1].copy() if against else lines[number]
-    chain_ids = [[ways[way].osm_id for way, _ in groupby(chain.way.tolist())] for chain in chains]
+    chain_ids = [
+        [name for name, _ in groupby(ways[k].osm_id for k in chain.way.tolist())] for chain in chains
+    ]
     side = [(of_chain[number], int(against)) for number, against in rows]
     none = np.zeros(len(used), np.bool_)
     graph = RoadGraph(

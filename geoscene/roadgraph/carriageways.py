@@ -16,6 +16,7 @@ from geoscene.roadgraph.chains import chains_of
 from geoscene.roadgraph.lane_uses import NO_USES, LaneUses, read_lane_uses
 from geoscene.roadgraph.streets import move_aside, read_streets
 from geoscene.roadgraph.tags import CLASSES, Street, place_of
+from geoscene.roadgraph.walls import Walls
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
@@ -125,15 +126,21 @@ class _Kind:
 
 
 def read_carriageways(
-    osm: OsmData, frame: Frame, *, sidewalks: Literal["mapped", "urban"], left_hand: bool
+    osm: OsmData,
+    frame: Frame,
+    *,
+    sidewalks: Literal["mapped", "urban"],
+    left_hand: bool,
+    walls: Walls | None = None,
 ) -> Carriageways:
     """The carriageways of a map.
 
     sidewalks : ``urban`` gives streets in built-up areas sidewalks where the map neither has a sidewalk tag
                 nor a footway beside them
     left_hand : traffic keeps left
+    walls     : of buildings that streets of unknown width yield to
     """
-    ways, streets, _ = read_streets(osm, private=True, left_hand=left_hand)
+    ways, streets, _ = read_streets(osm, frame, private=True, left_hand=left_hand, walls=walls)
     kinds = [_read_kind(way, street, left_hand=left_hand) for way, street in zip(ways, streets, strict=True)]
     ignored: list[Problem] = []  # reported with the road graph
     runs, node_id, lonlat = read_runs(ways, ignored)

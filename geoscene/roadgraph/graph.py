@@ -31,8 +31,8 @@ class RoadGraph:
                (``driving|bus``), its metres (``3|3.5``) and the values of ``turn:lanes`` (``left|through``),
                from left to right; "" where they are not mapped. Cycle lanes are among them (``biking``)
     width    : (m,) float64, metres of the whole carriageway (both directions)
-    width_source : (m,) str: ``width``, ``est_width``, ``lanes`` (mapped lanes x the class's lane width) or
-                   ``default``
+    width_source : (m,) str: ``width``, ``est_width``, ``lanes`` (mapped lanes x the class's lane width),
+                   ``default``, or ``buildings`` (less than that, between walls)
     oneway   : (m,) bool
     layer    : (m,) int8
     layer_source : (m,) str: ``layer``, ``level``, ``bridge``, ``tunnel`` or ``default`` (ground)

@@ -15,6 +15,7 @@ from geoscene.roadgraph.chains import RoadChain
 from geoscene.roadgraph.lanes import street_lanes
 from geoscene.roadgraph.tags import Street, drivable, read_street
 from geoscene.roadgraph.values import Remarks, remark_several, remark_unreadable
+from geoscene.roadgraph.walls import IN_CARRIAGEWAY, Walls, yield_to_walls
 from geoscene.sources.data import OsmData, Tags, Way
 from geoscene.typing import Float
 
@@ -46,12 +47,13 @@ class _Placement:
 
 
 def read_streets(
-    osm: OsmData, *, private: bool, left_hand: bool
+    osm: OsmData, frame: Frame, *, private: bool, left_hand: bool, walls: Walls | None = None
 ) -> tuple[list[Way], list[Street], list[tuple[str, Remarks]]]:
     """The ways of a map that carry vehicles, their streets, and remarks on tags by id of the way.
 
     private   : also the ways that are closed to the public
     left_hand : traffic keeps left
+    walls     : of buildings that streets of unknown width yield to, which cuts their ways
     """
     ways = [way for way in osm.ways if drivable(way.tags, private=True)]
     found = [read_street(way.tags, left_hand=left_hand) for way in ways]
@@ -61,12 +63,17 @@ def read_streets(
         if ";" in surface:
             remark_several(remark, "surface", text=surface, taken=surface.split(";", maxsplit=1)[0].strip())
     _set_aside(ways, streets, remarks=remarks, left_hand=left_hand)
-    kept = [k for k, way in enumerate(ways) if private or drivable(way.tags)]
-    return (
-        [ways[k] for k in kept],
-        [streets[k] for k in kept],
-        [(ways[k].osm_id, remarks[k]) for k in kept if remarks[k]],
-    )
+    if walls is not None:
+        ways, streets, remarks = yield_to_walls(ways, streets, remarks=remarks, walls=walls, frame=frame)
+    kept = np.array([private or drivable(way.tags) for way in ways], np.bool_)
+    own = [
+        # A scene has the carriageways of private ways, too.
+        remark if keep else [(reason, text) for reason, text in remark if reason == IN_CARRIAGEWAY]
+        for remark, keep in zip(remarks, kept, strict=True)
+    ]
+    rows = np.flatnonzero(kept).tolist()
+    reported = [(way.osm_id, remark) for way, remark in zip(ways, own, strict=True) if remark]
+    return [ways[k] for k in rows], [streets[k] for k in rows], reported
 
 
 def _set_aside(

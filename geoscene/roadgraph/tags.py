@@ -198,6 +198,11 @@ def is_tunnel(tags: Tags) -> bool:
     return tags.get("tunnel", "") not in _ABOVE_GROUND
 
 
+def is_passage(tags: Tags) -> bool:
+    """Whether the way runs through or under a building."""
+    return tags.get("tunnel") == "building_passage" or tags.get("covered", "no") not in _NO
+
+
 def read_layer(tags: Tags, remarks: Remarks) -> tuple[int, str]:
     """Layer and its source: the tag, a storey (``level``), else 1 on bridges, -1 in tunnels, 0."""
     for key in ("layer", "level"):
