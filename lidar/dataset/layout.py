@@ -350,7 +350,11 @@ def opened_rows(path: Path) -> Iterator[Iterator[dict[str, str]]]:
         rows = csv.DictReader(file, strict=True)
         if not rows.fieldnames:
             raise ValueError("no line with the names of columns")
-        yield rows
+        file.seek(max(path.stat().st_size - 1, 0))
+        if file.read() != "\n":
+            raise ValueError("ends within a line")
+        file.seek(0)
+        yield csv.DictReader(file, strict=True)
 
 
 def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
@@ -368,6 +372,8 @@ def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
             turn = mount[:3, :3]
             if mount.shape != (4, 4) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6):
                 raise ValueError("a mount is no rigid transformation")
+            if np.linalg.det(turn) < 0:
+                raise ValueError(f"the mount of {name} mirrors: its determinant is -1")
             if not np.isfinite(mount).all():
                 raise ValueError("a mount is not finite")
             if sensor["kind"] in ("lidar", "camera"):

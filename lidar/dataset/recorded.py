@@ -22,6 +22,9 @@ from lidar.geometry.poses import Trajectory
 _FAR = 1e6
 """Metres from a scanner, beyond the range of any."""
 
+_RINGS = 4096
+"""Channels that a scanner has at most; a flash camera counts the rows of its pixels."""
+
 _LATEST_NS = 2**32 - 1
 """Nanoseconds from a frame's start to a point's time, at most."""
 
@@ -217,10 +220,14 @@ def cloud_points(path: Path) -> Table:
         table = read_table(path)
         if lacks := [name for name in format_of(path).columns if name in _NEEDED and name not in table]:
             raise ValueError(f"lacks {', '.join(lacks)}")
-        near = all((np.abs(table[name]) < _FAR).all() for name in ("x", "y", "z", "intensity"))
+        lengths = [table[name] for name in ("intensity", "range") if name in table]
+        near = all((np.abs(table[name]) < _FAR).all() for name in "xyz")
+        near = near and all(((column >= 0) & (column < _FAR)).all() for column in lengths)
         time_ns = table.get("time_ns", np.zeros(1))
         if not (near and ((time_ns >= 0) & (time_ns <= _LATEST_NS)).all()):
             raise ValueError("points that no scanner measures")
+        if "ring" in table and table["ring"].max(initial=0) >= _RINGS:
+            raise ValueError(f"ring {table['ring'].max()}, more than a scanner has")
         if "label" in table and not np.isin(table["label"], _CLASSES).all():
             raise ValueError("labels of no class")
     return table

@@ -93,6 +93,8 @@ def _with_clouds_as(
         devices = scanners(rig_of(dataset.manifest["recipe"]["rig"]))
     if dataset.stored is not None:
         dataset.stored.mirror(dataset.path, progress=progress)
+    if not any(True for device in devices for _ in dataset.files(device.name, source)):
+        raise DatasetError(f"{dataset.path}: has no {source.name} clouds to convert; drive with a scanner")
     with complete_folder(out) as part:
         writing, count = replace(recording, out=part, settings=settings), 0
         _copy_all_but_clouds(dataset, writing, devices=devices)

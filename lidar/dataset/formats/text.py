@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from geoscene.support.compiled import njit
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import FormatError
+
+log = logging.getLogger(__name__)
 
 _METRES = ("x", "y", "z", "range", "true_range", "velocity")
 _DECIMALS = dict.fromkeys(_METRES, 4) | {"intensity": 2, "incidence": 5}
@@ -72,6 +75,8 @@ def read(path: Path) -> Table:
     Raises FormatError if the columns cannot be read as numbers.
     """
     header, _, body = path.read_text(encoding="ascii", errors="replace").partition("\n")
+    if body and not body.endswith("\n"):
+        log.warning("%s: does not end with a line break: its last number may be cut", path)
     names = header.strip().split(",")
     if "x" not in names:
         raise FormatError(f"{path}: its first line does not name a column x")

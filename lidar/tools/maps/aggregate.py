@@ -20,7 +20,7 @@ from lidar.dataset.derived import write_map_provenance
 from lidar.dataset.formats import MAPS, format_of, map_suffixes, read_table
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
-from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, open_dataset, own_files
 from lidar.errors import InputError
 from lidar.options import MapOptions
 from lidar.tools.maps.colors import ImageColors, distinct, ramp
@@ -115,6 +115,9 @@ def aggregate(
     expect(options, MapOptions, name="options", error=InputError)
     out = Path(out)
     _check(out, tiles=options.tiles is not None)
+    folder, target = dataset.path.resolve(), out.resolve()
+    if folder in target.parents and own_files(folder)(target.relative_to(folder).as_posix()):
+        raise InputError(f"{out}: is a file of the dataset; give another one")
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
     names = _scanners(dataset, options)

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import shutil
 from contextlib import suppress
 from importlib import resources
 
@@ -12,7 +13,10 @@ from helpers.mutations import mutated
 from geoscene.errors import GeosceneError
 from geoscene.geometry.frames import Frame
 from geoscene.sources.tracks import read_track
+from lidar.dataset.formats import FORMATS
 from lidar.dataset.journal import read_journal
+from lidar.dataset.layout import open_dataset, read_rows, read_sensors
+from lidar.dataset.recorded import all_clouds, cloud_points
 from lidar.errors import LidarError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.trajectory_files import read_tum, write_trajectory
@@ -24,7 +28,9 @@ from lidar.sensors.rig.scanner import load_sensor
 from lidar.sensors.rig.specs import load_rig, rig_digest
 from lidar.signal.registry import read_stages
 from lidar.signal.weather.setting import read_weather
+from lidar.tools.convert import convert
 from lidar.tools.defences.calibration import read_calibration
+from lidar.tools.maps.aggregate import aggregate
 from lidar.tools.redteam.plan import read_plan
 from lidar.tools.sweep.grid import read_grid
 from lidar.traffic.fcd import read_fcd
@@ -230,3 +236,69 @@ def test_traffic_that_unpacks_to_gigabytes_is_refused(tmp_path):
     (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(b"<fcd-export>" + b" " * (2**26 + 10)))
     with pytest.raises(LidarError, match=r"fcd\.xml\.gz: is unpacked to more than 64 MiB"):
         read_fcd(tmp_path / "fcd.xml.gz")
+
+
+@pytest.fixture
+def drive_copy(plain_drive, tmp_path):
+    return open_dataset(shutil.copytree(plain_drive, tmp_path / "drive"))
+
+
+def test_a_mount_that_mirrors_is_refused(drive_copy):
+    path = drive_copy.paths.calibration
+    document = json.loads(path.read_text())
+    name = next(name for name, row in document["sensors"].items() if row["kind"] == "lidar")
+    for row in document["sensors"][name]["vehicle_from_sensor"][:3]:
+        row[1] = -row[1]
+    path.write_text(json.dumps(document))
+    with pytest.raises(LidarError, match=rf"calibration\.json: .*the mount of {name} mirrors"):
+        read_sensors(drive_copy.paths)
+
+
+def test_a_table_that_is_cut_by_one_byte_is_refused(drive_copy):
+    path = drive_copy.paths.poses
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(LidarError, match=r"poses\.csv: .*ends within a line"):
+        read_rows(path)
+
+
+def test_a_cloud_as_text_that_is_cut_is_reported(tmp_path, caplog):
+    (tmp_path / "a.csv").write_text("x,y,z\n1,2,3\n4,5,6.2")
+    assert FORMATS["csv"].read(tmp_path / "a.csv")["z"].tolist() == [3, 6.2]
+    assert "a.csv: does not end with a line break" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("range", -1.0), ("range", np.nan), ("x", np.nan), ("intensity", -5.0), ("ring", 60_000)],
+)
+def test_values_that_no_scanner_measures_are_refused(drive_copy, column, value):
+    path = all_clouds(drive_copy)[0].files[0]
+    table = FORMATS["pcd"].read(path)
+    table[column] = np.concatenate([table[column][:-1], [value]]).astype(table[column].dtype)
+    FORMATS["pcd"].write(path, table)
+    with pytest.raises(LidarError, match=rf"{path.name}: damaged"):
+        cloud_points(path)
+
+
+@pytest.mark.parametrize("ring", [-1.0, 3.5, 1e6])
+def test_rings_of_nuscenes_that_are_none_are_refused(tmp_path, ring):
+    np.array([[1, 2, 3, 4, 5], [1, 2, 3, 4, ring]], "<f4").tofile(tmp_path / "a.pcd.bin")
+    with pytest.raises(LidarError, match=r"a\.pcd\.bin: row 1 has ring"):
+        FORMATS["nuscenes"].read(tmp_path / "a.pcd.bin")
+
+
+def test_a_drive_without_clouds_is_not_converted(drive_copy, tmp_path):
+    for name in drive_copy.sensors("lidar"):
+        for form in FORMATS.values():
+            shutil.rmtree(form.path(drive_copy.paths.sensor(name), 0).parent, ignore_errors=True)
+    with pytest.raises(LidarError, match=r"has no .* clouds to convert"):
+        convert(drive_copy.path, tmp_path / "out", to="e57")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_map_does_not_replace_a_file_of_its_dataset(drive_copy):
+    path = all_clouds(drive_copy)[0].files[0]
+    before = path.read_bytes()
+    with pytest.raises(LidarError, match=f"{path.name}: is a file of the dataset"):
+        aggregate(drive_copy.path, path, overwrite=True)
+    assert path.read_bytes() == before
