@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -159,7 +160,7 @@ def _without_verges(
     parcel, band = shapely.STRtree(bands).query(polygon, predicate="intersects")
     free = polygon.copy()
     ends = np.flatnonzero(np.diff(parcel, append=-1)) + 1
-    for first, stop in zip(np.append(0, ends[:-1]), ends, strict=True):
+    for first, stop in pairwise([0, *ends.tolist()]):
         k = parcel[first]
         free[k] = shapely.difference(free[k], shapely.union_all(bands[band[first:stop]]))
     return free
