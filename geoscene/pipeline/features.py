@@ -106,7 +106,7 @@ def _with_roofs(layer: Layer, replaced: Mapping[str, str], *, flat: Bools) -> La
     shape[pitched & flat] = "flat"
     changed |= pitched & flat
     source = layer.columns["roof_source"].copy()
-    source[changed] = "fallback"
+    source[changed & (source != "assumed")] = "fallback"
     height = np.where(changed & (shape == "flat"), 0.0, layer.columns["roof_height"])
     columns = {"roof_shape": shape, "roof_height": height, "roof_source": source}
     return replace(layer, columns={**layer.columns, **columns})
