@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings import Buildings
+from geoscene.buildings.roof_guesses import without_guess
 from geoscene.buildings.table import GRID
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.polylines import unit
@@ -22,7 +23,7 @@ from geoscene.structures.sheets import areal
 from geoscene.support.columns import Columns
 from geoscene.support.problems import Problem
 from geoscene.tags import parse_length
-from geoscene.typing import Float, Height, Ints
+from geoscene.typing import Bools, Float, Height, Ints
 
 _COVERED = frozenset({"building_passage", "covered", "avalanche_protector"})
 """Values of ``tunnel`` of ways on the ground."""
@@ -80,8 +81,11 @@ class Passages(Columns):
                lower leave free
     building : (n,) int64, row of the table of buildings
     width    : (n,) float64 metres
-    height   : (n,) float64 metres of free height
-    height_source : (n,) str: ``height``, ``maxheight:physical``, ``maxheight`` or ``default``
+    top      : (n,) float64 metres above the way up to which it is cut, and whether these are not mapped
+    guessed  : (n,) bool
+    height   : (n,) float64 metres of free height, less than that under low eaves and hanging parts
+    height_source : (n,) str: ``height``, ``maxheight:physical``, ``maxheight``, ``default``, or ``building``
+               where that is less
     osm_id   : (n,) str, the way
     """
 
@@ -89,6 +93,8 @@ class Passages(Columns):
     cut: NDArray[np.object_]
     building: Ints
     width: Float
+    top: Float
+    guessed: Bools
     height: Float
     height_source: NDArray[np.str_]
     osm_id: NDArray[np.str_]
@@ -150,25 +156,39 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passag
         polygon, beyond = _opening(lines[k], body, half=width / 2 + _BESIDE, tags=ways[k].tags)
         if polygon.area < _TINY:
             continue
-        height, source = _free_height(ways[k].tags)
-        low = buildings.min_height[mine]
-        grounded = buildings.footprint[mine[low < _LOW]]
-        hanging = shapely.union_all(buildings.footprint[mine[(low >= _LOW) & (low < height)]])
-        free = hanging.difference(shapely.union_all(grounded)).buffer(-_INTO, join_style="mitre")
-        into = shapely.union_all(shapely.intersection(grounded, polygon))
-        cut = beyond.difference(free) if into.area > _TINY else shapely.MultiPolygon()
-        cut = areal(cut, least=_TINY)
-        rows.append((polygon, cut, building, width, height, source, ways[k].osm_id))
-    columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 7
+        top, source = _free_height(ways[k].tags)
+        low, plan = buildings.min_height[mine], buildings.footprint[mine]
+        grounded = shapely.union_all(plan[low < _LOW])
+        hanging = shapely.union_all(plan[(low >= _LOW) & (low < top)])
+        free = hanging.difference(grounded).buffer(-_INTO, join_style="mitre")
+        into = grounded.intersection(polygon).area > _TINY
+        cut = areal(beyond.difference(free), least=_TINY) if into else shapely.MultiPolygon()
+        guessed = source == "default"
+        underside = np.where(low < _LOW, _eaves(buildings, mine) if guessed else np.inf, low)
+        own = np.where(low < _LOW, plan, shapely.difference(plan, grounded))
+        over = (shapely.area(shapely.intersection(own, polygon)) > _TINY) & (underside >= _LOW)
+        height = underside[over].min(initial=top)
+        source = source if height == top else "building"
+        rows.append((polygon, cut, building, width, top, guessed, height, source, ways[k].osm_id))
+    columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 9
     return Passages(
         np.fromiter(columns[0], object),
         np.fromiter(columns[1], object),
         np.array(columns[2], np.int64),
         np.array(columns[3], float),
         np.array(columns[4], float),
-        np.array(columns[5], np.str_),
-        np.array(columns[6], np.str_),
+        np.array(columns[5], np.bool_),
+        np.array(columns[6], float),
+        np.array(columns[7], np.str_),
+        np.array(columns[8], np.str_),
     )
+
+
+def _eaves(buildings: Buildings, row: Ints) -> Float:
+    """Metres from the bases of buildings (k,) to the highest passages under their eaves, or into low ones."""
+    level = without_guess(buildings, np.ones(len(buildings), np.bool_))
+    most = np.asarray(level.height[row] - _LINTEL, float)
+    return np.where(most < _LOW, most, np.maximum(most - level.roof_height[row], _LOW))
 
 
 def _is_passage(tags: Tags) -> bool:
@@ -260,19 +280,16 @@ def passage_cuts(
     row = drawn[row]
     own = buildings.outline[row] == passages.building[some[pair]]
     pair, row = pair[own], row[own]
-    clear = ground[pair] + passages.height[some[pair]]
-    guessed = passages.height_source[some[pair]] == "default"
-    eaves = buildings.height[row] - buildings.roof_height[row] - _LINTEL
-    lower = guessed & (eaves < clear) & (eaves >= ground[pair] + _LOW)
+    clear = ground[pair] + passages.top[some[pair]]
+    eaves = _eaves(buildings, row)
+    lower = passages.guessed[some[pair]] & (eaves < clear) & (eaves >= ground[pair] + _LOW)
     problems = []
     for n in np.flatnonzero(lower).tolist():
         k = some[pair[n]]
         detail = f"{eaves[n] - ground[pair[n]]:.2f} m high under the eaves of {buildings.osm_id[row[n]]}"
         name = str(passages.osm_id[k])
         problems.append(
-            Problem(
-                name, "building", "repaired", "low-passage", f"{detail}, {passages.height[k]:g} m is usual"
-            )
+            Problem(name, "building", "repaired", "low-passage", f"{detail}, {passages.top[k]:g} m is usual")
         )
     clear = np.where(lower, eaves, clear)
     hit = buildings.min_height[row] < clear

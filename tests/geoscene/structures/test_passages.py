@@ -33,7 +33,8 @@ def lonlat(xy):
 def house(shape=HOUSE, number=900, **tags):
     shape = shapely.transform(shape, lonlat)
     colon = {
-        key.replace("__", ":"): value for key, value in ({"building": "yes", "height": "12"} | tags).items()
+        key.replace("__", ":"): value
+        for key, value in ({"building": "yes", "height": "12", "roof__shape": "flat"} | tags).items()
     }
     return Area(f"way/{number}", colon, shape, np.empty(0, np.int64))
 
@@ -259,6 +260,7 @@ def test_a_street_through_several_parts_cuts_those_on_the_ground():
         ({"height": "4.6"}, 4.3, ["low-passage"]),
         ({"height": "3"}, 2.7, ["low-passage"]),
         ({"height": "6", "roof__shape": "gabled", "roof__height": "3"}, 2.7, ["low-passage"]),
+        ({"height": "3", "roof__shape": "gabled", "roof__height": "2"}, 2.0, ["low-passage"]),
         ({"height": "2.1"}, None, []),
     ],
 )
@@ -267,6 +269,24 @@ def test_a_passage_under_low_eaves_is_lower_unless_there_is_no_room(tags, free, 
     found = heights(mesh, 0.7, 0.9)
     assert (found[0] if found else None) == pytest.approx(free)
     assert [p.reason for p in problems] == reasons
+
+
+@pytest.mark.parametrize(
+    ("areas", "tags", "height", "source"),
+    [
+        ([house()], PASSAGE, 4.5, "default"),
+        ([house(height="3")], PASSAGE, 2.7, "building"),
+        ([house(height="4.6")], PASSAGE | {"maxheight": "4.4"}, 4.4, "maxheight"),
+        ([house(building="roof", height="3")], {"covered": "yes"}, 2.6, "building"),
+        ([house(), part(HOUSE, 901, min_height="3")], PASSAGE, 3.0, "building"),
+        ([house(), part(HOUSE, 901, height="3"), part(HOUSE, 902, min_height="3")], PASSAGE, 2.7, "building"),
+    ],
+)
+def test_the_table_of_passages_has_their_free_height(areas, tags, height, source):
+    plan, _, _ = built(areas, street(*STREET, inside=tags))
+    columns = {layer.name: layer for layer in plan.layers}["passages"].columns
+    assert columns["height"][0] == pytest.approx(height)
+    assert columns["height_source"].tolist() == [source]
 
 
 def test_a_mapped_height_is_kept_under_low_eaves():
