@@ -1,6 +1,6 @@
 """Inferred appearance of buildings without mapped colours: walls, roofs, storeys and windows.
 
-Guesses are for pictures only. They depend on a building's OSM id, use, size and region, not on its
+Guesses depend on a building's OSM id, use, size and region, not on its
 neighbours or its place in the table.
 """
 
@@ -10,13 +10,16 @@ import functools
 import hashlib
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
+from geoscene.buildings.table import Buildings
+from geoscene.classes import materials
 from geoscene.geometry.frames import wrap_longitude
 from geoscene.support.columns import Columns
 from geoscene.support.splitmix import uniform_at
@@ -146,6 +149,40 @@ def guess_looks(
         windows,
         np.array(_BAY)[windows] * (0.85 + 0.3 * draw[6]),
     )
+
+
+def with_looks(buildings: Buildings, region: str) -> Buildings:
+    """The buildings, with guessed colours and materials where none are mapped; their source is ``assumed``.
+
+    Parts look as their building would.
+    """
+    of = buildings.outline
+    looks = guess_looks(
+        buildings.osm_id[of],
+        buildings.use[of],
+        area=np.asarray(shapely.area(buildings.footprint[of]), float),
+        walls=np.maximum(buildings.height[of] - buildings.roof_height[of], 0.0),
+        levels=buildings.levels[of],
+        roof_height=buildings.roof_height,
+        region=region,
+    )
+    found: dict[str, NDArray[Any]] = {}
+    for side, source, names in (
+        ("wall", "wall_source", looks.wall),
+        ("roof", "roof_look_source", looks.roof),
+    ):
+        free = getattr(buildings, source) == "default"
+        made_of = np.array(
+            [materials()[palettes()["materials"][name]].code for name in names.tolist()], np.uint8
+        )
+        found |= {
+            f"{side}_color": np.where(
+                free[:, None], getattr(looks, f"{side}_color"), getattr(buildings, f"{side}_color")
+            ),
+            f"{side}_material": np.where(free, made_of, getattr(buildings, f"{side}_material")),
+            source: np.where(free, "assumed", getattr(buildings, source)).astype(object),
+        }
+    return replace(buildings, **found)
 
 
 def seeds(osm_id: Names) -> Ints:

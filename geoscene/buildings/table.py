@@ -75,8 +75,8 @@ class Buildings(Columns):
     roof_color       : (n, 3) uint8 sRGB
     wall_material    : (n,) uint8, codes of `geoscene.classes.materials`
     roof_material    : (n,) uint8
-    wall_source      : (n,) str: tag, outline or default
-    roof_look_source : (n,) str: tag, outline or default
+    wall_source      : (n,) str: tag, outline, assumed (guessed) or default
+    roof_look_source : (n,) str: tag, outline, assumed (guessed) or default
     """
 
     osm_id: Texts

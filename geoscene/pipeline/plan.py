@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.buildings import BuildingOptions, Buildings, read_buildings
 from geoscene.buildings.facades import FacadeSetting, read_setting
-from geoscene.buildings.guesses import palettes, region_at
+from geoscene.buildings.guesses import palettes, region_at, with_looks
 from geoscene.buildings.heights import with_measured_tops
 from geoscene.buildings.roof_guesses import without_guess
 from geoscene.classes import Class
@@ -282,6 +282,7 @@ def make_plan(
     buildings = _collect(problems, buildings_over(buildings, base, foot=foot, table=structures, cuts=cuts))
     buildings = without_guess(buildings, np.array([len(some) > 0 for some in buildings.passages], np.bool_))
 
+    buildings = with_looks(buildings, region_at(*_checked_centre(osm)))
     rooftops = None
     if options.relief == "full":
         rooftops = plan_rooftops(buildings, centre=_checked_centre(osm))

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.buildings.guesses import WINDOWS, AppearanceGuesses, guess_looks, region_at
-from geoscene.classes import Class, materials
+from geoscene.classes import Class
 from geoscene.export.objects import FeatureAttributes
 from geoscene.geometry.mesh import ROOF, WALL, Mesh
 from geoscene.scene import Scene
@@ -23,9 +23,6 @@ GUESSED = 4
 
 STEP = 0.05
 """Metres of a step of the heights of storeys and of the distances of windows."""
-
-_DEFAULTS = (materials()["plaster"], materials()["roof_tile"], materials()["tar_roof"])
-"""Materials of walls and roofs whose look is not mapped."""
 
 _COLUMNS = (
     *("feature", "osm_id", "use", "base", "height", "roof_height", "levels"),
@@ -59,36 +56,36 @@ class Looks:
 
     facades : (n rows), by ascending feature number
     guesses : (n rows)
+    other_roofs : (n, 3) uint8 sRGB, guessed colours of flat roofs of parts where the building's is pitched, or
+                  the other way round
     walls, roofs, storeys : (n,) bool, these of the guesses stand for what the map does not give
     region  : whose usual looks the guesses are
     """
 
     facades: FacadeLooks
     guesses: AppearanceGuesses
+    other_roofs: NDArray[np.uint8]
     walls: Bools
     roofs: Bools
     storeys: Bools
     region: str
 
     def dressed(self, tile: Tile) -> Tile:
-        """The tile with guessed colours on the faces that have a default one, marked as `GUESSED`."""
+        """The tile with the faces of guessed colours marked as `GUESSED`."""
         mesh = tile.mesh
         if not len(self.facades):
             return tile
         row = np.searchsorted(self.facades.feature, mesh.feature).clip(max=len(self.facades) - 1)
         own = (self.facades.feature[row] == mesh.feature) & (mesh.klass == Class.BUILDING)
-        own &= np.any(
-            [(mesh.material == m.code) & (mesh.color == m.color).all(axis=1) for m in _DEFAULTS], axis=0
-        )
-        color, surface = mesh.color.copy(), mesh.surface.copy()
+        surface = mesh.surface.copy()
         for side, guessed, colors in (
-            (WALL, self.walls, self.guesses.wall_color),
-            (ROOF, self.roofs, self.guesses.roof_color),
+            (WALL, self.walls, (self.guesses.wall_color,)),
+            (ROOF, self.roofs, (self.guesses.roof_color, self.other_roofs)),
         ):
-            faces = own & (mesh.surface == side) & guessed[row]
-            color[faces] = colors[row[faces]]
-            surface[faces] |= GUESSED
-        return replace(tile, mesh=replace(mesh, color=color, surface=surface))
+            faces = np.flatnonzero(own & (mesh.surface == side) & guessed[row])
+            alike = [(mesh.color[faces] == color[row[faces]]).all(axis=1) for color in colors]
+            surface[faces[np.any(alike, axis=0)]] |= GUESSED  # parts may have mapped colours
+        return replace(tile, mesh=replace(mesh, surface=surface))
 
     def facades_of(self, mesh: Mesh) -> FacadeLooks:
         """The facades of the buildings in a mesh."""
@@ -130,24 +127,33 @@ def read_looks(scene: Scene) -> Looks:
     roof, levels, height = (columns[name].astype(float) for name in ("roof_height", "levels", "height"))
     walls = np.maximum(height - roof, 0.0)
     region = region_at(float(lon), float(lat))
-    guesses = guess_looks(
-        columns["osm_id"],
-        columns["use"],
-        area=np.asarray(shapely.area(footprint), float),
-        walls=walls,
-        levels=levels,
-        roof_height=roof,
-        region=region,
+    guesses, others = (
+        guess_looks(
+            columns["osm_id"],
+            columns["use"],
+            area=np.asarray(shapely.area(footprint), float),
+            walls=walls,
+            levels=levels,
+            roof_height=rise,
+            region=region,
+        )
+        for rise in (roof, np.where(roof > 0, 0.0, 1.0))
     )
     storey = np.clip(walls / guesses.storeys, 2.0, 12.0)
     codes = np.column_stack([guesses.windows, guesses.storeys, _steps(storey), _steps(guesses.bay)])
     feature, base = columns["feature"].astype(np.int32), columns["base"].astype(np.float32)
     facades = FacadeLooks(feature, base, codes.astype(np.uint8))
     walls_guessed, roofs_guessed = (
-        columns[name] == "default" for name in ("wall_source", "roof_look_source")
+        columns[name] == "assumed" for name in ("wall_source", "roof_look_source")
     )
     return Looks(
-        facades, guesses, walls=walls_guessed, roofs=roofs_guessed, storeys=~(levels >= 0.5), region=region
+        facades,
+        guesses,
+        others.roof_color,
+        walls=walls_guessed,
+        roofs=roofs_guessed,
+        storeys=~(levels >= 0.5),
+        region=region,
     )
 
 
