@@ -82,7 +82,7 @@ AREAS: dict[str, dict[str, GroundKind]] = {
         "dog_park": _GREEN, "pitch": GroundKind(Class.GRASS, "grass", 62), "stadium": _PAVED,
         "sports_centre": _BUILT,
         "playground": GroundKind(Class.SAND, "sand", 61),
-        "track": GroundKind(Class.TERRAIN, "soil", 61),
+        "track": GroundKind(Class.TERRAIN, "dirt", 61),
         "swimming_pool": _BASIN, "schoolyard": _PAVED,
         "fitness_station": GroundKind(Class.SAND, "sand", 61),
         "marina": GroundKind(Class.PAVED, "concrete", 9),
@@ -161,7 +161,7 @@ SURFACES: dict[str, str] = {
     "stone": "stone", "rock": "stone", "bricks": "brick", "brick": "brick",
     "gravel": "gravel", "fine_gravel": "gravel", "pebblestone": "gravel", "compacted": "gravel",
     "unpaved": "gravel", "shells": "gravel", "rubber": "asphalt",
-    "dirt": "soil", "earth": "soil", "ground": "soil", "mud": "soil", "clay": "soil", "woodchips": "bark",
+    "dirt": "dirt", "earth": "dirt", "ground": "dirt", "mud": "soil", "clay": "dirt", "woodchips": "bark",
     "grass": "grass", "grass_paver": "grass", "artificial_turf": "grass", "sand": "sand", "wood": "wood",
     "metal": "metal", "snow": "snow", "ice": "snow",
 }  # fmt: skip
@@ -169,7 +169,7 @@ SURFACES: dict[str, str] = {
 
 _UNPAVED: dict[str, Class] = {
     "grass": Class.GRASS, "dry_grass": Class.GRASS, "sand": Class.SAND, "soil": Class.TERRAIN,
-    "gravel": Class.TERRAIN, "bark": Class.TERRAIN, "snow": Class.TERRAIN,
+    "dirt": Class.TERRAIN, "gravel": Class.TERRAIN, "bark": Class.TERRAIN, "snow": Class.TERRAIN,
 }  # fmt: skip
 """Classes of ground of unpaved materials; all other materials are paving."""
 

@@ -29,8 +29,8 @@ _PATHS = {
     "sidewalk": (2.0, "paving"),
     "pedestrian": (5.0, "paving"),
     "cycleway": (2.5, "asphalt"),
-    "path": (1.5, "soil"),
-    "bridleway": (2.0, "soil"),
+    "path": (1.5, "dirt"),
+    "bridleway": (2.0, "dirt"),
     "steps": (2.0, "concrete"),
 }
 _PRIORITIES = {"sidewalk": "footway", "cycleway": "cycleway"}  # of other kinds: path

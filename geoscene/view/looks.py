@@ -56,8 +56,8 @@ class Looks:
 
     facades : (n rows), by ascending feature number
     guesses : (n rows)
-    other_roofs : (n, 3) uint8 sRGB, guessed colours of flat roofs of parts where the building's is pitched, or
-                  the other way round
+    other_roofs : (n, 3) uint8 sRGB, guessed colours of flat roofs of parts where that of the building is
+                  pitched, or the other way round
     walls, roofs, storeys : (n,) bool, these of the guesses stand for what the map does not give
     region  : whose usual looks the guesses are
     """

@@ -102,6 +102,7 @@ _BY_MATERIAL = {
     "ballast": "ballast",
     "sand": "sand",
     "soil": "soil",
+    "dirt": "soil",
     "grass": "grass",
     "dry_grass": "grass",
 }

@@ -36,7 +36,7 @@ MATERIALS = {
     CONCRETE: ("concrete",),
     PAVING: ("paving", "brick"),
     SETTS: ("stone",),
-    LOOSE: ("gravel", "soil", "sand", "ballast"),
+    LOOSE: ("gravel", "soil", "dirt", "sand", "ballast"),
     GREEN: ("grass", "dry_grass"),
 }
 

@@ -29,7 +29,7 @@ _BUILDING, _MARKING = int(Class.BUILDING), int(Class.LANE_MARKING)
 _ASPHALT = ground_texture.ASPHALT
 
 _KINDS = {
-    texture.SPECKLED: ("asphalt", "asphalt_fresh", "gravel", "soil", "sand", "ballast", "tar_roof"),
+    texture.SPECKLED: ("asphalt", "asphalt_fresh", "gravel", "soil", "dirt", "sand", "ballast", "tar_roof"),
     texture.SLABS: ("paving", "concrete"),
     texture.BRICK: ("brick",),
     texture.WEATHERED: ("plaster", "stone", "copper", "bark", "wood"),

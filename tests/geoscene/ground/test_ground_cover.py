@@ -78,7 +78,7 @@ BOX = shapely.box(-50, -50, 50, 50)
         ({"place": "square"}, ("SIDEWALK", "paving")),
         ({"place": "square", "surface": "cobblestone"}, ("SIDEWALK", "stone")),
         ({"place": "square", "surface": "grass"}, ("GRASS", "grass")),
-        ({"amenity": "marketplace", "surface": "dirt"}, ("TERRAIN", "soil")),
+        ({"amenity": "marketplace", "surface": "dirt"}, ("TERRAIN", "dirt")),
         ({"amenity": "parking"}, ("PARKING", "asphalt")),
         ({"amenity": "parking", "surface": "grass_paver"}, ("PARKING", "grass")),
         ({"natural": "water", "surface": "asphalt"}, ("WATER", "water")),

@@ -11,6 +11,7 @@ from geoscene.ground import Layers, landcover
 from geoscene.ground.land import PARCELS, TEMPERATE, Land, parcels
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
+from geoscene.roadgraph.paths import path_surfaces
 from geoscene.sources.data import Area, OsmData, Way
 
 ARID = Land("sand", {"sand": 5.0, "soil": 3.0, "gravel": 2.0})
@@ -136,3 +137,17 @@ def test_open_ground_of_a_scene_is_that_of_its_region(place, expected, tmp_path)
     assert bare == {expected}
     table = scene.features("landcover").columns
     assert {PARCELS} == set(table["source"])
+
+
+def test_dirt_roads_differ_from_the_soil_beside_them_in_colour_and_reflectance():
+    soil, dirt = materials()["soil"], materials()["dirt"]
+    rows = path_surfaces(
+        OsmData((8.9, 49.9, 9.1, 50.1), [path(highway="path")], [], [], []), Frame.at(9.0, 50.0)
+    )
+    assert material_names(rows.material).tolist() == ["dirt"]
+    assert min(np.array(dirt.color) / soil.color) > 1.2
+    assert min(np.array(dirt.reflectance) / soil.reflectance) > 1.15
+
+
+def path(**tags):
+    return Way("way/1", tags, np.array([1, 2]), np.array([[9.0, 50.0], [9.001, 50.0]]))
