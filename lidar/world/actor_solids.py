@@ -104,7 +104,7 @@ def mirror(mesh: Mesh) -> list[Mesh]:
     return [mesh, other]
 
 
-def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10) -> Mesh:
+def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 18) -> Mesh:
     """A wheel about (x, y) on the ground: a tyre with a metal disc on both sides."""
     turn = 2 * np.pi * np.arange(corners) / corners
     rings = []
@@ -119,7 +119,7 @@ def wheel(x: float, y: float, *, radius: float, width: float, corners: int = 10)
     return repaint(tyre, sides(3, corners)[:, 0] < 0, material="metal")
 
 
-def hoop(x: float, radius: float, *, width: float, corners: int = 12) -> Mesh:
+def hoop(x: float, radius: float, *, width: float, corners: int = 20) -> Mesh:
     """A bicycle wheel in the plane y = 0 on the ground at x: a tyre without spokes."""
     turn = 2 * np.pi * np.arange(corners) / corners
     ring = np.column_stack([np.cos(turn), np.zeros(corners), np.sin(turn)])
@@ -196,7 +196,7 @@ def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mes
     swing = 0.0 if phase is None else _SWING * np.sin(phase)
     left, right = (0.0, 0.0) if phase is None else (max(sign * np.cos(phase), 0.0) for sign in (1, -1))
     parts = _trunk((0.0, _HIP * h), (0.0, _SHOULDER * h), h=h, jacket=jacket)
-    parts += _head((0.0, _CHIN * h), h)
+    parts += [_shoulders(0.0, 0.79 * h, h=h, jacket=jacket), *_head((0.0, _CHIN * h), h)]
     for side, angle, bend in ((1, swing, left), (-1, -swing, right)):
         hip = np.array([0.0, side * 0.052 * h, _LEG * h + 0.05 * h])
         knee = hip + 0.25 * h * np.array([np.sin(angle + 0.35 * bend), 0.0, -np.cos(angle + 0.35 * bend)])
@@ -207,9 +207,7 @@ def person(stature: float, clothes: Clothes, *, phase: float | None) -> list[Mes
             limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
             _shoe(ankle, (0.03 * h, 0.015 * h), toe=(0.10 * h, 0.02 * h), thick=(0.05 * h, 0.04 * h)),
         ]
-        parts += _arm(
-            np.array([0.0, side * 0.125 * h, 0.80 * h]), -0.8 * angle, bend=0.25, h=h, jacket=jacket
-        )
+        parts += _arm(np.array([0.0, side * 0.12 * h, 0.79 * h]), -0.8 * angle, bend=0.25, h=h, jacket=jacket)
     return _ground_parts(parts)
 
 
@@ -233,6 +231,7 @@ def rider(
     lean = 0.42 if crank is not None else 0.3
     top = (seat[0] + 0.30 * h * np.sin(lean), seat[1] + 0.30 * h * np.cos(lean))
     parts = _trunk(seat, top, h=h, jacket=jacket)
+    parts.append(_shoulders(top[0], top[1] - 0.03 * h, h=h, jacket=jacket))
     parts += _head((top[0] + 0.02 * h, top[1] + 0.05 * h), h, helmet=helmet)
     for side in (1, -1):
         turn = 0.0 if crank is None else crank + (0.0 if side > 0 else np.pi)
@@ -245,7 +244,7 @@ def rider(
             limb(knee, ankle, thick=(0.075 * h, 0.05 * h), color=trousers),
             _shoe(ankle, (0.05, 0.03), toe=(0.16, 0.03), thick=(0.08, 0.06)),
         ]
-        shoulder = np.array([top[0], side * 0.115 * h, top[1] - 0.02 * h])
+        shoulder = np.array([top[0], side * 0.115 * h, top[1] - 0.03 * h])
         hand = np.array([grip[0], side * 0.24, grip[1]])
         elbow = (shoulder + hand) / 2 + [-0.02, side * 0.05, -0.06]
         parts += [
@@ -299,6 +298,13 @@ def _arm(shoulder: Float, angle: float, *, bend: float, h: float, jacket: Rgb) -
         limb(elbow, hand, thick=(0.045 * h, 0.035 * h), color=jacket),
         ball(hand, (0.05 * h, 0.03 * h, 0.055 * h), material="skin", color=SKIN),
     ]
+
+
+def _shoulders(x: float, z: float, *, h: float, jacket: Rgb) -> Mesh:
+    """A bar across the trunk from arm to arm, which closes the gaps between them."""
+    reach = np.array([0.0, 0.14 * h, 0.0])
+    middle = np.array([x, 0.0, z - 0.015 * h])
+    return limb(middle - reach, middle + reach, thick=(0.065 * h, 0.065 * h), color=jacket)
 
 
 def _joint(a: Float, b: Float, *, first: float, second: float) -> Float:

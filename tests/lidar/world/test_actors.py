@@ -103,6 +103,20 @@ def test_beams_at_the_windows_of_a_car_hit_glass_on_either_side():
     assert (body.mesh.material[hits.face] == materials()["glass"].code).all()
 
 
+@pytest.mark.parametrize("kind", ["adult", "small_adult", "child"])
+def test_arms_join_the_trunk_at_the_shoulders(kind):
+    """From ahead, the highest rows of rays that hit both arms have no gap between an arm and the trunk."""
+    for body in [s for s in catalogue().values() if s.kind == kind][:9]:
+        caster = Caster(body.mesh.vertices, body.mesh.faces)
+        y, z = np.meshgrid(np.arange(-0.3, 0.3, 0.001), np.arange(0.9, 0.7, -0.003) * body.height)
+        start = np.stack([np.full(y.size, 3.0), y.ravel(), z.ravel()], axis=1)
+        hit = caster.cast(start, np.tile([-1.0, 0.0, 0.0], (len(start), 1))).face.reshape(y.shape) >= 0
+        spans = [np.flatnonzero(row) for row in hit]
+        wide = [k for k, row in enumerate(spans) if len(row) and np.ptp(row) > 220 * body.height]
+        for k in wide[:3]:
+            assert np.diff(spans[k]).max() == 1, body.name
+
+
 def test_paint_shares_add_up_to_one():
     assert sum(share for _, share in PAINTS.values()) == pytest.approx(1.0)
 
