@@ -85,7 +85,7 @@ from geoscene.roadgraph.relief import (
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.roadgraph.tags import find_unused_inclines
-from geoscene.roadgraph.walls import Walls
+from geoscene.roadgraph.walls import HEADROOM, Walls
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import OsmData
@@ -233,13 +233,12 @@ def make_plan(
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
-    walls = Walls.of(
-        buildings.footprint[: buildings.count],
-        np.array(buildings.osm_id[: buildings.count], np.str_),
-        min_height=buildings.min_height[: buildings.count],
-    )
-    roads = _plan_roads(osm, frame, options=options, terrain=terrain, walls=walls, problems=problems)
     passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
+    solid = _on_ground(buildings, passages, free=HEADROOM)
+    some = np.flatnonzero([shape is not None for shape in solid])
+    names = np.array(buildings.osm_id[some], np.str_)
+    walls = Walls.of(solid[some], names, min_height=np.zeros(len(some)))
+    roads = _plan_roads(osm, frame, options=options, terrain=terrain, walls=walls, problems=problems)
     reach, area = Reach.of(options, roads.graph, frame=frame), None
     route = None if reach is None else reach.line
     if needed is not None:
@@ -709,7 +708,7 @@ def _surfaces(
         feature=surfaces.number,
     )
     pads = building_pads(
-        _on_ground(buildings, passages),
+        _on_ground(buildings, passages, free=_RAISED),
         osm_id=buildings.osm_id[:count].astype(str),
         feature=np.arange(count, dtype=np.int32),
     )
@@ -717,10 +716,13 @@ def _surfaces(
     return (replace(cover, feature=np.arange(len(cover), dtype=np.int32)), paved, pads), problems
 
 
-def _on_ground(buildings: Buildings, passages: Passages) -> NDArray[np.object_]:
-    """What buildings (count,) take of the ground, or None: not what is below raised parts or in passages."""
+def _on_ground(buildings: Buildings, passages: Passages, *, free: float) -> NDArray[np.object_]:
+    """What buildings (count,) take of the ground, or None: not what is below raised parts or in passages.
+
+    free : metres of the underside of raised parts, at least
+    """
     shapes = buildings.footprint[: buildings.count].copy()
-    low = buildings.drawn & (buildings.min_height < _RAISED)
+    low = buildings.drawn & (buildings.min_height < free)
     raised = np.unique(buildings.outline[buildings.drawn & ~low])
     of_low = np.flatnonzero(low)
     of_low = of_low[np.argsort(buildings.outline[of_low], kind="stable")]

@@ -18,7 +18,7 @@ from geoscene.typing import Float, Ints
 
 IN_CARRIAGEWAY = "building-in-carriageway"
 """Reason of a problem: a building stands in a carriageway, however narrow that was made."""
-_HEADROOM = 2.5
+HEADROOM = 2.5
 """Metres above the ground from which on a building does not stand in a carriageway."""
 NARROWEST_CAR_LANE = 2.5
 """Metres between walls that a car passes, with a third of a metre on each side."""
@@ -42,7 +42,7 @@ class Walls:
     @classmethod
     def of(cls, footprint: NDArray[np.object_], osm_id: NDArray[np.str_], *, min_height: Float) -> Walls:
         """Those of buildings without room for a car below; ``min_height`` (n,) metres above the ground."""
-        low = np.flatnonzero(min_height < _HEADROOM)
+        low = np.flatnonzero(min_height < HEADROOM)
         return cls(footprint[low], osm_id[low])
 
 

@@ -130,6 +130,13 @@ def test_a_street_runs_through_a_house_as_high_as_its_tags_say(tags, free):
     assert found == expected
 
 
+def test_streets_to_a_passage_are_as_wide_as_the_one_in_it():
+    plan, _, problems = built([house()], street(*STREET))
+    assert len(set(plan.graph.width.tolist())) == 1
+    assert plan.graph.width[0] > 5
+    assert problems == []
+
+
 @pytest.mark.parametrize(
     ("tags", "width", "free"),
     [
