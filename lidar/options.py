@@ -1007,17 +1007,17 @@ class PlaybackOptions(_OfFrames):
     """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
     default."""
 
-    every: int = 1
-    """Show each n-th of these frames only."""
+    every: int | None = None
+    """Show each n-th of these frames only; by default all, or as many as fit `max_mb`."""
 
     max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
-    """Maximum size of the page in megabytes; for a larger one, the error names a selection that fits."""
+    """Maximum size of the page in megabytes."""
 
     def __post_init__(self) -> None:
         """Validate the options."""
         take_values(self, error=InputError)
         _ = self.limits
-        if self.every < 1:
+        if self.every is not None and self.every < 1:
             raise InputError(f"`every` {self.every}: give 1 or more")
         _check_positive(self, max_mb=" of megabytes")
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -104,7 +105,7 @@ class Drive:
         self.dataset = dataset
         scanners, cameras = _chosen(dataset, options.sensors)
         self.clouds, *others = scanners
-        shown = frames_within(self.clouds, options.limits, every=options.every)
+        shown = frames_within(self.clouds, options.limits, every=options.every or 1)
         self.rows: Ints = np.searchsorted(self.clouds.frames, shown.frames)
         self.scanners = [ScannerSweeps(self.clouds, self.rows, np.arange(len(self.rows)))]
         for clouds in others:
@@ -200,7 +201,11 @@ class Drive:
             "steps": {"range": RANGE_STEP, "angle": ANGLE_STEP, "table": TABLE_STEP, "time_ns": TIME_STEP_NS},
         }
 
-    def _file(self, clouds: Stream, row: int) -> Any:
+    def cloud(self, scanner: ScannerSweeps, k: int) -> Path:
+        """File of the k-th sweep of a scanner that is shown."""
+        return self._file(scanner.clouds, int(scanner.rows[k]))
+
+    def _file(self, clouds: Stream, row: int) -> Path:
         return self.dataset.frame_file(clouds.files[row])
 
     def _images(self, name: str) -> CameraImages | None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
 from typing import IO, Any
+
+import numpy as np
 
 from geoscene.support.files import atomic_file, exclusive, spool
 from geoscene.support.progress import Progress, displayed, shows_progress
@@ -24,6 +28,11 @@ _SCRIPTS = ("sweep.js", "draw.js", "panels.js", "player.js")
 """The player's own scripts, in the order in which they are joined."""
 HOST = "127.0.0.1"
 """Only programs of this machine reach the server."""
+
+_LOOKED_AT = 12
+"""Frames from which the size of a page is estimated."""
+_FILLED = 0.9
+"""Share of the largest size that frames are chosen to fill: those that were looked at may be small ones."""
 
 _KEPT = 256
 """Packed sweeps and images that are kept."""
@@ -60,43 +69,92 @@ def view_drive(
 ) -> PageSummary:
     """Write a drive as one web page that a browser opens from disk and plays; returns its contents.
 
+    Of a drive that is too large for ``max_mb``, each n-th frame is shown, and a note says so.
+
     The page loads nothing: data, style and player (WebGL 2) are in it. Its bytes depend on the dataset, the
     scene's roads and the options alone.
 
     Raises InputError for a file that exists or is not named as a page, for sensors and frames that the
-    dataset does not have, and for a page that would be too large; the message then gives a selection that
-    would fit. Raises DatasetError for damaged files and a dataset without clouds in the sensor frame.
+    dataset does not have, and for a page that would be larger than ``max_mb`` with an `every` that is given;
+    the message then names a selection that would fit. Raises DatasetError for damaged files and a dataset
+    without clouds in the sensor frame.
     """
     dataset = open_dataset(dataset)
     out = Path(out)
     check_page(out, overwrite=overwrite)
-    drive = Drive(dataset, options)
+    drive, limit = Drive(dataset, options), options.max_mb * 1e6
+    (fixed, whole), every = _estimated_bytes(drive), options.every
+    if whole > limit:
+        if every is not None:
+            raise InputError(_too_large(drive, options, fixed=fixed, size=whole))
+        every = min(math.ceil((whole - fixed) / max(_FILLED * limit - fixed, 1.0)), len(drive))
+        drive = Drive(dataset, replace(options, every=every))
     head = drive.head()
-    returns = 0
-    written: set[str] = set()
-    swept: set[str] = set()
     with exclusive(out), atomic_file(out) as file, spool(out) as blobs:
         _write_slots(blobs, drive)
-        for k in range(len(drive)):
+        returns = images = 0
+        for k, parts in enumerate(_parts(drive)):
             progress("page", k, total=len(drive))
-            for number, scanner in enumerate(drive.scanners):
-                row = int(scanner.index[k])
-                if (name := f"sweep-{number}-{row}") not in swept:
-                    count, data = drive.sweep(row, scanner=number)
-                    returns += count
-                    write_blob(blobs, name, data=data)
-                    swept.add(name)
-            for number, camera in enumerate(drive.cameras):
-                for kind in camera.kinds:
-                    image = int(camera.index[k])
-                    if (name := f"image-{number}-{kind}-{image}") not in written:
-                        write_blob(blobs, name, data=drive.image(number, image, kind=kind))
-                        written.add(name)
-            if blobs.tell() > options.max_mb * 1e6:
-                raise InputError(_too_large(drive, options, done=k + 1, size=blobs.tell()))
+            for name, count, data in parts:
+                returns, images = returns + count, images + name.startswith("image")
+                write_blob(blobs, name, data=data)
+            if blobs.tell() > limit:
+                size = max(1.01 * limit, blobs.tell() / (k + 1) * len(drive))
+                raise InputError(_too_large(drive, options, fixed=fixed, size=size))
         write_player(file, drive, head=head, blobs=blobs)
-    notes = (*drive.notes, *_left_out(drive))
-    return PageSummary(out, out.stat().st_size, len(drive), len(written), returns, notes)
+    notes = [*drive.notes, *_left_out(drive)]
+    if every != options.every:
+        notes.append(
+            f"one frame of {every}: all would take about {whole / 1e6:.3g} MB, more than the"
+            f" {options.max_mb:g} of `max_mb`; raise it, or see all of them with --serve"
+        )
+    return PageSummary(out, out.stat().st_size, len(drive), images, returns, tuple(notes))
+
+
+def _parts(drive: Drive) -> Iterator[Iterator[tuple[str, int, bytes]]]:
+    """Name, number of returns and bytes of what each frame adds to the page."""
+    written: set[str] = set()
+
+    def of(k: int) -> Iterator[tuple[str, int, bytes]]:
+        for number, scanner in enumerate(drive.scanners):
+            row = int(scanner.index[k])
+            if (name := f"sweep-{number}-{row}") not in written:
+                written.add(name)
+                yield name, *drive.sweep(row, scanner=number)
+        for number, camera in enumerate(drive.cameras):
+            image = int(camera.index[k])
+            for kind in camera.kinds:
+                if (name := f"image-{number}-{kind}-{image}") not in written:
+                    written.add(name)
+                    yield name, 0, drive.image(number, image, kind=kind)
+
+    yield from map(of, range(len(drive)))
+
+
+def _estimated_bytes(drive: Drive) -> tuple[float, float]:
+    """Bytes of the page without frames, and with all, from a few frames and the sizes of all clouds."""
+    with SpooledTemporaryFile() as blobs:
+        _write_slots(blobs, drive)
+        size = fixed = float(blobs.tell())
+        for number, scanner in enumerate(drive.scanners):
+            clouds = np.array([drive.cloud(scanner, k).stat().st_size for k in range(len(scanner.rows))])
+            few, before = _few(len(clouds)), blobs.tell()
+            for k in few:
+                write_blob(blobs, "sweep", data=drive.sweep(k, scanner=number)[1])
+            size += (blobs.tell() - before) * clouds.sum() / max(clouds[few].sum(), 1)
+        for number, camera in enumerate(drive.cameras):
+            few, before = _few(len(camera.frame)), blobs.tell()
+            for k in few:
+                for kind in camera.kinds:
+                    write_blob(blobs, "image", data=drive.image(number, k, kind=kind))
+            size += (blobs.tell() - before) * len(camera.frame) / len(few)
+    return fixed, size
+
+
+def _few(count: int) -> list[int]:
+    """Numbers of a few frames, spread over all."""
+    few: list[int] = np.unique(np.linspace(0, count - 1, _LOOKED_AT).astype(int)).tolist()
+    return few
 
 
 def write_player(
@@ -146,13 +204,15 @@ def _left_out(drive: Drive) -> list[str]:
     return notes
 
 
-def _too_large(drive: Drive, options: PlaybackOptions, *, done: int, size: int) -> str:
-    """Error text: how large the page would be, and a selection of frames that would fit."""
+def _too_large(drive: Drive, options: PlaybackOptions, *, fixed: float, size: float) -> str:
+    """Error text: how many bytes the page would have, and a selection of frames that would fit.
+
+    fixed : bytes of it without frames
+    """
     limit = options.max_mb
-    whole = size / done * len(drive) / 1e6
-    fits = max(1, int(0.9 * limit * 1e6 / size * done))
-    message = f"the page would have about {max(whole, 1.01 * limit):.3g} MB and `max_mb` is {limit:g}"
-    every = options.every * -(-len(drive) // fits)
+    fits = max(1, int((_FILLED * limit * 1e6 - fixed) / max(size - fixed, 1.0) * len(drive)))
+    message = f"the page would have about {size / 1e6:.3g} MB and `max_mb` is {limit:g}"
+    every = (options.every or 1) * -(-len(drive) // fits)
     frames = drive.clouds.frames[drive.rows]
     end = int(frames[min(fits, len(frames) - 1)])
     return (

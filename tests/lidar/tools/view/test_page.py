@@ -146,14 +146,35 @@ def test_of_several_scanners_the_nearest_sweeps_are_shown_together(town_drive, t
     assert not any("lidar_front" in note for note in summary.notes)
 
 
-def test_a_page_that_would_be_too_large_names_a_selection_that_fits(town_drive, tmp_path):
+def test_of_a_drive_that_is_too_large_each_nth_frame_is_shown(town_drive, tmp_path):
+    data, out = open_dataset(town_drive), tmp_path / "page.html"
+    whole = view_drive(data, out)
+    assert not any("one frame of" in note for note in whole.notes)
+    limit = 0.6 * whole.bytes / 1e6
+    some = view_drive(data, out, options=PlaybackOptions(max_mb=limit), overwrite=True)
+    assert some.bytes < 1e6 * limit + 2e5  # the player itself
+    assert 1 <= some.frames < whole.frames
+    (note,) = [note for note in some.notes if note.startswith("one frame of")]
+    every = int(note.split()[3].rstrip(":"))
+    assert some.frames == -(-whole.frames // every)
+    size = float(re.search(r"about ([\d.]+) MB", note)[1])
+    assert size == pytest.approx(whole.bytes / 1e6, abs=0.2)
+
+
+def test_a_page_that_would_be_too_large_names_a_selection_that_fits(town_drive, tmp_path, monkeypatch):
+    """It is refused before anything is packed."""
     out = tmp_path / "page.html"
+    monkeypatch.setattr("lidar.tools.view.page.write_player", None)
     with pytest.raises(InputError, match="would have about") as caught:
-        view_drive(open_dataset(town_drive), out, options=PlaybackOptions(max_mb=0.3))
+        view_drive(open_dataset(town_drive), out, options=PlaybackOptions(max_mb=0.3, every=1))
     assert list(tmp_path.iterdir()) == []
+    monkeypatch.undo()
     every = int(re.search(r"`every` (\d+)", str(caught.value))[1])
     frames = re.search(r"`frames` (\d+:\d+)", str(caught.value))[1]
-    for options in (PlaybackOptions(max_mb=0.3, every=every), PlaybackOptions(max_mb=0.3, frames=frames)):
+    for options in (
+        PlaybackOptions(max_mb=0.3, every=every),
+        PlaybackOptions(max_mb=0.3, frames=frames, every=1),
+    ):
         assert view_drive(open_dataset(town_drive), out, options=options, overwrite=True).frames >= 1
 
 
