@@ -19,6 +19,8 @@ from lidar.errors import InputError
 P = TypeVar("P")
 T = TypeVar("T", bool, int, float, str)
 
+_ENDLESS = ("unlimited", "never")
+"""Words for infinity in texts, besides inf."""
 _SWITCH = {"on": True, "yes": True, "true": True, "1": True}
 _SWITCH |= {"off": False, "no": False, "false": False, "0": False}
 
@@ -30,7 +32,7 @@ def parameter(
     unit: str = "",
     low: float = -inf,
     high: float = inf,
-    endless: bool = False,
+    endless: str = "",
     among: tuple[str, ...] = (),
 ) -> T:
     """A field of a dataclass whose value users choose; its type is that of its default.
@@ -38,7 +40,7 @@ def parameter(
     meaning   : one line
     unit      : of a number; empty for counts, shares and factors
     low, high : bounds of a number, both allowed
-    endless   : infinity is allowed, too
+    endless   : word for infinity, such as never or unlimited; infinity is not allowed if empty
     among     : allowed words of a text; any if empty
     """
     declared = {"meaning": meaning, "unit": unit, "low": low, "high": high}
@@ -55,13 +57,18 @@ def parameter_rows(kind: type[Any]) -> list[dict[str, Any]]:
     return [
         {
             "name": f.name,
-            "default": f.default,
+            "default": shown_value(f, f.default),
             **{end: f.metadata[end] for end in ("low", "high") if isfinite(f.metadata[end])},
             **{key: f.metadata[key] for key in ("among", "unit") if f.metadata[key]},
             "meaning": f.metadata["meaning"],
         }
         for f in parameters_of(kind)
     ]
+
+
+def shown_value(declared: Field[Any], value: Any) -> Any:
+    """The value of a parameter for listings: infinity as its word."""
+    return declared.metadata["endless"] if value == inf else value
 
 
 def describe(row: Mapping[str, Any]) -> str:
@@ -140,7 +147,8 @@ def _within(bounds: Mapping[str, Any]) -> str:
     if isfinite(high):
         return f" within {low:g} to {high:g}{unit}"
     if isfinite(low):
-        return f" at least {low:g}{unit}" + (", or inf" if bounds["endless"] else " and finite")
+        more = f", or {bounds['endless']}" if bounds["endless"] else " and finite"
+        return f" at least {low:g}{unit}{more}"
     return ""
 
 
@@ -181,6 +189,8 @@ def _value(text: str, kind: type) -> Any:
     """A text as a value of a type; the text itself if it is none."""
     if kind is bool:
         return _SWITCH.get(text.lower(), text)
+    if kind is float and text.lower() in _ENDLESS:
+        return inf
     try:
         return kind(text)
     except ValueError:

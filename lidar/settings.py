@@ -10,7 +10,14 @@ from geoscene.support.registry import unknown_name
 from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
 from lidar.dataset.formats.table import MOMENTS
 from lidar.errors import InputError
-from lidar.parameters import describe, parameter_rows, read_values, value_text
+from lidar.parameters import (
+    describe,
+    parameter_rows,
+    parameters_of,
+    read_values,
+    shown_value,
+    value_text,
+)
 from lidar.sensors.camera import settings as camera_settings
 from lidar.sensors.camera.settings import PLAIN as PLAIN_CAMERA
 from lidar.sensors.camera.settings import CameraSettings
@@ -74,8 +81,9 @@ def setting_rows() -> list[dict[str, str]]:
     at_levels = [_at(level) for level in levels()]
     found = []
     for of, groups in zip(_OF, zip(*at_levels, strict=True), strict=True):
-        for row in parameter_rows(type(groups[0])):
-            values = [value_text(getattr(group, row["name"])) for group in groups]
+        kind = type(groups[0])
+        for row, declared in zip(parameter_rows(kind), parameters_of(kind), strict=True):
+            values = [value_text(shown_value(declared, getattr(group, row["name"]))) for group in groups]
             at = dict(zip(levels(), values, strict=True))
             found.append(
                 {"name": row["name"], "of": of, **at, "unit": row.get("unit", ""), "meaning": describe(row)}

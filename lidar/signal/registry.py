@@ -91,7 +91,7 @@ class NamedStage:
         extra = {"seed": self.seed, "sensor": self.sensor}
         return {
             "name": self.name,
-            **asdict(self.stage),
+            **{k: "never" if v == math.inf else v for k, v in asdict(self.stage).items()},  # JSON has no inf
             **{k: v for k, v in extra.items() if v not in (None, "")},
         }
 

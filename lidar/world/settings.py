@@ -40,11 +40,11 @@ class WorldSettings:
     )
     reach: float = parameter(
         inf,
-        "distance from the vehicle beyond which no tiles are loaded and nothing is hit; inf: the sensors'"
-        " maximum range",
+        "distance from the vehicle beyond which no tiles are loaded and nothing is hit; unlimited: the"
+        " sensors' maximum range",
         unit="m",
         low=1e-3,
-        endless=True,
+        endless="unlimited",
     )
     forests: bool = parameter(default=True, meaning="the trees of forests")
     trees: bool = parameter(default=True, meaning="single trees and those of rows")

@@ -33,7 +33,7 @@ class Fog(Parameters):
     """A thing with a parameter of each kind."""
 
     share: float = parameter(0.5, "share", low=0, high=1)
-    sight: float = parameter(50.0, "visibility", unit="m", low=1, endless=True)
+    sight: float = parameter(50.0, "visibility", unit="m", low=1, endless="unlimited")
     shift: float = parameter(0.0, "shift", unit="m")
     count: int = parameter(3, "count", low=1, high=9)
     lit: bool = parameter(default=True, meaning="lit")
@@ -122,7 +122,7 @@ def test_tables_of_a_file_say_the_same_as_texts(tmp_path):
         ("fog:shar=1", "thing fog: parameter 'shar' is unknown; is share meant? (known are share, sight"),
         ("fog:share=2", "share = 2 is not within 0 to 1"),
         ("fog:share=nan", "share = nan is not within 0 to 1"),
-        ("fog:sight=0", "sight = 0 is not at least 1 m, or inf"),
+        ("fog:sight=0", "sight = 0 is not at least 1 m, or unlimited"),
         ("fog:shift=inf", "shift = inf is not a finite number"),
         ("fog:count=2.5", "count = '2.5' is not a whole number within 1 to 9"),
         ("fog:lit=maybe", "lit = 'maybe' is not on or off"),
@@ -140,6 +140,16 @@ def test_values_of_another_type_are_refused():
         with pytest.raises(InputError):
             Fog(**values)
     assert Fog(share=1, sight=float("inf")).share == 1
+
+
+@pytest.mark.parametrize("word", ["unlimited", "never", "Unlimited", "inf"])
+def test_infinity_has_words_where_it_is_allowed(word):
+    (fog,) = (build(THINGS, item) for item in split_items(f"fog:sight={word}", THINGS))
+    assert fog.sight == float("inf")
+    (row,) = (row for row in parameter_rows(type(Fog(sight=1.0))) if row["name"] == "sight")
+    assert row["default"] == 50.0
+    with pytest.raises(InputError, match="share"):
+        [build(THINGS, item) for item in split_items(f"fog:share={word}", THINGS)]
 
 
 WORDS = (

@@ -70,7 +70,7 @@ def test_a_setting_that_scanners_and_cameras_share_changes_both():
         ("standard", [("poses", "colum")], "is none of firing, column, frame; is column meant?"),
         ("standard", [("precision", "half")], "is none of exact, refined, float32"),
         ("standard", [("origin", "far")], "is none of near, scene"),
-        ("standard", [("reach", "0")], "reach = 0 is not at least 0.001 m, or inf"),
+        ("standard", [("reach", "0")], "reach = 0 is not at least 0.001 m, or unlimited"),
         ("standard", [("reach", "nan")], "reach = nan is not at least 0.001 m"),
         ("standard", [("daylight_lux", "20000")], "no effect without detection or false_alarms"),
         ("survey", [("stretch", "on")], "no effect with rays=19"),

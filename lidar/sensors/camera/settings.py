@@ -37,10 +37,10 @@ class CameraSettings:
     )
     haze: float = parameter(
         20_000.0,
-        "distance at which haze removes 98 % of contrast; inf for clear air",
+        "distance at which haze removes 98 % of contrast; unlimited: clear air",
         unit="m",
         low=1e-3,
-        endless=True,
+        endless="unlimited",
     )
     cloud: float = parameter(
         0.0, "share of the sky that clouds cover; overcast light casts no shadows", low=0, high=1

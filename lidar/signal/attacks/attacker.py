@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import cast
 
@@ -116,7 +117,9 @@ class Attacker(Stage):
     )
     reach: float = parameter(110.0, "greatest distance from the sensor", unit="m", low=0.5, high=500)
     start: float = parameter(0.0, "time since the drive's start from which it attacks", unit="s", low=0)
-    stop: float = parameter(1e9, "time since the drive's start until which it attacks", unit="s", low=0)
+    stop: float = parameter(
+        inf, "time since the drive's start until which it attacks", unit="s", low=0, endless="never"
+    )
 
     def __post_init__(self) -> None:
         """Validate the parameters, also against the device's limits."""

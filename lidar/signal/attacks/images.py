@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,9 @@ class CameraBlind(Stage):
     up: float = parameter(0.0, "angle above it", unit="degrees", low=-90, high=90)
     tint: str = parameter("white", "colour", among=(*_TINTS,))
     start: float = parameter(0.0, "time since the drive's start from which it shines", unit="s", low=0)
-    stop: float = parameter(1e9, "time since the drive's start until which it shines", unit="s", low=0)
+    stop: float = parameter(
+        inf, "time since the drive's start until which it shines", unit="s", low=0, endless="never"
+    )
 
     def image(self, frame: CameraImage, *, at: Situation, rng: np.random.Generator) -> CameraImage:
         """The frame with the light added."""
@@ -93,7 +96,9 @@ class Patch(Stage):
     up: float = parameter(0.0, "without place: height above it", unit="m", low=-500, high=500)
     wide: float = parameter(1.0, "in the world: its width", unit="m", low=0.01, high=100)
     start: float = parameter(0.0, "time since the drive's start from which it is there", unit="s", low=0)
-    stop: float = parameter(1e9, "time since the drive's start until which it is there", unit="s", low=0)
+    stop: float = parameter(
+        inf, "time since the drive's start until which it is there", unit="s", low=0, endless="never"
+    )
 
     def __post_init__(self) -> None:
         """Validate the parameters; the picture must be readable."""

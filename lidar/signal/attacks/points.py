@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,9 @@ class Tampering(Stage):
 
     points: int = parameter(0, "most returns a frame, drawn at random; 0: all", low=0, high=10_000_000)
     start: float = parameter(0.0, "time since the drive's start from which data are changed", unit="s", low=0)
-    stop: float = parameter(1e9, "time since the drive's start until which data are changed", unit="s", low=0)
+    stop: float = parameter(
+        inf, "time since the drive's start until which data are changed", unit="s", low=0, endless="never"
+    )
 
     def is_on(self, at: Situation) -> bool:
         """Whether data of a frame are changed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
@@ -35,7 +36,9 @@ class GnssSpoof(Stage):
     ramp: float = parameter(
         20.0, "time until the whole offset is reached; not of a step", unit="s", low=0.1, high=1e6
     )
-    stop: float = parameter(1e9, "time since the drive's start at which it ends at once", unit="s", low=0)
+    stop: float = parameter(
+        inf, "time since the drive's start at which it ends at once", unit="s", low=0, endless="never"
+    )
 
     def fixes(self, fixes: Fixes, *, at: Situation, rng: np.random.Generator) -> Fixes:
         """The fixes with the offset."""

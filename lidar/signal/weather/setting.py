@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 from geoscene.support.registry import unknown_name
@@ -15,9 +15,6 @@ from lidar.signal.registry import STAGES, NamedStage, number_stages
 from lidar.signal.stage import POSES, ROAD_USERS, Stage
 
 _TEXTURE = 1.2  # mm of water that fill the texture of a road (Hahner et al. 2022)
-
-FOREVER = 1e9
-"""Seconds; the default end of weather."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +85,8 @@ class WeatherSetting(Stage):
         10.0, "rain and snow: mm/h (as water); fog and dust: visibility, m; spray: mm of water on the road"
     )
     amount_to: float = parameter(-1.0, "amount at the end, approached linearly; -1: amount, all the time")
-    start: float = parameter(0.0, "begin, since the drive's start", unit="s", low=0, high=FOREVER)
-    end: float = parameter(FOREVER, "end, since the drive's start", unit="s", low=0, high=FOREVER)
+    start: float = parameter(0.0, "begin, since the drive's start", unit="s", low=0)
+    end: float = parameter(inf, "end, since the drive's start", unit="s", low=0, endless="never")
     model: str = parameter("physical", "model of what lasers measure", among=tuple(MODELS))
     medium: str = parameter("", "law of extinction and sizes of the particles; of the kind if empty")
     longitude: float = parameter(0.0, "centre of the place, with radius", unit="degrees", low=-180, high=180)
@@ -154,7 +151,7 @@ class WeatherSetting(Stage):
         """Road users for spray, poses and time for weather over time and place, plumes and the sun."""
         if self.kind == "spray":
             return (ROAD_USERS, POSES)
-        passing = self.start > 0 or self.end < FOREVER
+        passing = self.start > 0 or self.end < inf
         placed = self.radius or self.polygon or self.sunlight or self.medium == "plumes"
         return (POSES,) if passing or placed else ()
 
@@ -197,7 +194,7 @@ def _faults(setting: WeatherSetting, kind: WeatherKind) -> list[str]:
         faults.append(f"model {setting.model} has no {setting.kind}; {setting.kind} has {', '.join(known)}")
     if setting.end <= setting.start:
         faults.append(f"end = {setting.end:g} is not after start = {setting.start:g}")
-    if setting.amount_to >= 0 and setting.end == FOREVER:
+    if setting.amount_to >= 0 and setting.end == inf:
         faults.append("amount_to needs an end")
     if setting.polygon and setting.radius:
         faults.append("a place is a polygon or a centre with radius, not both")
