@@ -121,7 +121,7 @@ def drive(
                 progress=progress,
                 live=shown_live,
             )
-        limits = open_dataset(folder).manifest["limits"]
+        manifest = open_dataset(folder).manifest
     summary = done.summary
     document: dict[str, Any] = {
         "path": shown(out),
@@ -155,9 +155,15 @@ def drive(
             print(reached)
     for missed in done.missed():
         print(f"lidar: {missed}", file=sys.stderr)
-    for limit in limits:
+    for limit in manifest["limits"]:
         print(f"lidar: {limit['advice']}", file=sys.stderr)
-    for name in (name for name, points in summary.points.items() if not points):
+    if empty := [name for name, count in manifest["sensor_frames"].items() if not count]:
+        print(
+            f"lidar: {', '.join(empty)}: no frame ends within {summary.duration:g} s, so nothing is recorded;"
+            " drive longer, or set a higher rate_hz",
+            file=sys.stderr,
+        )
+    for name in (name for name, points in summary.points.items() if not points and name not in empty):
         print(
             f"lidar: {name} has no returns in the whole drive; check its mount and maximum range",
             file=sys.stderr,

@@ -37,10 +37,11 @@ from geoscene.geometry.frames import Frame
 from geoscene.support.digests import digest
 from geoscene.support.files import delete_leftovers, write_json
 from geoscene.support.option_values import brief, listed
+from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import Previewed
 from geoscene.support.storage import StoredFolder, cache_folder, url_of
 from geoscene.typing import Ints
-from lidar.dataset.checksums import CHECKSUMS
+from lidar.dataset.checksums import CHECKSUMS, differences, read_checksums
 from lidar.dataset.formats import Format
 from lidar.errors import DatasetError, InputError, LidarError
 from lidar.geometry.poses import Trajectory
@@ -289,10 +290,11 @@ def open_dataset(path: DatasetLike) -> Dataset:
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
     with reading_file(manifest_path):
         manifest = json.loads(manifest_path.read_text("utf-8"))
-        if manifest["schema"] != SCHEMA:
-            raise DatasetError(
-                f"{folder}: schema version {manifest['schema']}, this program reads {SCHEMA}; drive again"
-            )
+        schema = manifest["schema"]
+        if schema != SCHEMA:
+            newer = isinstance(schema, int) and schema > SCHEMA
+            remedy = "a newer version wrote it: upgrade this program" if newer else "drive again"
+            raise DatasetError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; {remedy}")
         dataset = Dataset(folder, manifest, stored)
         _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
         _ = dataset.scene_path
@@ -405,8 +407,7 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         return 0
     manifest = open_dataset(path).manifest
     old, new = manifest["recipe"], json.loads(json.dumps(recipe))
-    changed = [k for k in old | new if old.get(k) != new.get(k)]
-    if changed:
+    if changed := _changed(old, new):
         changes = ", ".join(f"{k} {_text(old.get(k))} (now {_text(new.get(k))})" for k in changed)
         raise DatasetError(
             f"{path}: holds a drive made with other options: {changes};"
@@ -414,6 +415,29 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         )
     delete_leftovers(path)
     return int(manifest["frames_done"])
+
+
+def _changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Names of options that differ between recipes, as JSON gives them."""
+    return [key for key in {**old, **new} if old.get(key) != new.get(key)]
+
+
+def finished(path: Path, recipe: Mapping[str, Any], *, progress: Progress = silent) -> Dataset | None:
+    """The dataset of a finished drive made by ``recipe`` if all its files are as they were written."""
+    paths = Paths(path)
+    if not (paths.manifest.is_file() and paths.checksums.is_file()):
+        return None
+    dataset = open_dataset(path)
+    manifest = dataset.manifest
+    if not manifest["frames_done"] == manifest["frames"] > 0 or _changed(
+        manifest["recipe"], json.loads(json.dumps(recipe))
+    ):
+        return None
+    own = own_files(path)
+    for found in differences(path, read_checksums(paths.checksums), progress=progress):
+        if found.what != "added" or own(found.name):
+            return None
+    return dataset
 
 
 def remove_dataset(path: Path) -> None:

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from geoscene.support.option_values import expect
 from geoscene.support.progress import Aside, Progress, displayed, shows_progress
 from lidar.dataset.checksums import write_checksums
 from lidar.dataset.journal import Journal, frame_digest, read_journal
-from lidar.dataset.layout import Paths, own_files, prepare, remove_dataset
+from lidar.dataset.layout import Paths, finished, own_files, prepare, remove_dataset
 from lidar.errors import InputError, LidarError
 from lidar.geometry.trajectory_files import write_trajectory
 from lidar.options import DriveOptions
@@ -112,6 +112,12 @@ def drive(
     if live is not None and options.scheduler:
         raise InputError("`live` shows frames that this machine records; leave out `scheduler`")
     began, out = time.perf_counter(), Path(out)
+    if (
+        check is None
+        and not overwrite
+        and (before := _finished(scene, out, options=options, progress=progress))
+    ):
+        return replace(before, wall=time.perf_counter() - began)
     with (
         install_listener("numba:compile", _CompilationProgress(progress)),
         connect(options.scheduler) if options.scheduler else nullcontext() as cluster,
@@ -166,6 +172,30 @@ def drive(
         recording=recording_s,
         stages=recording.watch.seconds,
         effects=recording.settings.stages.effects(recording.effects.counts),
+    )
+
+
+def _finished(scene: Scene, out: Path, *, options: DriveOptions, progress: Progress) -> DriveSummary | None:
+    """The summary of a drive that is finished already, without planning it again; None if it is not."""
+    if not Paths(out).manifest.is_file():
+        return None
+    with exclusive(out):
+        dataset = finished(out, options.recipe(scene), progress=progress)
+    if dataset is None:
+        return None
+    manifest = dataset.manifest
+    return DriveSummary(
+        out,
+        int(manifest["frames"]),
+        sum(manifest["sensor_frames"].values()),
+        manifest["points"],
+        written=0,
+        duration=manifest["duration_ns"] / 1e9,
+        length=float(manifest["length_m"]),
+        wall=0.0,
+        planning=0.0,
+        recording=0.0,
+        stages={},
     )
 
 

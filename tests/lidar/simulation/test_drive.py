@@ -321,6 +321,26 @@ def test_a_resumed_drive_makes_damaged_frames_anew(scene, dataset, damage, tmp_p
     assert digest(tmp_path / "again") == digest(dataset.path)
 
 
+def test_a_finished_drive_is_not_planned_again(scene, dataset, tmp_path, monkeypatch):
+    out = tmp_path / "again"
+    shutil.copytree(dataset.path, out)
+    (out / "notes.txt").write_text("mine")
+    planned = []
+    monkeypatch.setattr("lidar.simulation.drive.plan_drive", lambda *_, **__: planned.append(1))
+    found = drive(scene, out, options=PLAIN)
+    manifest = dataset.manifest
+    assert not planned
+    assert (found.frames, found.written) == (manifest["frames"], 0)
+    assert found.points == manifest["points"]
+    assert found.resumed == sum(manifest["sensor_frames"].values())
+    assert (found.duration, found.length) == (manifest["duration_ns"] / 1e9, manifest["length_m"])
+    with pytest.raises(AttributeError):  # what is planned is None here
+        drive(scene, out, options=PLAIN, overwrite=True)
+    (out / "poses.csv").write_text("")
+    with pytest.raises(AttributeError):
+        drive(scene, out, options=PLAIN)
+
+
 def test_a_replaced_dataset_keeps_the_files_of_others(dataset, tmp_path, caplog):
     copy = tmp_path / "again"
     shutil.copytree(dataset.path, copy)
