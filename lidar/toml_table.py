@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from geoscene.support.registry import nearest, unknown_name
+from geoscene.support.registry import hint, nearest, unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import RigError
 
@@ -193,6 +193,13 @@ def built_in_names(package: str, folder: str) -> list[str]:
     return sorted(f.name.removesuffix(".toml") for f in files if f.name.endswith(".toml"))
 
 
+def unknown_built_in(what: str, name: str, *, names: Collection[str]) -> str:
+    """The message for a name that is neither built in nor that of a TOML file."""
+    return (
+        f"{what} {name!r} is not known{hint(name, names)} ({', '.join(names)}, or the path of a .toml file)"
+    )
+
+
 def read_named_table(name: str | Path, *, what: str, package: str, folder: str) -> Table:
     """The root table of a TOML file, or of a built-in one by its name.
 
@@ -200,11 +207,12 @@ def read_named_table(name: str | Path, *, what: str, package: str, folder: str) 
 
     Raises RigError as `read_table`, and for a name that is neither.
     """
-    known = ", ".join(built_in_names(package, folder))
+    names = built_in_names(package, folder)
+    known = ", ".join(names)
     if str(name).endswith(".toml"):
         if not Path(name).is_file():
             raise RigError(f"{name}: no such {what} file; built-in ones are {known}")
         return read_table(Path(name))
-    if str(name) not in known.split(", "):
-        raise RigError(f"{what} {str(name)!r} is not known: {known}, or the path of a .toml file")
+    if str(name) not in names:
+        raise RigError(unknown_built_in(what, str(name), names=names))
     return read_table(resources.files(package) / folder / f"{name}.toml", name=f"{folder}/{name}.toml")

@@ -25,6 +25,8 @@ HEADING_REACH = 5.0
 """Scene metres over which the heading of a street at a junction is taken."""
 _NEAR_MAP = 10_000.0
 """Scene metres from the graph to places that are meant to lie in it."""
+_SHOWN = 100
+"""Most letters of a list of columns that a message shows."""
 SWAPPED = "latitude and longitude look swapped: write LAT,LON"
 """What to do about places that `looks_swapped` finds."""
 _U_TURN = np.radians(150.0)
@@ -392,7 +394,10 @@ def _read_lonlat(path: Path) -> Float:
         points = read_track(path)[:, :2]
     else:
         with reading(path, InputError, remedy="give a CSV file with columns lon and lat"):
-            rows = list(csv.DictReader(path.read_text("utf-8", errors="replace").splitlines()))
+            rows = csv.DictReader(path.read_text("utf-8-sig", errors="replace").splitlines())
+            if missing := [name for name in ("lon", "lat") if name not in (rows.fieldnames or ())]:
+                has = ", ".join(rows.fieldnames or ())[:_SHOWN] or "no columns"
+                raise InputError(f"{path}: has {has}; no {' and no '.join(missing)}")
             points = np.array([(float(row["lon"]), float(row["lat"])) for row in rows])
     if not len(points):
         raise InputError(f"{path}: holds no points")

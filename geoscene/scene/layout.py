@@ -423,8 +423,10 @@ def open_scene(path: SceneLike) -> Scene:
         manifest = json.loads(manifest_file.read_text("utf-8"))
         schema = manifest["schema"]
         if schema != SCHEMA:
+            newer = isinstance(schema, int) and schema > SCHEMA
+            remedy = "a newer version wrote it: upgrade this program" if newer else "build the scene again"
             raise SceneFormatError(
-                f"{folder}: schema version {schema}, this program reads {SCHEMA}; build the scene again"
+                f"{folder}: schema version {schema}, this program reads {SCHEMA}; {remedy}"
             )
         if manifest.get("digest") != manifest_digest(manifest):
             raise SceneFormatError(f"{manifest_file}: {DIFFERS}")

@@ -15,9 +15,10 @@ from lidar.geometry.attitude import OPTICAL_QUAT, Mount, quat_from_euler, quat_p
 from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.sensors.rig.names import folded, name_fault
 from lidar.sensors.rig.scanner import MOST_CODE_BITS, MOST_JITTER_NS
-from lidar.toml_table import Table, built_in_names, read_named_table
+from lidar.toml_table import Table, built_in_names, read_named_table, unknown_built_in
 
 _BUILT_IN = {"package": "lidar.sensors.rig", "folder": "rigs"}
+_SCANNERS = {"package": "lidar.sensors.rig", "folder": "sensors"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +185,8 @@ def _mount(table: Table, *, camera: bool = False) -> Mount:
 
 def _lidar(table: Table, folder: Path) -> LidarSpec:
     preset = table.text("preset")
+    if not preset.endswith(".toml") and preset not in (known := built_in_names(**_SCANNERS)):
+        raise table.error("preset", unknown_built_in("sensor", preset, names=known))
     rate_hz = table.number("rate_hz", 0.0, low=0.0, high=1e4)
     if 0 < rate_hz < SLOWEST_HZ:
         raise table.error("rate_hz", f"{rate_hz:g} is under {SLOWEST_HZ:g}")

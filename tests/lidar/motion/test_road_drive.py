@@ -2,7 +2,9 @@
 
 import pytest
 
+from geoscene.errors import InputError
 from geoscene.pipeline.build import build
+from geoscene.roadgraph.routing import route_line
 from geoscene.sources import read_osm
 from lidar.errors import RouteError
 from lidar.motion.road_drive import RoadDriveOptions, plan_road_drive
@@ -49,3 +51,23 @@ def scene(tmp_path_factory):
 def test_a_waypoint_on_a_road_that_cannot_be_driven_says_why(scene, place, says):
     with pytest.raises(RouteError, match=rf"waypoint 2 .* m from the nearest drivable street.*{says}"):
         plan_road_drive(scene, [lat_lon(50, 0), lat_lon(*place)], options=RoadDriveOptions("car"))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("a,b\n1,2\n", "has a, b; no lon and no lat"),
+        ("lon,b\n1,2\n", "has lon, b; no lat"),
+        ("", "has no columns"),
+    ],
+)
+def test_a_table_without_places_says_which_columns_it_lacks(scene, tmp_path, text, says):
+    (tmp_path / "w.csv").write_text(text)
+    with pytest.raises(InputError, match=says):
+        route_line([str(tmp_path / "w.csv")], scene.road_graph(), frame=scene.frame)
+
+
+def test_waypoints_to_build_along_say_that_they_look_swapped(scene):
+    words = [f"{lon},{lat}" for lat, lon in (lat_lon(50, 0), lat_lon(150, 0))]
+    with pytest.raises(InputError, match=r"m from the nearest road; at most 100; .* look swapped"):
+        route_line(words, scene.road_graph(), frame=scene.frame)

@@ -24,6 +24,17 @@ def test_all_rigs_load_and_their_sensors_too():
             load_sensor(spec.preset, name=spec.name, rate_hz=spec.rate_hz, return_mode=spec.return_mode)
 
 
+def test_a_preset_that_is_unknown_is_named_with_its_line_and_what_is_meant(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        'name = "mine"\n[[lidar]]\nname = "top"\npreset = "vlp61"\ntranslation = [0.0, 0.0, 1.9]\n'
+    )
+    with pytest.raises(
+        RigError, match=r"mine.toml, line 4: lidar.preset: sensor 'vlp61' .*; is vlp16 meant\?"
+    ):
+        load_rig(path)
+
+
 def test_the_seed_rig_matches_the_paper():
     rig = load_rig("seed")
     roof, front = rig.lidars
