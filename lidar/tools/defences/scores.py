@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from geoscene.typing import Float
 from lidar.dataset.layout import reading_file
 from lidar.errors import DatasetError
 from lidar.sensors.physics.origin import Origin
-from lidar.signal.registry import ATTACKS, acts_on
+from lidar.signal.registry import ATTACKS, acts_on, read_stage
 from lidar.tools.defences.observation import Observation, RecordedScans
 
 LEVELS = ("returns", "objects", "frames")
@@ -68,10 +69,16 @@ def attack_truth(scans: RecordedScans, frame: Observation) -> FrameTruth:
         goes_on = any(
             table["name"] in ATTACKS
             and acts_on(table, scans.sensor.name, kind="lidar")
-            and table["start"] <= frame.start_ns * 1e-9 < table["stop"]
+            and _is_on(table, frame.start_ns * 1e-9)
             for table in stages
         )
     return truth if goes_on else replace(truth, removed_xyz=truth.removed_xyz[:0])
+
+
+def _is_on(table: Mapping[str, Any], seconds: float) -> bool:
+    """Whether an attack, as `NamedStage.to_json` writes it, goes on at a time since the drive's start."""
+    stage = read_stage(table).stage
+    return bool(getattr(stage, "start", 0.0) <= seconds < getattr(stage, "stop", math.inf))
 
 
 def frame_truth(scans: RecordedScans, frame: Observation) -> FrameTruth:

@@ -823,7 +823,8 @@ def test_a_sensor_without_returns_is_reported(scene, tmp_path):
 def test_a_sensor_that_is_too_slow_for_a_drive_is_named(scene, tmp_path):
     rig = [
         'name = "slow"\n[[lidar]]\nname = "top"\npreset = "vlp16"\ntranslation = [1.2, 0.0, 1.9]',
-        '[[camera]]\nname = "rare"\nrate_hz = 1.0\nwidth = 16\nheight = 16\ntranslation = [1.2, 0.0, 2.9]',
+        '[[camera]]\nname = "rare"\nrate_hz = 1.0\nfov_deg = 90.0\nwidth = 16\nheight = 16',
+        "translation = [1.2, 0.0, 2.9]",
     ]
     (tmp_path / "slow.toml").write_text("\n".join(rig))
     words = ["--rig", tmp_path / "slow.toml", "--route", "random", "--duration", "0.2", "--format", "pcd"]

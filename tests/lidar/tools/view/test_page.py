@@ -89,7 +89,7 @@ def test_the_page_has_every_frame_image_and_road_user(town_drive, page):
 def test_a_sweep_of_a_scanner_that_repeats_its_pattern_needs_little_more_than_ranges(page):
     blobs, _ = elements(page.path)
     size = sum(len(data) for name, data in blobs.items() if name.startswith("sweep-"))
-    assert 8 * size / page.returns < 14  # bits, with snow; its file has 41 bytes
+    assert 8 * size / page.returns < 18  # bits, with snow; its file has 41 bytes
 
 
 def test_equal_drives_give_equal_pages(town_drive, page, tmp_path):
