@@ -71,7 +71,7 @@ def map_(
         counts |= {"frames": summary.frames, "missing_frames": summary.missing}
         counts |= {"poses": asdict(summary.poses) if summary.poses else None}
         counts |= {"beside": [str(path) for path in summary.beside]}
-        counts |= {"distances": [asdict(row) for row in summary.distances]}
+        counts |= {"distances": [asdict(row) for row in summary.distances], "notes": summary.notes}
         print_json({"path": str(out), **counts})
     else:
         left = [f"{n:,} of {_LEFT_OUT.get(name, f'--{name}')}" for name, n in summary.left_out.items() if n]
@@ -90,6 +90,8 @@ def map_(
                 f"  median {1000 * row.median_m:8.1f} mm  95 % {1000 * row.p95_m:8.1f} mm"
                 + (f"  farther than {LIMIT:g} m: {row.beyond / row.points:.1%}" if row.beyond else "")
             )
+        for note in summary.notes:
+            print(f"  {note}")
         if summary.beside:
             print(f"also written: {', '.join(map(str, summary.beside))}")
     if summary.missing:

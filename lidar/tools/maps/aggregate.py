@@ -24,7 +24,7 @@ from lidar.dataset.layout import Dataset, DatasetLike, open_dataset, own_files
 from lidar.errors import InputError
 from lidar.options import MapOptions
 from lidar.tools.maps.colors import ImageColors, distinct, ramp
-from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances
+from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances, far_reasons
 from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.source import (
     COLUMNS,
@@ -55,6 +55,7 @@ class MapSummary:
     beside    : further files: rasters, and those of comparisons
     distances : to the surfaces of the scene that the map was compared with
     poses     : errors of the poses of a file; None for true ones
+    notes     : why distances are large, one line each
     """
 
     points_in: int
@@ -66,6 +67,7 @@ class MapSummary:
     beside: list[Path]
     distances: list[SurfaceDistances]
     poses: PoseErrors | None
+    notes: tuple[str, ...] = ()
 
     def _repr_png_(self) -> bytes | None:
         """A picture from above in the map's colours, for notebooks; None if empty, very large or in tiles."""
@@ -132,9 +134,10 @@ def aggregate(
     outliers = Outliers(*options.outliers) if options.outliers else None
     if outliers:
         stream = outliers.without(stream, out=out, offset=source.geo.offset)
-    comparison = None
+    compared = comparison = None
     if options.compare is not None:
-        comparison = SurfaceComparison(open_scene(options.compare), dataset.frame, crs=dataset.crs)
+        compared = open_scene(options.compare)
+        comparison = SurfaceComparison(compared, dataset.frame, crs=dataset.crs)
         stream = comparison.measured(stream)
     rasters = Rasters(options.raster, options.resolution)
     if options.raster:
@@ -152,6 +155,7 @@ def aggregate(
         if trajectory is not None:
             beside.append(named.with_suffix(".tum"))
             write_poses(beside[-1], trajectory, dataset=dataset)
+    distances = comparison.rows() if comparison else []
     return MapSummary(
         read.points,
         written,
@@ -162,8 +166,9 @@ def aggregate(
         beside=beside
         if options.tiles is None
         else [out / name for name in (INDEX, *(p.name for p in beside))],
-        distances=comparison.rows() if comparison else [],
+        distances=distances,
         poses=pose_errors(trajectory, dataset.trajectory()) if trajectory is not None else None,
+        notes=tuple(far_reasons(dataset, compared, rows=distances)) if compared is not None else (),
     )
 
 

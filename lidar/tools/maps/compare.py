@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import NamedTuple
@@ -22,9 +22,11 @@ from geoscene.scene.layout import OVERHANG
 from geoscene.support.files import atomic_path, write_atomically
 from geoscene.typing import Float
 from lidar.dataset.formats.table import Table
+from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import InputError
 from lidar.geometry.box_tree import Tree, lower_to_nearest, tree_of
 from lidar.geometry.georeference import Georeference
+from lidar.settings import settings_of
 from lidar.tools.maps.colors import ramp
 from lidar.tools.maps.picture import cloud_picture, with_key
 
@@ -36,6 +38,9 @@ LIMIT = 5.0
 _STEP = 1e-4  # metres: width of the bins from which median and percentile are taken
 _SHOWN = 2_000_000  # points of the picture, at most
 _COLORS = (1e-3, 1.0)  # metres: ends of the logarithmic ramp of colours
+_FAR = 0.1
+"""Metres: distances of 5 % of the points of a class from which on reasons are given."""
+_MOVING = ("all", *(klass.name.lower() for klass in Class if Class.CAR <= klass <= Class.MOTORCYCLIST))
 _ROAD_USERS = (Class.CAR, Class.MOTORCYCLIST)
 
 
@@ -111,6 +116,34 @@ class SurfaceDistances:
     rms_m: float
     largest_m: float
     beyond: int
+
+
+def far_reasons(dataset: Dataset, scene: Scene, *, rows: Sequence[SurfaceDistances]) -> list[str]:
+    """Why points of a map may lie far from the surfaces of a scene, one line each; none if they do not.
+
+    rows : distances of the map to the scene
+    """
+    high = [row.name for row in rows if row.points and row.p95_m > _FAR and row.name not in _MOVING]
+    if not high:
+        return []
+    recipe, reasons = dataset.manifest["recipe"], []
+    if recipe.get("scene") != scene.manifest.get("fingerprint", scene.path.name):
+        reasons.append(
+            "the drive was in another scene: what only one of the two holds is as far as it is large"
+        )
+    with reading_file(dataset.paths.manifest):
+        scanner, _, _ = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
+        if scanner.rays > 1:
+            reasons.append(
+                f"pulses have {scanner.rays} rays (setting rays): where one meets several surfaces, as at"
+                " edges, windows with the room behind them, and leaves, echoes merge to a point between them"
+            )
+        if recipe.get("stages") or recipe.get("applied_stages"):
+            reasons.append(
+                "weather, attacks or other stages added or moved returns (--origin surface leaves them out)"
+            )
+    told = "; ".join(reasons) or "points of moving things and of measured poses are not where surfaces are"
+    return [f"5 % or more of {', '.join(high)} lie farther than {_FAR:g} m from all surfaces: {told}"]
 
 
 class SurfaceComparison:

@@ -1,6 +1,7 @@
 """Maps against true surfaces: distances are those to the nearest triangle, of whatever tile."""
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ from geoscene.geometry.frames import Frame
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import demo_path, read_osm
+from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
 from lidar.geometry.box_tree import lower_to_nearest, tree_of
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.tools.maps.compare import LIMIT, SurfaceComparison, TrueSurfaces
+from lidar.tools.maps.compare import LIMIT, SurfaceComparison, SurfaceDistances, TrueSurfaces, far_reasons
 from lidar.world.world import World
 
 BOX = (24.9405, 60.1660, 24.9425, 60.1670)
@@ -159,3 +161,25 @@ def test_a_scene_with_other_heights_is_refused(scene):
     frame = Frame(scene.frame.wkt, scene.frame.origin, "ellipsoidal")
     with pytest.raises(InputError, match="ellipsoidal"):
         SurfaceComparison(scene, frame, crs=export_crs(scene.frame))
+
+
+def test_large_distances_are_explained_by_what_the_drive_is(scene, plain_drive):
+    data = open_dataset(plain_drive)
+    near, far = (
+        SurfaceDistances(name, 100, p95 / 3, p95 / 3, p95_m=p95, rms_m=p95 / 2, largest_m=p95, beyond=0)
+        for name, p95 in (("road", 0.02), ("building", 0.6))
+    )
+
+    def reasons(rows, scene=scene, **changes):
+        recipe = data.manifest["recipe"] | changes
+        changed = replace(data, manifest=data.manifest | {"recipe": recipe})
+        return " ".join(far_reasons(changed, scene, rows=rows))
+
+    assert reasons([near], fidelity="survey") == ""
+    beams = reasons([near, far], fidelity="survey")
+    assert beams.startswith("5 % or more of building lie farther than 0.1 m")
+    assert "echoes merge to a point between them" in beams
+    assert "another scene" not in beams
+    assert "rays" not in reasons([far])
+    assert "another scene" in reasons([far], scene=replace(scene, manifest={"fingerprint": "x"}))
+    assert "stages added or moved" in reasons([far], stages=[{"name": "remove"}])
