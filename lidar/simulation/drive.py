@@ -117,7 +117,7 @@ def drive(
         and not overwrite
         and (before := _finished(scene, out, options=options, progress=progress))
     ):
-        return replace(before, wall=time.perf_counter() - began)
+        return replace(ended, wall=time.perf_counter() - began)
     with (
         install_listener("numba:compile", _CompilationProgress(progress)),
         connect(options.scheduler) if options.scheduler else nullcontext() as cluster,
