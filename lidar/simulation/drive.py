@@ -17,7 +17,7 @@ import numpy as np
 from numba.core.event import Event, Listener, install_listener
 
 from geoscene.errors import GeosceneError
-from geoscene.scene import SceneLike
+from geoscene.scene import Scene, SceneLike
 from geoscene.support.cluster import DaskCluster, connect
 from geoscene.support.files import exclusive, json_bytes, write_json
 from geoscene.support.option_values import expect
@@ -115,7 +115,7 @@ def drive(
     if (
         check is None
         and not overwrite
-        and (before := _finished(scene, out, options=options, progress=progress))
+        and (ended := _finished(scene, out, options=options, progress=progress))
     ):
         return replace(ended, wall=time.perf_counter() - began)
     with (
