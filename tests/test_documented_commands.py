@@ -6,11 +6,17 @@ is replaced by a part of it, drives end after 0.2 s and have no relief unless th
 20 frames, and cameras have a sixteenth of their pixels. Sweeps have drives of 0.1 s with one seed.
 """
 
+import csv
+import json
 import re
 import shlex
 import shutil
 from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from textwrap import dedent
 
+import numpy as np
 import osmium
 import pytest
 from helpers import ROOT
@@ -31,8 +37,13 @@ import lidar.tools.tradeoff.compare
 import lidar.tools.tradeoff.pick
 import lidar.tools.tradeoff.search
 import lidar.tools.tradeoff.sensors
+from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
+from geoscene.roadgraph.routing import nearest_edge
 from geoscene.sources import demo_path, read_osm
+from lidar.dataset.layout import open_dataset
+from lidar.motion.random_route import public_streets
+from lidar.motion.road_drive import road_surface
 from lidar.options import DriveOptions
 from lidar.tools.tradeoff.bench import coarse
 from lidar.traffic.options import TrafficOptions
@@ -114,7 +125,14 @@ def texts(tmp_path_factory):
     reference = ROOT / "docs" / "reference"
     pages = [(reference / f"{name}.md").read_text("utf-8") for name in ("stages", "sweeps", "security")]
     stages, sweep, matrix = (page.split("```toml")[1].split("```")[0] for page in pages)
-    texts = {"track.gpx": ROUTE, "my_rig.toml": RIG, "fcd.xml": TRAFFIC, "stages.toml": stages}
+    other = (ROOT / "docs" / "howto" / "compare-sensors.md").read_text("utf-8").split("```toml")[1]
+    texts = {
+        "track.gpx": ROUTE,
+        "my_rig.toml": RIG,
+        "xt32_rig.toml": dedent(other.split("```")[0]),
+        "fcd.xml": TRAFFIC,
+        "stages.toml": stages,
+    }
     texts |= {"sweep.toml": brief(sweep), "matrix.toml": brief(matrix)}
     texts |= {"secret.key": "00" * 32, "private.pem": PRIVATE_KEY, "public.pem": PUBLIC_KEY}
     shutil.copytree(ROOT / "examples", folder / "examples")
@@ -282,3 +300,80 @@ def test_examples_in_python_succeed(page, folder, monkeypatch):
     for example in examples:
         exec(example, names)  # noqa: S102
     assert (folder / "drive" / "dataset.json").is_file()
+
+
+RECEIVER = """
+[[gnss]]
+name = "gnss"
+translation = [0.6, 0.0, 1.6]
+rate_hz = 10.0
+"""
+
+
+@pytest.fixture(scope="module")
+def first_drive(tmp_path_factory):
+    """The drive of the tutorial, in the whole demo scene, and what the page does with it; without cameras."""
+    folder = tmp_path_factory.mktemp("first")
+    scene = build(read_osm(demo_path()), folder / "scene", options=BuildOptions(use="lidar"))
+    (folder / "rig.toml").write_text(RIG + RECEIVER)
+    for program, *words in in_page("docs/guide/tutorial.md"):
+        if words[0] in ("apply", "defend", "map") or (words[0] == "drive" and "--traffic" in words):
+            extra = ["--rig", "rig.toml"] if words[0] == "drive" else []
+            done = run_program(program, *words, *extra, cwd=folder)
+            assert done.returncode == 0, (words, done.stderr)
+    return folder, scene
+
+
+def test_the_first_drive_is_on_a_street_in_the_open(first_drive):
+    folder, scene = first_drive
+    data = open_dataset(folder / "drive")
+    path = data.trajectory()
+    assert data.manifest["length_m"] > 40.0
+    speed = np.linalg.norm(path.velocity, axis=1)
+    assert speed[0] > 4.0
+    ground = road_surface(scene)(*path.position.T)
+    assert np.abs(path.position[:, 2] - ground).max() < 0.5
+    assert path.position[:, 2].min() > -2.0
+    graph = scene.road_graph()
+    edge, _, _ = nearest_edge(graph, path.position[:1, :2])
+    assert public_streets(graph, body_width=1.8)[edge].all()
+
+
+def test_the_first_drive_has_fixes_and_sees_road_users(first_drive):
+    data = open_dataset(first_drive[0] / "drive")
+    with (data.path / "gnss.csv").open(newline="") as file:
+        fixes = [row for row in csv.DictReader(file) if int(row["quality"]) > 0]
+    assert len(fixes) > 0.3 * 10 * data.manifest["duration_ns"] / 1e9  # of ten a second, between houses
+    with (data.path / "boxes.csv").open(newline="") as file:
+        seen = {row["id"] for row in csv.DictReader(file) if int(row["points"]) >= 10}
+    assert len(seen) >= 5
+
+
+def test_the_defence_of_the_tutorial_finds_its_attack(first_drive):
+    judged = json.loads((first_drive[0] / "judged" / "defend.json").read_text("utf-8"))
+    found = judged["defences"]["physics"]["objects"]
+    assert found["attacked"] > 50
+    assert found["tpr"][0] > 0.9
+    assert found["fpr"][0] < 0.05
+
+
+def test_pages_of_the_guide_write_to_places_of_their_own():
+    """What a reader made by one page is neither overwritten nor taken by another."""
+    pages = [page for page in PAGES if "howto" in page or page.endswith("tutorial.md")]
+    written = {
+        page: {words[words.index("-o") + 1] for words in in_page(page) if "-o" in words} for page in pages
+    }
+    for one, other in combinations(pages, 2):
+        assert not written[one] & written[other], (one, other)
+
+
+@pytest.mark.parametrize(
+    ("page", "file"),
+    [("docs/howto/security.md", "examples/attacks/inserted_box.toml")],
+)
+def test_files_that_a_page_shows_are_those_of_the_repository(page, file):
+    blocks = [
+        dedent(block.split("```")[0]) for block in (ROOT / page).read_text("utf-8").split("```toml")[1:]
+    ]
+    assert Path(file).name in (ROOT / page).read_text("utf-8")
+    assert (ROOT / file).read_text("utf-8").strip() in [block.strip() for block in blocks]
