@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.export.lane_links import (
+    DrivenLane,
+    LanePair,
+    Pose,
+    Turn,
+    link_lanes,
+    link_new_lanes,
+    side_by_side,
+)
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lane_tags import Lane, LaneKind
 from geoscene.roadgraph.lanes import LaneLayout, edge_lanes, graph_lanes
 from geoscene.roadgraph.routing import turn_table
-from geoscene.roadgraph.turn_lanes import STRAIGHT, lanes_by_turn, merges
 from geoscene.typing import Bools, Float, Ints
-
-Pose = tuple[Float, float, float]
-"""Point (3,), heading and gradient, in driving direction, where traffic enters or leaves a road."""
 
 START, END = 0, 1
 
@@ -142,12 +147,16 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     for first, then in sorted(zip(before.tolist(), after.tolist(), strict=True)):
         if junctions[graph.head[first]]:
             following[first].append(then)
-    connections = [
-        connection
+    turns = [
+        turn
         for first, then in following.items()
-        for connection in _connections(
-            graph, roads, road_of=road_of, before=first, after=then, left_hand=left_hand
-        )
+        for turn in _turns(roads, road_of=road_of, before=first, after=then, left_hand=left_hand)
+    ]
+    link_new_lanes(turns)
+    connections = [
+        _connection(turn, pairs, node=int(graph.head[turn.before]))
+        for turn in turns
+        for pairs in side_by_side(turn.pairs)
     ]
     connections.sort(key=lambda c: (c.node, c.before, c.after))
     return RoadNet(roads, road_of, junctions, connections, joints)
@@ -263,22 +272,6 @@ def _carriageway(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class DrivenLane:
-    """A lane at the end of a road, as seen in its direction.
-
-    number : in OpenDRIVE
-    lane   : its kind, width and arrows
-    inner  : metres that its inner edge is left of the centre line
-    middle : metres that its middle is left of the centre line
-    """
-
-    number: int
-    lane: Lane
-    inner: float
-    middle: float
-
-
 def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[DrivenLane]:
     """The lanes of one direction of a road, from the middle outwards.
 
@@ -304,112 +297,24 @@ def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Drive
     return found
 
 
-def _connections(
-    graph: RoadGraph,
-    roads: list[Carriageway],
-    *,
-    road_of: Ints,
-    before: int,
-    after: Sequence[int],
-    left_hand: bool,
-) -> Iterator[Connection]:
-    """The connections from the end of one edge to the starts of others."""
+def _turns(
+    roads: list[Carriageway], *, road_of: Ints, before: int, after: Sequence[int], left_hand: bool
+) -> list[Turn]:
+    """The turns from the end of one edge to the starts of others, with the lanes that they join."""
     source = roads[road_of[before]]
     begin = _pose(source, arriving=True, along=before == source.edge)
-    here = driven_lanes(source, before, left_hand=left_hand)
-    targets = [roads[road_of[edge]] for edge in after]
-    poses = [
-        _pose(road, arriving=False, along=edge == road.edge)
-        for road, edge in zip(targets, after, strict=True)
-    ]
-    turns = np.array([(pose[1] - begin[1] + np.pi) % (2 * np.pi) - np.pi for pose in poses])
-    links: list[list[tuple[DrivenLane, DrivenLane]]] = [[] for _ in after]
-    theres = [
-        driven_lanes(road, edge, left_hand=left_hand) for road, edge in zip(targets, after, strict=True)
-    ]
-    kinds: tuple[LaneKind, ...] = ("driving", "bus")
-    for kind in kinds:
-        own = [lane for lane in here if lane.lane.kind == kind]
-        in_order = own[::-1] if left_hand else own  # from left to right
-        allowed = lanes_by_turn([lane.lane for lane in in_order], turns, left_hand=left_hand)
-        for k, there in enumerate(theres):
-            chosen = [in_order[number] for number in allowed[k]]
-            chosen = chosen[::-1] if left_hand else chosen
-            open_there = [lane for lane in there if lane.lane.kind == kind]
-            if len(chosen) > len(open_there):
-                chosen = [lane for lane in chosen if not merges(lane.lane)] or chosen
-            if not open_there and kind == "bus":  # the bus lane ends
-                open_there = [lane for lane in there if lane.lane.kind == "driving"][-1:]
-            links[k] += _aligned(chosen, open_there, begin=begin, end=poses[k], left_hand=left_hand)
-        if len(turns) and own:
-            ahead = int(np.abs(turns).argmin())
-            linked = {lane.number for pairs in links for lane, _ in pairs}
-            for lane in own:
-                if lane.number not in linked and links[ahead]:  # it ends: its traffic merges
-                    near = min(links[ahead], key=lambda pair: abs(pair[0].number - lane.number))
-                    links[ahead].append((lane, near[1]))
-    for edge, pose, pairs in zip(after, poses, links, strict=True):
-        for run in _runs(pairs):
-            yield _connection(begin, pose, pairs=run, node=int(graph.head[before]), edges=(before, edge))
+    turns = []
+    for edge in after:
+        road = roads[road_of[edge]]
+        end = _pose(road, arriving=False, along=edge == road.edge)
+        turns.append(Turn(before, edge, begin, end, driven_lanes(road, edge, left_hand=left_hand), []))
+    link_lanes(driven_lanes(source, before, left_hand=left_hand), turns, left_hand=left_hand)
+    return turns
 
 
-def _aligned(
-    here: Sequence[DrivenLane],
-    there: Sequence[DrivenLane],
-    *,
-    begin: Pose,
-    end: Pose,
-    left_hand: bool,
-) -> list[tuple[DrivenLane, DrivenLane]]:
-    """Pairs of lanes, both from the middle outwards.
-
-    A turn towards the kerb takes the outermost lanes, one away from it the innermost ones; straight on, those
-    that lie in line.
-    """
-    turn = (end[1] - begin[1] + np.pi) % (2 * np.pi) - np.pi
-    outward = turn if left_hand else -turn
-    count = min(len(here), len(there))
-    spare, more = len(here) - count, len(there) - count
-    if outward > STRAIGHT:
-        places = [(spare, more)]
-    elif outward < -STRAIGHT:
-        places = [(0, 0)]
-    else:
-        places = [(k, 0) for k in range(spare + 1)] if spare else [(0, k) for k in range(more + 1)]
-    heading = begin[1] + turn / 2
-    left = np.array([-np.sin(heading), np.cos(heading)])
-    gap = float((end[0][:2] - begin[0][:2]) @ left)
-
-    def off(place: tuple[int, int]) -> float:
-        pairs = zip(here[place[0] :], there[place[1] :], strict=False)
-        return round(sum(abs(gap + b.middle - a.middle) for a, b in pairs), 6)
-
-    a, b = min(places, key=off)
-    return list(zip(here[a : a + count], there[b : b + count], strict=True))
-
-
-def _runs(pairs: list[tuple[DrivenLane, DrivenLane]]) -> list[list[tuple[DrivenLane, DrivenLane]]]:
-    """Pairs from the middle outwards, in runs of lanes that lie side by side on both roads."""
-    runs: list[list[tuple[DrivenLane, DrivenLane]]] = []
-    for pair in sorted(pairs, key=lambda pair: (abs(pair[0].number), abs(pair[1].number))):
-        last = runs[-1][-1] if runs else None
-        if last and all(abs(abs(pair[k].number) - abs(last[k].number)) == 1 for k in (0, 1)):
-            runs[-1].append(pair)
-        else:
-            runs.append([pair])
-    return runs
-
-
-def _connection(
-    begin: Pose,
-    end: Pose,
-    *,
-    pairs: Sequence[tuple[DrivenLane, DrivenLane]],
-    node: int,
-    edges: tuple[int, int],
-) -> Connection:
+def _connection(turn: Turn, pairs: Sequence[LanePair], *, node: int) -> Connection:
     """The connection of lanes that lie side by side, from the middle outwards."""
-    (start, heading, slope), (stop, end_heading, end_slope) = begin, end
+    (start, heading, slope), (stop, end_heading, end_slope) = turn.begin, turn.end
     first = start[:2] + pairs[0][0].inner * np.array([-np.sin(heading), np.cos(heading)])
     last = stop[:2] + pairs[0][1].inner * np.array([-np.sin(end_heading), np.cos(end_heading)])
     curve = connecting_curve(first, heading, end=last, end_heading=end_heading)
@@ -419,7 +324,8 @@ def _connection(
     d = (slope + end_slope - 2 * rise / length) / length**2
     return Connection(
         node,
-        *edges,
+        turn.before,
+        turn.after,
         curve,
         np.array([[a.number, b.number] for a, b in pairs], np.int64),
         tuple(a.lane.kind for a, _ in pairs),
