@@ -7,6 +7,10 @@ Messages name parameters in backquotes (`tile_size`); the command line shows the
 from __future__ import annotations
 
 import importlib
+import json
+import re
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import ModuleType
@@ -63,6 +67,60 @@ class WorkersLostError(GeosceneError):
     """All worker processes were killed."""
 
 
+_WORDS = (
+    (r"invalid literal for int\(\) with base \d+: (.+)", r"\1 is not a whole number"),
+    (r"could not convert string to float: (.+)", r"\1 is not a number"),
+    (
+        r"could not convert string (.+) to \w+ at row (\d+), column (\d+).*",
+        r"\1 in row \2, column \3 is not a number",
+    ),
+    (r"not enough values to unpack \(expected .*?(\d+), got (\d+)\)", r"\2 values where \1 are needed"),
+    (r"too many values to unpack \(expected (\d+).*\)", r"more values than the \1 that are needed"),
+    (r"Invalid isoformat string: (.+)", r"\1 is not an ISO 8601 time"),
+    (r"cannot convert float \S+ to integer", "a number that is not finite"),
+    (r"cannot reshape array .*", "a number of values that does not fit the stated one"),
+    (
+        r"the number of columns changed from (\d+) to (\d+) at row (\d+).*",
+        r"row \3 has \2 columns, the first \1",
+    ),
+    (r"non-hexadecimal number .*", "digits that are not hexadecimal"),
+    (
+        r".*NoneType.*|.*'\w+' object.*|.* (subscriptable|iterable).*|.*__\w+__.*|.*not supported between.*",
+        "",
+    ),
+)
+"""What messages of Python become in plain words."""
+
+_FORM = "contents of another form than expected"
+
+
+def reason_of(error: BaseException) -> str:
+    """The reason of an error in reading a file in plain words, without those of Python, on one line."""
+    text = " ".join(str(error).split())[:200]
+    if isinstance(error, GeosceneError):
+        return text
+    if isinstance(error, UnicodeDecodeError):
+        return f"no UTF-8 text at byte {error.start + 1}"
+    if isinstance(error, json.JSONDecodeError):
+        ends = error.pos >= len(error.doc.rstrip())
+        return "it ends too early" if ends else f"no JSON at line {error.lineno}, column {error.colno}"
+    if isinstance(error, OSError):
+        return error.strerror or text or "it cannot be read"
+    if isinstance(error, KeyError):
+        return f"{text[:60]} is missing"
+    if isinstance(error, IndexError | EOFError | zlib.error | struct.error):
+        return "it ends too early or is damaged"
+    if isinstance(error, RecursionError):
+        return "it nests too deeply"
+    if isinstance(error, AttributeError | TypeError | AssertionError):
+        return _FORM
+    for pattern, plain in _WORDS:
+        if re.fullmatch(pattern, text, re.IGNORECASE):
+            text = re.sub(pattern, plain, text, flags=re.IGNORECASE)
+            break
+    return text or _FORM
+
+
 @contextmanager
 def reading(
     path: object, error: type[Exception], *, remedy: str, known: type[Exception] = GeosceneError
@@ -81,8 +139,7 @@ def reading(
     except FileNotFoundError as cause:
         raise error(f"{path}: is missing; {remedy}") from cause
     except Exception as cause:
-        text = " ".join(str(cause).split())[:200]
-        raise error(f"{path}: damaged ({type(cause).__name__}: {text}); {remedy}") from cause
+        raise error(f"{path}: damaged ({reason_of(cause)}); {remedy}") from cause
 
 
 def need(module: str, extra: str) -> ModuleType:

@@ -12,6 +12,7 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
+from geoscene.errors import reason_of
 from geoscene.support.registry import Registry, hint, unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
@@ -313,9 +314,9 @@ def item_of(table: Mapping[str, Any], *, key: str = "name", source: str = "") ->
 
 def _file_tables(path: Path, table: str) -> list[Mapping[str, Any]]:
     try:
-        document = read_toml(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8-sig"))
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as TOML ({error})") from None
+        raise InputError(f"{path}: cannot be read as TOML ({reason_of(error)})") from None
     rows = document.pop(table, None)
     if document or not rows or not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{path}: give tables [[{table}]] with a name and parameters, and nothing else")

@@ -11,6 +11,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from geoscene.errors import reason_of
 from geoscene.support.registry import hint, nearest, unknown_name
 from geoscene.support.untrusted import read_toml
 from lidar.errors import RigError
@@ -177,13 +178,13 @@ def read_table(path: Path | Any, *, name: str = "") -> Table:
     """
     shown = name or str(path)
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise RigError(f"{shown}: cannot be read ({error})") from error
+        raise RigError(f"{shown}: cannot be read ({reason_of(error)})") from error
     try:
         data = read_toml(text)
     except tomllib.TOMLDecodeError as error:
-        raise RigError(f"{shown}: not valid TOML: {error}") from error
+        raise RigError(f"{shown}: not valid TOML: {reason_of(error)}") from error
     return Table(shown, data, (), _lines(text))
 
 

@@ -15,7 +15,7 @@ from pyproj.crs import ProjectedCRS
 from pyproj.crs.coordinate_operation import TransverseMercatorConversion
 from pyproj.exceptions import CRSError, ProjError
 
-from geoscene.errors import FrameError
+from geoscene.errors import FrameError, reason_of
 from geoscene.typing import Float
 
 _GEOGRAPHIC = "EPSG:4326"
@@ -210,7 +210,7 @@ class Frame:
             frame = cls(str(document["wkt"]), (east, north), str(document["vertical"]))
             known = bool(np.isfinite(frame.to_geographic(0.0, 0.0)).all())
         except (KeyError, TypeError, ValueError, ProjError) as error:
-            raise FrameError(f"not a coordinate frame ({type(error).__name__}: {error})") from error
+            raise FrameError(f"not a coordinate frame ({reason_of(error)})") from error
         if not known:
             raise FrameError("a coordinate frame whose origin is nowhere on Earth")
         return frame

@@ -28,7 +28,7 @@ _CODE = re.compile(r"(?P<code>[A-Za-z]{0,3}-?\d[\w.]*(?:-\d+)?[a-z]?)(?:\[(?P<wo
 def sign_codes() -> dict[str, dict[str, str]]:
     """Faces by code, by country (``names`` for values without one)."""
     table = resources.files("geoscene") / "signs.toml"
-    return tomllib.loads(table.read_text(encoding="utf-8"))
+    return tomllib.loads(table.read_text(encoding="utf-8-sig"))
 
 
 def sign_face(tags: Tags) -> str:

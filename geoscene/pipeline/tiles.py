@@ -398,7 +398,7 @@ class _Former:
         document: Any = {"keys": {}}
         if folder is not None:
             with suppress(OSError, ValueError):
-                document = json.loads(files.tile_reports.read_text("utf-8"))
+                document = json.loads(files.tile_reports.read_text("utf-8-sig"))
         try:
             same = document["keys"].get("ground") == keys.ground
             reports = {(r.i, r.j): r for r in map(_report, document["tiles"])} if same else {}
@@ -461,7 +461,7 @@ def _read_journal(folder: Path, keys: Keys) -> dict[tuple[int, int], TileReport]
     files = SceneFiles(folder)
     path = files.tile_journal
     reports: dict[tuple[int, int], TileReport] = {}
-    for line in path.read_text("utf-8", errors="replace").splitlines() if path.exists() else ():
+    for line in path.read_text("utf-8-sig", errors="replace").splitlines() if path.exists() else ():
         try:
             document = json.loads(line)
             same = document.pop("keys") == asdict(keys)

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import shapely
 
-from geoscene.errors import BUILD_AGAIN, DIFFERS, GeosceneError, InputError, SceneFormatError, reading
+from geoscene.errors import (
+    BUILD_AGAIN,
+    DIFFERS,
+    GeosceneError,
+    InputError,
+    SceneFormatError,
+    reading,
+    reason_of,
+)
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
 from geoscene.objects.forests import Forests
@@ -420,7 +428,7 @@ def open_scene(path: SceneLike) -> Scene:
             f"{folder}: no {manifest_file.name} in it: not a scene, or its build did not finish"
         )
     with reading(manifest_file, SceneFormatError, remedy=BUILD_AGAIN):
-        manifest = json.loads(manifest_file.read_text("utf-8"))
+        manifest = json.loads(manifest_file.read_text("utf-8-sig"))
         schema = manifest["schema"]
         if schema != SCHEMA:
             newer = isinstance(schema, int) and schema > SCHEMA
@@ -473,7 +481,7 @@ def content_digest(path: Path) -> str:
 
 def _tile_digests(reports: Path) -> dict[str, str]:
     """Digests of tiles by their files' names, from the file of their reports."""
-    rows = json.loads(reports.read_text("utf-8"))["tiles"]
+    rows = json.loads(reports.read_text("utf-8-sig"))["tiles"]
     return {SceneFiles(Path()).tile(int(r["i"]), int(r["j"])).name: str(r["digest"]) for r in rows}
 
 
@@ -491,6 +499,6 @@ def using(scene: Scene, *, known: type[Exception] = GeosceneError) -> Iterator[S
         raise
     except Exception as error:
         if changed := changed_files(scene):
-            cause = f"{type(error).__name__}: {error}"
+            cause = reason_of(error)
             raise SceneFormatError(f"{changed[0]}: {DIFFERS} ({cause})") from error
         raise

@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import InputError
+from geoscene.errors import InputError, reason_of
 from geoscene.sources.data import Bounds, Progress, Tags
 from geoscene.support.problems import Problem
 from geoscene.support.untrusted import open_unpacked
@@ -292,7 +292,7 @@ def collect_xml(path: Path, form: str, *, collector: Collector, progress: Progre
                 _collect_element(item, collector, deleted=deleting or is_deleted(item.attrib))
                 item.clear()
     except ET.ParseError as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(reason_of(error)) from error
 
 
 def is_deleted(attributes: Mapping[str, Any]) -> bool:
@@ -365,7 +365,7 @@ def collect_answer(answer: Any, collector: Collector) -> None:
                 )
                 collector.relation(osm_id, tags, members=members)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(f"JSON, but not as Overpass answers with [out:json]: {error!r}") from error
+        raise InputError(f"JSON, but not as Overpass answers with [out:json]: {reason_of(error)}") from error
 
 
 def _tags(item: dict[str, Any]) -> Tags:

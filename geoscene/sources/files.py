@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import InputError, SourceNotFoundError, reason_of
 from geoscene.sources.assemble import features
 from geoscene.sources.data import Bounds, OsmData, Progress, Tags
 from geoscene.sources.elements import Collector, collect_answer, collect_xml
@@ -179,7 +179,7 @@ def _read(path: Path, progress: Progress) -> Collector:
     except MemoryError:
         raise
     except Exception as error:
-        cause = " ".join(str(error).split()) or type(error).__name__
+        cause = reason_of(error)
         raise InputError(f"{path}: damaged, cut short or no OpenStreetMap file ({cause}); {_HELP}") from error
     if len(collector) == 0:
         raise SourceNotFoundError(f"{path}: holds no map objects; {_HELP}")

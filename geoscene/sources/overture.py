@@ -13,7 +13,7 @@ import shapely
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from geoscene.errors import InputError, SourceNotFoundError, need
+from geoscene.errors import InputError, SourceNotFoundError, need, reason_of
 from geoscene.geometry.frames import beside
 from geoscene.sources.data import Area, Bounds, OsmData, Progress, Tags
 from geoscene.sources.extent import checked_bounds, close_together
@@ -120,7 +120,7 @@ def _read_rows(path: Path, bounds: Bounds | None) -> list[dict[str, Any]]:
     except InputError:
         raise
     except (errors, OSError, ValueError, KeyError, TypeError, CRSError) as error:
-        cause = " ".join(str(error).split())[:120]
+        cause = reason_of(error)
         raise InputError(f"{path}: damaged, or not Overture's GeoParquet ({cause})") from error
     return rows
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from geoscene.errors import InputError, SourceNotFoundError
+from geoscene.errors import InputError, SourceNotFoundError, reason_of
 from geoscene.typing import Float
 
 _Point = tuple[float, float, float]
@@ -49,7 +49,7 @@ def _gpx(path: Path, data: bytes) -> list[_Point]:
     try:
         root = ET.fromstring(data)  # noqa: S314  (expat bounds the growth of entities)
     except (ET.ParseError, ValueError, LookupError) as error:  # of an encoding that is unknown or not kept to
-        raise InputError(f"{path}: not readable as GPX: {error}") from error
+        raise InputError(f"{path}: not readable as GPX: {reason_of(error)}") from error
     for tag in ("trkpt", "rtept", "wpt"):
         found = [e for e in root.iter() if e.tag.rsplit("}", 1)[-1] == tag]
         if found:

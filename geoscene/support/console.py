@@ -148,6 +148,7 @@ def main(
     usage   : those of them caused by input or options, exit code 2; DamagedFileError has 1
     removed : what to write instead of former options, by flag
     """
+    _open_streams()
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
@@ -175,6 +176,10 @@ def main(
     except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(_BROKEN_PIPE)
+    except UnicodeEncodeError as error:
+        name = "".join(map(_shown_byte, error.object))
+        _print_error(app, f"{name[:200]}: is not UTF-8, as names here must be; rename it")
+        sys.exit(USAGE)
     except MemoryError:
         _print_error(app, "out of memory; take a smaller area or fewer workers")
         sys.exit(FAILURE)
@@ -185,6 +190,35 @@ def main(
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
+
+
+def _open_streams() -> None:
+    """Open standard streams that are closed, so that no file of the program takes their place.
+
+    Paths need not be UTF-8: what standard output and error cannot encode is written as escapes.
+    """
+    missing = [number for number in (0, 1, 2) if not _is_open(number)]
+    for _ in missing:  # each takes the lowest number that is free
+        os.open(os.devnull, os.O_RDWR)
+    for name, number in (("stdout", 1), ("stderr", 2)):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "w", closefd=False))
+        with suppress(AttributeError):  # of a stream of another kind, as of notebooks
+            getattr(sys, name).reconfigure(errors="backslashreplace")
+
+
+def _is_open(number: int) -> bool:
+    try:
+        os.fstat(number)
+    except OSError:
+        return False
+    return True
+
+
+def _shown_byte(character: str) -> str:
+    """A character; of a byte of a path that is no UTF-8 its value."""
+    code = ord(character)
+    return f"\\x{code - 0xDC00:02x}" if 0xDC80 <= code <= 0xDCFF else character
 
 
 class _Formatter(logging.Formatter):
@@ -265,7 +299,9 @@ def with_flags(app: App, text: str) -> str:
 
 def _print_error(app: App, message: object) -> None:
     text = without_secrets(" ".join(with_flags(app, str(message)).split()))
-    print(f"{app.name[0]}: {text}", file=sys.stderr)
+    text = "".join(map(_shown_byte, text))
+    with suppress(BrokenPipeError):  # nobody reads it
+        print(f"{app.name[0]}: {text}", file=sys.stderr)
 
 
 def command_line(*words: object) -> str:
@@ -281,8 +317,12 @@ def print_json(document: Mapping[str, Any]) -> None:
 def note_new_folder(out: Path) -> None:
     """Say on standard error which folder is made to hold an output, so that a mistyped path is noticed.
 
-    Raises InputError for a URL.
+    Raises InputError for a URL, and for a path that is no UTF-8, which not all formats can name.
     """
+    try:
+        os.fspath(out).encode()
+    except UnicodeEncodeError:
+        raise InputError(f"`out` {out}: is not UTF-8; give another path") from None
     if url := url_of(out):
         raise InputError(
             f"`out` {without_secrets(url)}: only geoscene build and lidar drive write to object storage;"

@@ -256,8 +256,9 @@ def write_json(path: Path, document: Mapping[str, Any], *, indent: int = 2) -> N
 
 
 def json_bytes(document: Mapping[str, Any], *, indent: int = 2) -> bytes:
-    """A document as `write_json` writes it."""
-    return (json.dumps(document, indent=indent, ensure_ascii=False) + "\n").encode("utf-8")
+    """A document as `write_json` writes it; what of a path is no UTF-8 becomes an escape of JSON."""
+    text = json.dumps(document, indent=indent, ensure_ascii=False) + "\n"
+    return text.encode("utf-8", "backslashreplace")
 
 
 @contextmanager

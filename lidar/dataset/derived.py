@@ -155,6 +155,6 @@ def read_folder_provenance(folder: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     with reading_file(path):
-        known: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        known: dict[str, Any] = json.loads(path.read_text("utf-8-sig"))
         _ = [str(step["from"]) for step in known.get("derived_from", ())], known.get("recipe", {}).keys()
     return known

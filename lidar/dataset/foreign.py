@@ -43,7 +43,7 @@ def read_foreign_stages(source: Path) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with reading_file(path):
-        stages: list[dict[str, Any]] = json.loads(path.read_text("utf-8"))["stages"]
+        stages: list[dict[str, Any]] = json.loads(path.read_text("utf-8-sig"))["stages"]
         _ = [str(stage["name"]) for stage in stages]
     return stages
 

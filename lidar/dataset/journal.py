@@ -91,7 +91,7 @@ def read_journal(path: Path) -> Entries:
     found = Entries()
     if not path.is_file():
         return found
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         for row in csv.reader(file):
             if len(row) != len(_HEADER) or not all(n.isdecimal() and len(n) < _DIGITS for n in row[1:3]):
                 continue

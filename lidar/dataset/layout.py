@@ -289,7 +289,7 @@ def open_dataset(path: DatasetLike) -> Dataset:
     if not manifest_path.exists():
         raise DatasetError(f"{folder}: no dataset.json in it; lidar drive records a dataset")
     with reading_file(manifest_path):
-        manifest = json.loads(manifest_path.read_text("utf-8"))
+        manifest = json.loads(manifest_path.read_text("utf-8-sig"))
         schema = manifest["schema"]
         if schema != SCHEMA:
             newer = isinstance(schema, int) and schema > SCHEMA
@@ -347,7 +347,7 @@ def opened_rows(path: Path) -> Iterator[Iterator[dict[str, str]]]:
     remedy = "was the drive finished?"
     with (
         reading(path, DatasetError, remedy=remedy, known=LidarError),
-        path.open(newline="", encoding="utf-8") as file,
+        path.open(newline="", encoding="utf-8-sig") as file,
     ):
         rows = csv.DictReader(file, strict=True)
         if not rows.fieldnames:
@@ -365,7 +365,7 @@ def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
     Raises DatasetError for a file that is missing or damaged.
     """
     with reading_file(paths.calibration):
-        sensors = json.loads(paths.calibration.read_text("utf-8"))["sensors"]
+        sensors = json.loads(paths.calibration.read_text("utf-8-sig"))["sensors"]
         found = {name: sensor for name, sensor in sensors.items() if not kinds or sensor["kind"] in kinds}
         for name, sensor in found.items():
             if not names_folder(name):

@@ -44,7 +44,7 @@ def read_fixes(paths: Paths, name: str, *, vertical: str) -> tuple[Fixes, FixHei
         value = {key: column.astype(np.float64) for key, column in columns.items() if key not in _TEXTS}
         quality = columns["quality"].astype(np.int8)
     with reading_file(sentences):
-        note, *lines = sentences.read_text("ascii").splitlines()
+        note, *lines = sentences.read_text("utf-8-sig").splitlines()
         names, used, pdop = satellites_used(lines, count=len(rows))
     found = re.search(r"separation of (.*)\)", note)
     fixes = Fixes(
@@ -98,7 +98,7 @@ def read_samples(path: Path) -> Inertial:
 
     Raises DatasetError for a file that cannot be read.
     """
-    with reading_file(path), path.open(encoding="utf-8") as file, warnings.catch_warnings():
+    with reading_file(path), path.open(encoding="utf-8-sig") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a file without samples
         names = next(file, "").rstrip("\n").split(",")
         columns = [names.index(name) for name in _SAMPLES]

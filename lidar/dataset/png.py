@@ -11,6 +11,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 from PIL import Image
 
+from geoscene.errors import reason_of
 from geoscene.support.files import write_atomically
 from lidar.errors import FormatError
 
@@ -67,7 +68,7 @@ def read_png(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
                 raise FormatError(f"{path}: neither 8-bit colour nor 8- or 16-bit grey")
             return np.array(image)
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise FormatError(f"{path}: not a readable image ({error})") from error
+        raise FormatError(f"{path}: not a readable image ({reason_of(error)})") from error
 
 
 def depth_to_counts(depth: NDArray[np.floating]) -> NDArray[np.uint16]:

@@ -14,6 +14,7 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.columns import write_columns
 from geoscene.support.files import write_atomically
 from geoscene.typing import Float
@@ -40,12 +41,12 @@ def read_trajectory(path: Path) -> Trajectory:
     Raises DatasetError if the file is missing or damaged.
     """
     try:
-        with path.open(encoding="utf-8") as lines:
+        with path.open(encoding="utf-8-sig") as lines:
             return _parse(path, lines)
     except DatasetError:
         raise
     except (OSError, ValueError, InputError) as error:
-        raise DatasetError(f"{path}: not a readable trajectory ({error})") from error
+        raise DatasetError(f"{path}: not a readable trajectory ({reason_of(error)})") from error
 
 
 def _parse(path: Path, lines: TextIO) -> Trajectory:
@@ -87,7 +88,7 @@ def read_tum(path: Path) -> tuple[NDArray[np.int64], Float, Float]:
     times.
     """
     try:
-        lines = path.read_text("utf-8").splitlines()
+        lines = path.read_text("utf-8-sig").splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give a TUM trajectory") from None
     except UnicodeDecodeError:

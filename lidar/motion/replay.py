@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from geoscene.errors import FrameError
+from geoscene.errors import FrameError, reason_of
 from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import DatasetError, FormatError, RouteError
@@ -66,9 +66,9 @@ def read_replay(path: Path, frame: Frame) -> Trajectory:
 
 def _recorded_frame(manifest: Path) -> Frame:
     try:
-        return Frame.from_json(json.loads(manifest.read_text("utf-8"))["frame"])
+        return Frame.from_json(json.loads(manifest.read_text("utf-8-sig"))["frame"])
     except (ValueError, KeyError, TypeError, FrameError) as error:
-        raise DatasetError(f"{manifest}: damaged ({type(error).__name__}: {error})") from error
+        raise DatasetError(f"{manifest}: damaged ({reason_of(error)})") from error
 
 
 def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
@@ -84,7 +84,7 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
         lon, lat, h = (np.array([float(row[k]) for row in rows]) for k in ("lon", "lat", "h"))
         quat = np.array([[float(row[k]) for k in _QUAT] for row in rows])
     except (ValueError, TypeError) as error:
-        raise FormatError(f"{path}: a row that cannot be read ({error})") from error
+        raise FormatError(f"{path}: a row that cannot be read ({reason_of(error)})") from error
     if (np.diff(time) <= 0).any() or time[-1] > _LATEST_NS:
         raise FormatError(f"{path}: its times do not increase, or span over eleven days")
     x, y = frame.from_geographic(lon, lat)

@@ -218,7 +218,7 @@ def _by_step(
     path: Path, order: int, *, step: Callable[[int], int]
 ) -> Iterator[tuple[int, int, list[list[str]]]]:
     """Number of each step with boxes of a scanner, the scanner's order, and the cells of the rows in it."""
-    with path.open(encoding="utf-8", newline="") as file:
+    with path.open(encoding="utf-8-sig", newline="") as file:
         time = next(file).rstrip("\n").split(",").index("time_ns")
         cells = (line.rstrip("\n").split(",") for line in file)
         for k, group in itertools.groupby(cells, key=lambda row: step(int(row[time]))):
@@ -269,7 +269,7 @@ def _merge(folder: Path, target: Path) -> str:
     with atomic_path(target) as whole, whole.open("w", encoding="utf-8", newline="") as file:
         for part in (folder / f"{frame:06d}.csv" for frame in frames):
             with reading_file(part):
-                own, *rows = part.read_text("utf-8").splitlines()
+                own, *rows = part.read_text("utf-8-sig").splitlines()
                 names = own.split(",")
                 numbers = [names.index(key) for key in ("frame", "time_ns", "id", "points") if key in names]
                 for cells in (row.split(",") for row in rows):

@@ -12,6 +12,7 @@ import numpy as np
 import shapely
 
 from geoscene.classes import GROUND
+from geoscene.errors import reason_of
 from geoscene.pipeline.reach import RoadMap
 from geoscene.scene import Scene
 from geoscene.sources.tracks import read_geometries
@@ -294,7 +295,7 @@ def _polygon(path: Path) -> Any:
         parts = read_geometries(path, path.read_bytes())
         shapes = [shapely.from_geojson(json.dumps(part)) for part in parts]
     except (ValueError, shapely.errors.GEOSException) as error:
-        raise RouteError(f"`survey` {path}: not readable as GeoJSON ({error})") from error
+        raise RouteError(f"`survey` {path}: not readable as GeoJSON ({reason_of(error)})") from error
     areas = shapely.union_all([s for s in shapes if s.geom_type in ("Polygon", "MultiPolygon")])
     if areas.is_empty:
         raise RouteError(f"`survey` {path}: no polygon in it")

@@ -253,7 +253,7 @@ def _read_past(path: Path | None, *, count: int) -> dict[str, NDArray[Any]] | No
     if path is None or not count:
         return None
     kinds = {"time_ns": np.int64, "quality": np.int8, "satellites": np.int8}
-    with reading_file(path), path.open(encoding="utf-8") as file:
+    with reading_file(path), path.open(encoding="utf-8-sig") as file:
         names = next(file, "").rstrip("\n").split(",")
         values = np.loadtxt(file, delimiter=",", ndmin=2)
         if len(values) < count:

@@ -256,7 +256,7 @@ def _intact(path: Path) -> Scene | None:
     """The scene of a directory; None if it is not there, or a file of it is damaged or missing."""
     with suppress(SceneFormatError, OSError, ValueError, LookupError):
         scene = open_scene(path)
-        reports = json.loads(scene.files.tile_reports.read_text("utf-8"))["tiles"]
+        reports = json.loads(scene.files.tile_reports.read_text("utf-8-sig"))["tiles"]
         whole = {(r["i"], r["j"]) for r in reports} == set(scene.tile_indices) and scene.area is not None
         if whole and not changed_files(scene):
             return scene

@@ -17,6 +17,7 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.untrusted import TooLargeError, open_unpacked
 from geoscene.typing import Float
 from lidar.errors import FormatError
@@ -157,9 +158,9 @@ def _open_file(path: Path) -> Iterator[IO[bytes]]:
     except TooLargeError as error:
         raise FormatError(f"{path}: {error}") from None
     except (OSError, EOFError, zlib.error) as error:
-        raise FormatError(f"{path}: cannot be read: {error}") from None
+        raise FormatError(f"{path}: cannot be read: {reason_of(error)}") from None
     except (ET.ParseError, LookupError) as error:  # also of an unknown encoding
-        raise FormatError(f"{path}: broken XML ({error}); was sumo still writing it?") from None
+        raise FormatError(f"{path}: broken XML ({reason_of(error)}); was sumo still writing it?") from None
 
 
 def _sumo_options(path: Path) -> dict[str, str]:
@@ -270,7 +271,7 @@ def network_projection(net: Path) -> NetworkProjection:
     try:
         return NetworkProjection(shift, Transformer.from_crs(CRS(proj), "EPSG:4326", always_xy=True))
     except CRSError as error:
-        raise FormatError(f"{net}: projParameter = {proj!r}: {error}") from None
+        raise FormatError(f"{net}: projParameter = {proj!r}: {reason_of(error)}") from None
 
 
 def _types(path: Path, sumo_options: dict[str, str]) -> dict[str, tuple[str, float | None]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from geoscene.errors import need
+from geoscene.errors import need, reason_of
 from geoscene.support.registry import Registry
 from lidar.errors import FormatError, InputError
 
@@ -104,7 +104,7 @@ class Format:
         except FormatError:
             raise
         except (OSError, ValueError, IndexError, StopIteration) as error:
-            text = " ".join(str(error).split())
+            text = reason_of(error)
             raise FormatError(f"{path}: its number of points cannot be read ({text})") from error
 
     def open_map(self, path: Path, *, info: Any, columns: tuple[str, ...]) -> Any:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geoscene.errors import reason_of
 from geoscene.support.files import atomic_file
 from geoscene.support.untrusted import DAMAGED_ARCHIVE, array_header, read_arrays
 from lidar.dataset.formats.table import Table, rows
@@ -29,7 +30,7 @@ def read(path: Path) -> Table:
     try:
         table = read_arrays(io.BytesIO(path.read_bytes()))
     except DAMAGED_ARCHIVE as error:
-        raise FormatError(f"{path}: not a readable NPZ file ({error})") from error
+        raise FormatError(f"{path}: not a readable NPZ file ({reason_of(error)})") from error
     for name, column in table.items():
         if column.ndim != 1 or column.dtype.kind not in "iuf":
             raise FormatError(
@@ -49,4 +50,4 @@ def count(path: Path) -> int:
         with zipfile.ZipFile(path) as file, file.open("x.npy") as member:
             return array_header(member)[0][0]
     except DAMAGED_ARCHIVE as error:
-        raise ValueError(str(error)) from error
+        raise ValueError(reason_of(error)) from error

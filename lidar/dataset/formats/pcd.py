@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geoscene.errors import reason_of
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
@@ -80,7 +81,7 @@ def read(path: Path) -> Table:
         else:
             data = np.loadtxt(io.BytesIO(body), kinds, ndmin=1) if points else np.empty(0, kinds)
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        raise FormatError(f"{path}: damaged PCD header or data ({error})") from error
+        raise FormatError(f"{path}: damaged PCD header or data ({reason_of(error)})") from error
     if len(data) != points:
         raise FormatError(f"{path}: holds {len(data)} points, and its header states {points}")
     return {name: data[name] for name in names}

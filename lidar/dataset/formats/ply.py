@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geoscene.errors import reason_of
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, counted_file, number_in_header, records, rows
@@ -70,7 +71,7 @@ def read(path: Path) -> Table:
         fields = [(w[2], np.dtype(kinds[w[1]]).newbyteorder("<")) for w in words if w[0] == "property"]
         data = np.frombuffer(body, np.dtype(fields), count)
     except (StopIteration, KeyError, ValueError, IndexError) as error:
-        raise FormatError(f"{path}: damaged PLY header or data ({error})") from error
+        raise FormatError(f"{path}: damaged PLY header or data ({reason_of(error)})") from error
     table = {name: data[name] for name, _ in fields}
     if "t" in table:
         nanoseconds = np.rint(table["t"] * 1e9).astype(np.int64)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.compiled import njit
 from geoscene.support.files import write_atomically
 from lidar.dataset.formats.table import Table, rows
@@ -83,7 +84,7 @@ def read(path: Path) -> Table:
     try:
         values = np.loadtxt(StringIO(body), delimiter=",", ndmin=2) if body else np.empty((0, len(names)))
     except ValueError as error:
-        raise FormatError(f"{path}: not a table of numbers ({error})") from error
+        raise FormatError(f"{path}: not a table of numbers ({reason_of(error)})") from error
     if values.shape[1] != len(names):
         raise FormatError(f"{path}: {values.shape[1]} numbers a line under {len(names)} names")
     return {name: values[:, j].astype(_TYPES.get(name, np.float64)) for j, name in enumerate(names)}

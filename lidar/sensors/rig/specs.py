@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from geoscene.errors import reason_of
 from geoscene.support.digests import recipe_digest
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, RigError
@@ -332,10 +333,10 @@ def rig_digest(name: str | Path) -> str:
                 parts.append((inside / "sensors" / f"{spec.preset}.toml").read_bytes())
                 continue
             parts.append(Path(spec.preset).read_bytes())
-            listed = read_toml(parts[-1].decode()).get("table", {}).get("file", "")
+            listed = read_toml(parts[-1].decode("utf-8-sig")).get("table", {}).get("file", "")
             parts += [(Path(spec.preset).parent / listed).read_bytes()] if listed else []
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise RigError(f"rig {name}: a sensor's file cannot be read: {error}") from error
+        raise RigError(f"rig {name}: a sensor's file cannot be read: {reason_of(error)}") from error
     return recipe_digest(b"".join(len(part).to_bytes(8) + part for part in parts))
 
 

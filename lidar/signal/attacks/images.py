@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.parameters import parameter
@@ -182,7 +183,7 @@ def _picture(file: str) -> NDArray[np.uint8]:
         with Image.open(Path(file)) as picture:
             return np.asarray(picture.convert("RGB"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"file = {file!r} cannot be read as a picture ({error})") from None
+        raise InputError(f"file = {file!r} cannot be read as a picture ({reason_of(error)})") from None
 
 
 def _sample(picture: NDArray[np.uint8], *, u: Float, v: Float) -> NDArray[np.uint8]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from geoscene.classes import Class, materials
-from geoscene.errors import need
+from geoscene.errors import need, reason_of
 from geoscene.geometry.mesh import Mesh
 from geoscene.scene import Scene
 from geoscene.typing import Float, Ints
@@ -170,7 +170,7 @@ def _read_mesh(path: str) -> tuple[Float, Ints]:
     try:
         read = trimesh.load(path, force="mesh", process=False)
     except Exception as error:  # noqa: BLE001 - trimesh raises what its parsers raise
-        raise InputError(f"{path}: cannot be read as a mesh ({error})") from None
+        raise InputError(f"{path}: cannot be read as a mesh ({reason_of(error)})") from None
     vertices, faces = np.asarray(read.vertices, float), np.asarray(read.faces, np.int64)
     if not len(faces) or not np.isfinite(vertices).all():
         raise InputError(f"{path}: has no faces, or vertices that are not finite")

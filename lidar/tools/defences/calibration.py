@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from geoscene.errors import reason_of
 from geoscene.support.untrusted import read_toml
 from geoscene.typing import Float
 from lidar.errors import InputError
@@ -162,7 +163,7 @@ def read_calibration(path: Path | None = None, *, detector: Detector = RULES) ->
 def _read(file: Path) -> Calibration:
     tails: dict[tuple[str, str], Tail] = {}
     try:
-        document = read_toml(file.read_text("utf-8"))
+        document = read_toml(file.read_text("utf-8-sig"))
         for defence, levels in document["defence"].items():
             for level, row in levels.items():
                 tails[defence, level] = _tail(row)
@@ -174,7 +175,7 @@ def _read(file: Path) -> Calibration:
     except KeyError as error:
         raise InputError(f"{file}: is no calibration of defences ({error.args[0]} is missing)") from None
     except (OSError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
-        raise InputError(f"{file}: is no calibration of defences ({error})") from None
+        raise InputError(f"{file}: is no calibration of defences ({reason_of(error)})") from None
 
 
 def _tail(row: Mapping[str, Any]) -> Tail:

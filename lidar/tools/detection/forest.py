@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.files import write_atomically
 from geoscene.support.untrusted import DAMAGED_ARCHIVE, read_arrays
 from geoscene.typing import Float
@@ -146,6 +147,6 @@ def read_forest(path: Path) -> tuple[Forest, dict[str, Any], str]:
         forest = Forest(**{one.name: file[one.name] for one in fields(Forest)})
         forest.check(columns=len(header["features"]), classes=len(header["classes"]))
     except _DAMAGE as error:
-        text = " ".join(str(error).split())[:120]
+        text = reason_of(error)
         raise FormatError(f"{path}: is no model of a detector ({text}); make one with lidar train") from None
     return forest, header, hashlib.sha256(data).hexdigest()

@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 from lidar.errors import FormatError
@@ -135,7 +136,7 @@ def labels_of(lines: Sequence[str], *, name: object) -> Labels:
         if not np.isfinite(values).all():
             raise ValueError("numbers that are not finite")  # noqa: TRY301
     except ValueError as error:
-        raise FormatError(f"{name}: no labels of KITTI ({error})") from None
+        raise FormatError(f"{name}: no labels of KITTI ({reason_of(error)})") from None
     split = (values[:, 3:7], values[:, 7:10], values[:, 10:13])
     return Labels(kinds, values[:, 0], values[:, 1], *split, values[:, 13], values[:, 14])
 
@@ -143,7 +144,7 @@ def labels_of(lines: Sequence[str], *, name: object) -> Labels:
 def read_labels(path: Path) -> Labels:
     """The objects of a file; raises FormatError as `labels_of`."""
     try:
-        return labels_of(path.read_text("utf-8").splitlines(), name=path)
+        return labels_of(path.read_text("utf-8-sig").splitlines(), name=path)
     except UnicodeDecodeError:
         raise FormatError(f"{path}: not text") from None
 

@@ -216,7 +216,7 @@ def read_results(path: Path, samples: KeyFrames) -> Boxes:
     Raises FormatError for another file, InputError if it has none of the samples.
     """
     with reading(path, FormatError, remedy="give results in nuScenes' layout", known=FormatError):
-        results: Mapping[str, list[dict[str, Any]]] = json.loads(path.read_text("utf-8"))["results"]
+        results: Mapping[str, list[dict[str, Any]]] = json.loads(path.read_text("utf-8-sig"))["results"]
         found = []
         rows = {token: row for row, token in enumerate(samples.token)}
         for token, boxes_there in results.items():

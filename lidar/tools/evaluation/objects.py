@@ -77,7 +77,7 @@ def kind_of(estimate: Path) -> str:
         return "nuscenes"
     if estimate.suffix.lower() != ".txt" or not estimate.is_file():
         return ""
-    with estimate.open(encoding="utf-8", errors="replace") as lines:
+    with estimate.open(encoding="utf-8-sig", errors="replace") as lines:
         first = next((line for line in lines if line.strip()), "")
     words = first.split()
     return "tracks" if "," in first or (len(words) in (17, 18) and not _number(words[2])) else ""

@@ -186,7 +186,7 @@ def qualities(estimate: Path) -> Figure | None:
         beside = estimate.with_name("poses.csv")
     if not beside.is_file():
         return None
-    with beside.open(newline="", encoding="utf-8") as file:
+    with beside.open(newline="", encoding="utf-8-sig") as file:
         rows = list(csv.DictReader(file))
     columns = {}
     for name in rows[0] if rows else ():

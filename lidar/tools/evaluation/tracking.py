@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from geoscene.errors import reason_of
 from geoscene.typing import Bools, Float, Ints
 from lidar.errors import FormatError
 from lidar.tools.evaluation.kitti_detection import (
@@ -76,7 +77,7 @@ def read_tracks(path: Path) -> tuple[dict[int, ObjectTracks], str]:
     Raises FormatError for another file.
     """
     try:
-        lines = [line for line in path.read_text("utf-8").splitlines() if line.strip()]
+        lines = [line for line in path.read_text("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:
         raise FormatError(f"{path}: not text") from None
     rows: dict[int, list[tuple[int, str]]] = defaultdict(list)
@@ -95,7 +96,7 @@ def read_tracks(path: Path) -> tuple[dict[int, ObjectTracks], str]:
                 (int(float(words[1])), f"object 0 0 0 {box} 1 1 1 0 0 0 0 {score}")
             )
     except (ValueError, IndexError) as error:
-        raise FormatError(f"{path}: no tracks of KITTI or MOT ({error})") from None
+        raise FormatError(f"{path}: no tracks of KITTI or MOT ({reason_of(error)})") from None
     found = {
         frame: ObjectTracks(np.array([t for t, _ in own]), labels_of([text for _, text in own], name=path))
         for frame, own in rows.items()

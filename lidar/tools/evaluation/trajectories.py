@@ -141,7 +141,7 @@ def file_of(source: Path) -> Path:
 def _first_words(source: Path) -> list[str]:
     """Words of the first line that is no comment."""
     try:
-        with source.open(encoding="utf-8") as lines:
+        with source.open(encoding="utf-8-sig") as lines:
             for line in lines:
                 if (words := line.split()) and not words[0].startswith("#"):
                     return words
@@ -190,7 +190,7 @@ def _read_kitti(source: Path, *, truth: Dataset | None, sensor: str) -> Path3D:
 
 def _table(source: Path) -> Float:
     with reading(source, FormatError, remedy="give numbers separated by spaces", known=FormatError):
-        return np.loadtxt(source, ndmin=2)
+        return np.loadtxt(source, ndmin=2, encoding="utf-8-sig")
 
 
 def _read_csv(source: Path, *, truth: Dataset | None) -> Path3D:
@@ -201,7 +201,7 @@ def _read_csv(source: Path, *, truth: Dataset | None) -> Path3D:
     frame = open_dataset(source.parent) if beside else truth
     with (
         reading(source, FormatError, remedy="give the columns of poses.csv", known=FormatError),
-        source.open(newline="", encoding="utf-8") as file,
+        source.open(newline="", encoding="utf-8-sig") as file,
     ):
         rows = list(csv.DictReader(file, strict=True))
         if not rows or any(name not in rows[0] for name in _POSES):

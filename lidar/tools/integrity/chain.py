@@ -147,7 +147,7 @@ def verify_chain(dataset: Dataset, signer: Signer, *, progress: Progress) -> Cha
     if not path.is_file():
         raise DatasetError(f"{dataset.path}: is not signed; lidar sign --chain signs it")
     with reading_file(path):
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")
         document = json.loads(text)
         if document["schema"] != SCHEMA:
             raise DatasetError(f"{path}: schema version {document['schema']}, this program reads {SCHEMA}")

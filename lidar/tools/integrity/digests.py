@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.typing import Ints
 from lidar.errors import FormatError
 
@@ -185,7 +186,7 @@ def read_digests(path: Path) -> FrameDigests:
         data = path.read_bytes()
         found = _digests(data)
     except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise FormatError(f"{path}: damaged ({error})") from None
+        raise FormatError(f"{path}: damaged ({reason_of(error)})") from None
     if found.to_bytes() != data:
         raise FormatError(f"{path}: damaged (bytes that are not of digests)")
     return found
@@ -233,7 +234,7 @@ def read_links(path: Path) -> list[Link]:
         cells = [line.split(",") for line in data.decode("ascii").splitlines()[1:]]
         links = [Link(int(a), int(b), bytes.fromhex(c), bytes.fromhex(d)) for a, b, c, d in cells]
     except (OSError, ValueError) as error:
-        raise FormatError(f"{path}: damaged ({error})") from None
+        raise FormatError(f"{path}: damaged ({reason_of(error)})") from None
     if links_bytes(links) != data:
         raise FormatError(f"{path}: damaged (bytes that are not of a list of frames)")
     return links

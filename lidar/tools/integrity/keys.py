@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hmac
+from codecs import BOM_UTF8
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from geoscene.errors import need
+from geoscene.errors import need, reason_of
 from lidar.errors import InputError
 
 _SHORTEST = 16
@@ -69,7 +70,7 @@ def read_secret(path: Path) -> bytes:
     """
     data = _contents(path)
     try:
-        secret = bytes.fromhex(data.decode("ascii"))
+        secret = bytes.fromhex(data.removeprefix(BOM_UTF8).decode("ascii"))
     except ValueError:
         secret = data
     if len(secret) < _SHORTEST:
@@ -84,7 +85,7 @@ def read_signer(path: Path) -> Signer:
 
     Raises InputError for a file that holds neither, and MissingExtraError for PEM without ``cryptography``.
     """
-    data = _contents(path)
+    data = _contents(path).removeprefix(BOM_UTF8)
     if not data.lstrip().startswith(b"-----BEGIN"):
         return Hmac(read_secret(path))
     serialization = need("cryptography.hazmat.primitives.serialization", "security")
@@ -99,7 +100,7 @@ def read_signer(path: Path) -> Signer:
             if isinstance(public, ed25519.Ed25519PublicKey):
                 return Ed25519(public)
     except (ValueError, TypeError) as error:
-        raise InputError(f"{path}: cannot be read as a key ({error})") from None
+        raise InputError(f"{path}: cannot be read as a key ({reason_of(error)})") from None
     raise InputError(f"{path}: is not an Ed25519 key; make one by: openssl genpkey -algorithm ed25519")
 
 

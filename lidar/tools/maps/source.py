@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from geoscene.classes import Class
+from geoscene.errors import reason_of
 from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import Table, placed_returns, rows
 from lidar.dataset.ground_truth import read_truth
@@ -149,11 +150,11 @@ def _region(dataset: Dataset, options: MapOptions) -> Any:
 def _polygons(path: Path) -> Any:
     """The union of the polygons of a GeoJSON file (RFC 7946: longitude and latitude on WGS 84)."""
     try:
-        geometry = shapely.from_geojson(path.read_text("utf-8"))
+        geometry = shapely.from_geojson(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; `polygon` takes a GeoJSON file") from None
     except (OSError, UnicodeDecodeError, shapely.errors.GEOSException) as error:
-        raise InputError(f"{path}: not a readable GeoJSON file ({error})") from error
+        raise InputError(f"{path}: not a readable GeoJSON file ({reason_of(error)})") from error
     parts = shapely.get_parts(shapely.get_parts(geometry))
     found = [part for part in parts if part.geom_type == "Polygon" and not part.is_empty]
     if not found:

@@ -98,7 +98,7 @@ def _values(given: dict[str, Any], *, where: str) -> dict[str, Any]:
 
 def _file_table(path: Path) -> dict[str, Any]:
     try:
-        return read_toml(path.read_text("utf-8"))
+        return read_toml(path.read_text("utf-8-sig"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"`settings_file` {path}: not a readable TOML file ({why})") from None

@@ -90,7 +90,7 @@ def measure_drive(case: AttackCase) -> dict[str, Any]:
 def kept(case: AttackCase) -> dict[str, Any] | None:
     """The figures in the file of a drive; None if they are not of the same drive, twin and defences."""
     with suppress(OSError, ValueError, LookupError, TypeError):
-        document = json.loads(case.out.read_text("utf-8"))
+        document = json.loads(case.out.read_text("utf-8-sig"))
         if document["key"] == _key(case):
             return dict(document)
     return None

@@ -183,7 +183,7 @@ def read_plan(path: Path) -> RedteamPlan:
     Raises InputError, which names the file and what in it has the error.
     """
     with reading(path, InputError, remedy="give a TOML file with [grid] and [[attack]]", known=InputError):
-        document = read_toml(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8-sig"))
     if unknown := sorted(set(document) - set(_TABLES)):
         raise InputError(f"{path}: {unknown_name('table', unknown[0], known=_TABLES)}")
     attacks = _attacks(path, document.get("attack", []))

@@ -145,7 +145,7 @@ def read_grid(path: Path) -> list[GridDrive]:
     Raises InputError, which names the drive, for anything that can be known before the drive starts.
     """
     with reading(path, InputError, remedy="give a TOML file with a table [grid]", known=InputError):
-        document = read_toml(path.read_text("utf-8"))
+        document = read_toml(path.read_text("utf-8-sig"))
     return drives_of(document, path)
 
 
@@ -277,7 +277,7 @@ def _with_absolute_paths(options: DriveOptions) -> DriveOptions:
 def _is_made_of(target: Path, stamp: Path, *, made_of: Mapping[str, Any]) -> bool:
     """Whether a scene is there, undamaged, of the files and options of a stamp."""
     with suppress(OSError, ValueError, LookupError, SceneFormatError):
-        document, scene = json.loads(stamp.read_text("utf-8")), open_scene(target)
+        document, scene = json.loads(stamp.read_text("utf-8-sig")), open_scene(target)
         wanted = json.loads(json.dumps(made_of)) | {"scene": scene.manifest["digest"]}
         return bool(document == wanted) and not changed_files(scene)
     return False

@@ -297,7 +297,7 @@ class _Table:
         """Rows by name of the drives that an earlier run has finished; none if its table is damaged."""
         names = [field.name for field in fields(DriveRow)]
         with suppress(OSError, ValueError, LookupError, TypeError):
-            drives = json.loads((self._folder / _TABLE).read_text("utf-8"))["drives"]
+            drives = json.loads((self._folder / _TABLE).read_text("utf-8-sig"))["drives"]
             rows = [DriveRow(*(drive[name] for name in names)) for drive in drives]
             return {row.name: row for row in rows if row.state == "done"}
         return {}

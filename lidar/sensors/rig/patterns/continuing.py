@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from geoscene.errors import reason_of
 from geoscene.support.compiled import njit
 from geoscene.typing import Float
 from lidar.sensors.rig.patterns.beams import (
@@ -213,9 +214,9 @@ def read_listed(table: Table) -> Listed:
     name = table.text("file")
     path = Path(table.path).parent / name
     try:
-        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2)
+        rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=(0, 1, 2), ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
-        raise table.error("file", f"{path} cannot be read: {error}") from error
+        raise table.error("file", f"{path} cannot be read: {reason_of(error)}") from error
     after = np.round(rows[:, 0] * 1e9).astype(np.int64)
     period_ns = round(table.number("period_s", above=0.0) * 1e9)
     if len(after) == 0 or (np.diff(after) < 0).any() or after[0] < 0 or after[-1] >= period_ns:
