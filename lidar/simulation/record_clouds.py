@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from geoscene.typing import Float
 from lidar.dataset.formats.table import MOMENTS, FrameInfo, PointLabels, Table, cloud_table, deskew
 from lidar.errors import LidarError
+from lidar.geometry.flight_lines import edge_times, flight_columns
 from lidar.geometry.random_streams import generator
 from lidar.geometry.time_scales import gps_seconds
 from lidar.sensors.laser.cloud import Cloud, TracedCloud, no_returns
@@ -202,6 +203,12 @@ def write_clouds(
             east, north, up = recording.geo.points(placed).T
             gps = gps_seconds(recording.start, time_ns)
             world_table = table | {"x": east, "y": north, "z": up, "gps_time": gps}
+            if (strips := recording.scanning_ns) is not None:
+                sent = sent_pulses(recording, scanner, frame=frame)
+                edges = edge_times(sent.direction, mount=mount, time_ns=sent.time_ns, ring=sent.ring)
+                world_table |= flight_columns(
+                    placed, recording.trajectory, mount=mount, time_ns=time_ns, strips=strips, edges=edges
+                )
         for form in world_formats:
             with watch.stage(f"write {form.name}"):
                 form.write(paths[form.name], world_table, info=recording.las_info, frame=info)

@@ -29,6 +29,9 @@ from lidar.errors import DamagedFileError, FormatError
 SCALE = 0.001
 """Metres per count of a coordinate by default; the rounding error is at most half of it along each axis."""
 
+SCAN_ANGLE_STEP = 0.006
+"""Degrees per count of a scan angle in point formats 6 to 10."""
+
 INTENSITY_UNIT = 257.0
 """LAS intensity (16 bits) per unit of calibrated reflectivity (0 to 255)."""
 
@@ -199,6 +202,10 @@ class Encoder:
             points["gps_time"] = table["gps_time"]
         if "source" in table:
             points["point_source_id"] = table["source"]
+        if "scan_angle" in table:
+            points["scan_angle"] = np.rint(table["scan_angle"] / SCAN_ANGLE_STEP)
+        if "edge" in table:
+            points["classification_flags"] |= table["edge"].astype(np.uint8) << 7
         for name in self._extra:
             points[name] = table[name]
         if self._colour:
@@ -213,14 +220,24 @@ def open_las(path: Path, info: LasInfo, *, columns: tuple[str, ...]) -> Iterator
 
     columns : of the tables. They need x, y, z (projected, float64) and label; they may have gps_time,
               intensity, ring, instance, range, incidence, true_range, velocity, frame, echo, echoes (up to
-              15), source (point source id), red, green and blue
+              15), source (point source id), scan_angle (degrees), edge (of a flight line), red, green
+              and blue. With scan_angle, a file of one source has its number as file source id
     """
     encoder = Encoder(path, info, columns=columns)
     with atomic_path(path) as part:
         sink = (_Compressed if path.suffix.lower() == ".laz" else _Uncompressed)(part, encoder.layout)
+        strips: set[int] = set()
+
+        def append(table: Table) -> None:
+            if "scan_angle" in table:
+                strips.update(np.unique(table["source"]).tolist())
+            sink.write_points(encoder.records(table))
+
         try:
-            yield lambda table: sink.write_points(encoder.records(table))
+            yield append
             sink.close()
+            if len(strips) == 1:
+                _state_file_source(part, *strips)
         finally:
             with suppress(OSError):
                 sink.dest.close()
@@ -256,6 +273,13 @@ def write(path: Path, table: Table, *, info: LasInfo) -> None:
     """Write one table as LAS or LAZ, by the suffix."""
     with open_las(path, info, columns=tuple(table)) as append:
         append(table)
+
+
+def _state_file_source(path: Path, number: int) -> None:
+    """Enter the file source id in a header, at byte 4 (LAS 1.4 R15, table 3)."""
+    with path.open("r+b") as file:
+        file.seek(4)
+        file.write(number.to_bytes(2, "little"))
 
 
 def count(path: Path) -> int:
@@ -299,6 +323,9 @@ def _table(points: Any) -> Table:
     table["echo"] = np.asarray(points.return_number)
     table["echoes"] = np.asarray(points.number_of_returns)
     table["source"] = np.asarray(points.point_source_id)
+    angle, edge = np.asarray(points.scan_angle), np.asarray(points.edge_of_flight_line)
+    if "scan_angle" in points.array.dtype.names and (angle.any() or edge.any()):
+        table |= {"scan_angle": angle * SCAN_ANGLE_STEP, "edge": edge.astype(np.bool_)}
     for name in (*_EXTRA, "red", "green", "blue"):
         if name in points.array.dtype.names:
             table[name] = np.asarray(points[name])

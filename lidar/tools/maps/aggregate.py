@@ -27,7 +27,6 @@ from lidar.tools.maps.colors import ImageColors, distinct, ramp
 from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances, far_reasons
 from lidar.tools.maps.rasters import Rasters
 from lidar.tools.maps.source import (
-    COLUMNS,
     MapClouds,
     PoseErrors,
     Selection,
@@ -126,7 +125,15 @@ def aggregate(
     trajectory = None if options.poses == "truth" else read_poses(Path(options.poses), dataset)
     selection = Selection(dataset, options, trajectory=trajectory)
     colors = ImageColors(dataset) if options.color == "image" else None
-    source = MapClouds(dataset, names, selection=selection, trajectory=trajectory, colors=colors)
+    form = format_of(out) if options.tiles is None else MAPS[options.tile_format]
+    source = MapClouds(
+        dataset,
+        names,
+        selection=selection,
+        trajectory=trajectory,
+        colors=colors,
+        strips=form.module in ("las", "copc"),
+    )
     read = _Read()
     stream = read.wanted(source, selection, progress=progress)
     if options.voxel is not None:
@@ -237,7 +244,7 @@ def _open_file(
     The map, or the folder of its tiles, appears at the end, unless the block raises.
     """
     info = LasInfo(source.dataset.crs, source.geo.offset, source.dataset.start)
-    columns = (*COLUMNS, "red", "green", "blue")
+    columns = (*source.columns, "red", "green", "blue")
     if options.tiles is None:
         with exclusive(out), format_of(out).open_map(out, info=info, columns=columns) as append:
             yield out, append

@@ -20,8 +20,9 @@ from lidar.dataset.formats import FORMATS, Format, format_of
 from lidar.dataset.formats.table import Table, placed_returns, rows
 from lidar.dataset.ground_truth import read_truth
 from lidar.dataset.layout import Dataset, read_rows, reading_file
-from lidar.dataset.recorded import cloud_points
+from lidar.dataset.recorded import cloud_points, mount_of
 from lidar.errors import DatasetError, InputError
+from lidar.geometry.flight_lines import flight_columns
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import gps_seconds, posix_ns
@@ -235,6 +236,7 @@ class MapClouds:
     selection  : whose frames are read; all of them without it
     trajectory : that places the points, from clouds in the sensor frame; by default the true one
     colors     : of images; tables then have red, green, blue and ``imaged``, whether a camera saw the point
+    strips     : tables of surveys have the columns of `flight_columns`, instead of a source for each file
 
     Raises DatasetError for a dataset without such clouds, and InputError if none is within the selected time.
     """
@@ -247,8 +249,11 @@ class MapClouds:
         selection: Selection,
         trajectory: Trajectory | None = None,
         colors: ImageColors | None = None,
+        strips: bool = False,
     ) -> None:
         self.dataset = dataset
+        on = dataset.manifest.get("scanners_on_ns") if strips else None
+        self._strips = None if on is None else np.array(on, np.int64).reshape(-1, 2)
         self.geo = Georeference(dataset.frame, dataset.crs)
         self._trajectory, self._colors = trajectory, colors
         self._lidars = dataset.sensors("lidar")
@@ -286,6 +291,11 @@ class MapClouds:
         sensor = self._lidars[name]
         return int(sensor["time_offset_ns"]) + int(frame * frame_ns(sensor["rate_hz"]))
 
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of the tables but for colours: `COLUMNS`, and those of strips."""
+        return COLUMNS if self._strips is None else (*COLUMNS, "scan_angle", "edge")
+
     def missing(self) -> dict[str, int]:
         """Number of missing frames, by scanner."""
         expected = self.dataset.manifest.get("sensor_frames", {})
@@ -294,12 +304,16 @@ class MapClouds:
 
     def tables(self, every: int = 1) -> Iterator[tuple[int, str, int, Table]]:
         """Frame number, scanner, first row and table of every n-th file; several tables for large files."""
-        wanted = COLUMNS if self._colors is None else (*COLUMNS, "red", "green", "blue", "imaged")
+        wanted = (*self.columns, *(("red", "green", "blue", "imaged") if self._colors else ()))
         for frame, name, index, path in self._files[::every]:
             row = 0
             for table in self._of_file(path, name, frame=frame):
                 count = rows(table)
-                table["source"] = np.full(count, index, np.uint16)
+                if self._strips is None:
+                    table["source"] = np.full(count, index, np.uint16)
+                elif "scan_angle" not in table:
+                    zeros = {"scan_angle": np.zeros(count), "edge": np.zeros(count, np.bool_)}
+                    table.update({"source": np.zeros(count, np.uint16), **zeros, **table})
                 table["frame"] = np.full(count, frame, np.uint32)
                 yield frame, name, row, {column: table[column] for column in wanted}
                 row += count
@@ -326,16 +340,30 @@ class MapClouds:
             start = self.start_ns(name, frame)
             rgb, imaged = self._colors.of(table, name, frame=frame, start_ns=start, mount=mount)
             colored = {"red": rgb[:, 0], "green": rgb[:, 1], "blue": rgb[:, 2], "imaged": imaged}
-        return colored | {
-            **dict(zip("xyz", self.geo.points(placed).T, strict=True)),
-            "intensity": table["intensity"],
-            "gps_time": gps_seconds(self.dataset.start, time_ns),
-            "ring": table["ring"],
-            "label": table["label"].astype(np.uint8),
-            "instance": table["instance"],
-            "echo": table.get("echo", one),
-            "echoes": table.get("echoes", one),
-        }
+        survey: Table = {}
+        if self._strips is not None:
+            survey = flight_columns(
+                placed,
+                self._trajectory,
+                mount=mount_of(self._lidars[name]),
+                time_ns=time_ns,
+                strips=self._strips,
+                edges=np.empty(0, np.int64),  # clouds in the sensor frame do not tell
+            )
+        return (
+            colored
+            | survey
+            | {
+                **dict(zip("xyz", self.geo.points(placed).T, strict=True)),
+                "intensity": table["intensity"],
+                "gps_time": gps_seconds(self.dataset.start, time_ns),
+                "ring": table["ring"],
+                "label": table["label"].astype(np.uint8),
+                "instance": table["instance"],
+                "echo": table.get("echo", one),
+                "echoes": table.get("echoes", one),
+            }
+        )
 
     def height_range(self) -> tuple[float, float]:
         """1st and 99th percentile of the heights of about `_SAMPLE` frames."""
