@@ -69,6 +69,7 @@ from geoscene.roadgraph import (
     profile,
 )
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
+from geoscene.roadgraph.clipping import clip_graph
 from geoscene.roadgraph.creases import crease_lines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import Side
@@ -238,8 +239,10 @@ def make_plan(
     some = np.flatnonzero([shape is not None for shape in solid])
     names = np.array(buildings.osm_id[some], np.str_)
     walls = Walls.of(solid[some], names, min_height=np.zeros(len(some)))
-    roads = _plan_roads(osm, frame, options=options, terrain=terrain, walls=walls, problems=problems)
-    reach, area = Reach.of(options, roads.graph, frame=frame), None
+    roads = _plan_roads(
+        osm, frame, extent=extent, options=options, terrain=terrain, walls=walls, problems=problems
+    )
+    reach, area = Reach.of(options, roads.drivable, frame=frame), None
     route = None if reach is None else reach.line
     if needed is not None:
         area = needed(
@@ -247,7 +250,7 @@ def make_plan(
                 osm.source,
                 frame,
                 extent,
-                roads.graph if len(roads.graph) else None,
+                roads.drivable if len(roads.drivable) else None,
                 buildings.footprint[buildings.drawn],
                 buildings.min_height[buildings.drawn],
                 passages.polygon,
@@ -268,7 +271,7 @@ def make_plan(
     if reach is not None:
         kept = reach.rows(local.shapes, tiles=chosen, ground=ground, rows=rows, buildings=buildings)
         if needed is not None:
-            kept["roads"] = np.arange(len(roads.graph))
+            kept["roads"] = np.arange(len(roads.drivable))
         kept["passages"] = np.flatnonzero(np.isin(passages.building, kept["buildings"]))
     standing = np.arange(buildings.count) if kept is None else kept["buildings"]
     base, foot = np.full((2, buildings.count), np.nan)
@@ -295,7 +298,7 @@ def make_plan(
         ),
         ground_layer("landcover", cover),
         ground_layer("road_surfaces", surfaces),
-        road_layer(roads.graph),
+        road_layer(roads.drivable),
         tree_layer(trees, _foot(trees.xy, surface), with_relief=options.relief != "off"),
         furniture_layer(furniture, _foot(furniture.xy, surface), with_relief=options.relief != "off"),
         barrier_layer(barriers),
@@ -313,7 +316,7 @@ def make_plan(
         base=base,
         foot=foot,
         rows=rows,
-        graph=roads.graph,
+        graph=roads.drivable,
         side=(roads.side, roads.side_source),
         ground=ground,
         chosen=chosen,
@@ -363,11 +366,14 @@ def _checked_centre(osm: OsmData) -> tuple[float, float]:
 class _Roads:
     """Roads of a map and the ground graded to them.
 
+    graph  : of the whole map, with heights
+    drivable : the part of it within the extent
     height : z of the graded ground, None if it is 0 everywhere
     uneven : the ground or a road has heights other than 0
     """
 
     graph: RoadGraph
+    drivable: RoadGraph
     carriageways: Carriageways
     side: Side
     side_source: str
@@ -379,6 +385,7 @@ def _plan_roads(
     osm: OsmData,
     frame: Frame,
     *,
+    extent: Bounds,
     options: BuildOptions,
     terrain: Terrain,
     walls: Walls,
@@ -405,7 +412,7 @@ def _plan_roads(
     carriageways = read_carriageways(
         mapped, frame, sidewalks=sidewalks, left_hand=side == "left", walls=walls
     )
-    return _Roads(graph, carriageways, side, source, height, uneven)
+    return _Roads(graph, clip_graph(graph, extent), carriageways, side, source, height, uneven)
 
 
 def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:
@@ -526,7 +533,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             "building_parts": len(buildings) - buildings.count,
             "landcover": len(cover),
             "road_surfaces": made.count,
-            "roads": len(roads.graph),
+            "roads": len(roads.drivable),
             **{name: count for name, (_, _, count) in found.items()},
             "structures": len(structures),
             **({"wires": len(wires)} if len(wires) else {}),
@@ -605,7 +612,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             "parts": buildings.footprint,
             "landcover": cover.polygon,
             "road_surfaces": surfaces.polygon,
-            "roads": edge_lines(roads.graph),
+            "roads": edge_lines(roads.drivable),
         }
         beyond = {"trees": trees.crown / 2, "furniture": _ARM}
         chosen = reach.tiles(ground, rows=rows, shapes=shapes, beyond=beyond)

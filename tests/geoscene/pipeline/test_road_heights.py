@@ -162,3 +162,27 @@ GRID_WAYS += [(ROAD, [10 * i + j for i in range(6)]) for j in range(6)]
 def test_streets_on_steep_terrain_lie_on_the_ground(bench, tmp_path):
     scene = built(tmp_path, GRID, GRID_WAYS, terrain=HILLS)
     assert not faults(bench, scene)
+
+
+def test_streets_that_leave_the_extent_end_there(bench, tmp_path):
+    """Through the whole scene, along its border, into it, and out of it and in again."""
+    places = {
+        1: (-400, 30), 2: (0, 40), 3: (400, 30), 4: (0, -100), 5: (240, -300), 6: (400, -100), 7: (230, -60),
+        8: (300, -400), 9: (300, 400),
+    }  # fmt: skip
+    oneway = STREET | {"oneway": "yes"}
+    ways = [(ROAD, [1, 2, 3]), (oneway, [2, 4]), (STREET, [4, 5, 6, 7]), (ROAD, [8, 9])]
+    scene = built(tmp_path, places, ways, terrain=HILLS, dem_gaps="nearest")
+    assert not faults(bench, scene)
+    graph = scene.road_graph()
+    assert (graph.node_id < 0).sum() == 4
+    assert "way/103" not in graph.osm_id
+    (xmin, ymin, xmax, ymax) = scene.bounds
+    points = np.concatenate(list(graph.geometry))
+    assert ((points[:, :2] > (xmin, ymin)) & (points[:, :2] < (xmax, ymax))).all()
+    two_way = graph.twin >= 0
+    assert (graph.twin[graph.twin[two_way]] == np.flatnonzero(two_way)).all()
+    plan = [np.hypot(*np.diff(line[:, :2], axis=0).T).sum() for line in graph.geometry]
+    np.testing.assert_allclose(graph.length, plan, rtol=1e-5)
+    np.testing.assert_array_equal(graph.node_xyz[graph.tail], [line[0] for line in graph.geometry])
+    np.testing.assert_array_equal(graph.node_xyz[graph.head], [line[-1] for line in graph.geometry])
