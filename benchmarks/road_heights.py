@@ -12,7 +12,8 @@ Samples lie 0.25 m apart on the centre lines of the road graph, each street once
     step    if that surface is more than 12 cm higher or lower than at the next sample,
     hole    if there is no surface below it.
 
-For each kind of edge (ground, bridge, tunnel) the counts, and of each fault the places where it is greatest.
+For each kind of edge (ground, bridge, tunnel) the counts; of each fault the classes of the surface below, and
+the places where it is greatest.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,8 +82,8 @@ def mesh_of(scene: Scene) -> tuple[Caster, NDArray[np.uint8]]:
     return Caster(mesh.vertices, mesh.faces), mesh.klass
 
 
-def measure(scene: Scene) -> tuple[Samples, RoadGraph, dict[str, Float]]:
-    """Samples, their graph, and by fault how great it is at each sample, NaN where it is none."""
+def measure(scene: Scene) -> tuple[Samples, RoadGraph, dict[str, Float], NDArray[np.int64]]:
+    """Samples, their graph, by fault how great it is at each sample, NaN where it is none; classes below."""
     graph = read_graphml(scene.files.road_graph, scene.frame)
     points = samples(graph)
     caster, klass = mesh_of(scene)
@@ -108,23 +110,25 @@ def measure(scene: Scene) -> tuple[Samples, RoadGraph, dict[str, Float]]:
     z = xyz[:, 2] + rise
     step[next_one] = z[next_one + 1] - z[next_one]
     hole = np.where(np.isnan(rise) & ~inside, 1.0, np.nan)
-    on_road = np.isin(klass[down.face], DRIVEN)
+    below = np.where(np.isfinite(rise), klass[down.face], Class.UNLABELED).astype(np.int64)
+    on_road = np.isin(below, DRIVEN)
     return (
         points,
         graph,
         {
             "height": np.where(np.abs(off) > OFF, off, np.nan),
-            "road": np.where(np.isfinite(rise) & ~on_road, klass[down.face].astype(float), np.nan),
+            "road": np.where(np.isfinite(rise) & ~on_road, below.astype(float), np.nan),
             "blocked": blocked,
             "step": np.where(np.abs(step) > STEP, step, np.nan),
             "hole": hole,
         },
+        below,
     )
 
 
 def report(scene: Scene, *, worst: int) -> dict[str, Any]:
     """Counts of samples and faults by kind of edge, and the worst places of each fault."""
-    points, graph, faults = measure(scene)
+    points, graph, faults, below = measure(scene)
     kind = np.where(graph.tunnel, 2, np.where(graph.bridge, 1, 0))[points.edge]
     counts = {
         name: {"samples": int((kind == k).sum())}
@@ -133,6 +137,10 @@ def report(scene: Scene, *, worst: int) -> dict[str, Any]:
     }
     return {
         "counts": counts,
+        "below": {
+            fault: {Class(k).name: n for k, n in Counter(below[np.isfinite(size)].tolist()).most_common()}
+            for fault, size in faults.items()
+        },
         "worst": {
             fault: [
                 describe(scene, graph, points, row, float(size[row])) for row in spread(points, size, worst)
@@ -197,6 +205,9 @@ def text_of(name: str, found: dict[str, Any]) -> str:
         if row["samples"]:
             lines.append(f"{name:40} {kind:6} " + " ".join(f"{what} {n:7}" for what, n in row.items()))
     for fault, places in found["worst"].items():
+        if found["below"][fault]:
+            below = ", ".join(f"{name} {n}" for name, n in found["below"][fault].items())
+            lines.append(f"    {fault} on {below}")
         lines += [
             f"    {fault:8}{p['size']:9.3f}  {p['way']:34.34} {p['lat']},{p['lon']}"
             f"  ({p['x']}, {p['y']}, {p['z']})"

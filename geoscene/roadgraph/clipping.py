@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
@@ -121,7 +121,7 @@ def _assemble(graph: RoadGraph, pieces: Sequence[_Piece], *, twin_of: dict[int, 
     first = min(int(graph.node_id.min(initial=0)), 0) - 1
     added = len(xyz)
     none = np.zeros(added, np.bool_)
-    columns = {
+    columns: dict[str, Any] = {
         f.name: getattr(graph, f.name)[rows]
         for f in fields(graph)
         if not f.name.startswith(("node_", "turn_", "chain_", "control_"))
@@ -141,7 +141,7 @@ def _assemble(graph: RoadGraph, pieces: Sequence[_Piece], *, twin_of: dict[int, 
     return made.take(np.ones(len(made), np.bool_))  # without nodes that no edge has
 
 
-def _relations(graph: RoadGraph, pieces: Sequence[_Piece]) -> dict[str, NDArray[np.generic]]:
+def _relations(graph: RoadGraph, pieces: Sequence[_Piece]) -> dict[str, Any]:
     """Turns and controls of the graph of pieces."""
     starts = {piece.edge: k for k, piece in enumerate(pieces) if piece.whole_start}
     ends = {piece.edge: k for k, piece in enumerate(pieces) if piece.whole_end}

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from geoscene.geometry import polylines
+from geoscene.roadgraph.grading import structure_starts
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import in_reach
@@ -52,19 +53,29 @@ def crease_lines(graph: RoadGraph, height: Height, *, area: Any | None = None) -
     once = once[in_reach(edge_lines(graph)[once], area, metres=_NEAR)]
     if not len(once):
         return np.empty((0, 2, 2))
-    sizes = np.array([len(graph.geometry[e]) for e in once.tolist()])
-    xyz = np.concatenate([graph.geometry[e] for e in once.tolist()])
-    of = np.repeat(np.arange(len(once)), sizes)
-    half = graph.width[once][of] / 2
+    begun = structure_starts(graph)
+    begun = begun.take(in_reach(edge_lines(graph)[begun.edge], area, metres=_NEAR))
+    lines = [*graph.geometry[once], *begun.line]
+    edge = np.append(once, begun.edge)
+    xyz = np.concatenate(lines)
+    of = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    half = graph.width[edge][of] / 2
     start = np.flatnonzero(of[1:] == of[:-1])
     across = _across(xyz, of)
-    ends = np.stack([graph.tail[once], graph.head[once]], axis=1).astype(np.int64)
+    count = len(graph.node_id)
+    ends = np.concatenate(
+        [
+            np.stack([graph.tail[once], graph.head[once]], axis=1).astype(np.int64),
+            np.stack([begun.node, count + np.arange(len(begun))], axis=1),
+        ]
+    )
     along = _bent_across(xyz, start, across=across, half=half, height=height)
-    along = _around_nodes(along, of[start], ends=ends, count=len(graph.node_id))
+    along = _around_nodes(along, of[start], ends=ends, count=count + len(begun))
     ribbed = _bent_along(xyz, of)
     ribbed[start[along]] = ribbed[start[along] + 1] = True
     first, last = np.append(True, of[1:] != of[:-1]), np.append(of[1:] != of[:-1], True)
-    arms = np.bincount(np.concatenate([graph.tail[single], graph.head[single]]), minlength=len(graph.node_id))
+    at_node = np.concatenate([graph.tail[single], graph.head[single]])
+    arms = np.bincount(at_node, minlength=count + len(begun))
     node = np.where(first, ends[of, 0], ends[of, 1])
     ribbed &= ~(first | last) | (arms[node] < 3)
     aside = (half + _BESIDE)[ribbed, None] * across[ribbed]

@@ -10,18 +10,25 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.longitudinal_profile import Obstacles
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.tags import place_and_layer
 from geoscene.sources.data import OsmData, Tags
-from geoscene.support.columns import squares_between
+from geoscene.support.columns import Columns, squares_between
 from geoscene.support.compiled import njit
 from geoscene.typing import Bools, Float, Height, Ints
 
 _SHARP = 0.002
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
+
+PARALLEL = 0.85
+"""Cosine of the greatest angle at which one road runs beside another rather than across it."""
+
+_BEYOND = 0.3
+"""Metres beyond the edge of a road to which the ground follows bridges and tunnels that begin at its side."""
 
 _CUT = 0.5
 """Rise over run of the slopes of cuts and fills in surveyed ground: 1 to 2, usual in soil."""
@@ -78,24 +85,73 @@ def graded_ground(
     )
     if not len(once):
         return ground
-    lines = [graph.geometry[e] for e in once.tolist()]
+    begun = structure_starts(graph)
+    lines = [*graph.geometry[once], *begun.line]
     start = np.concatenate([line[:-1] for line in lines])
     end = np.concatenate([line[1:] for line in lines])
-    half = np.repeat(graph.width[once] / 2 + shoulder, [len(line) - 1 for line in lines])
+    width = graph.width[np.append(once, begun.edge)]
+    half = np.repeat(width / 2 + shoulder, [len(line) - 1 for line in lines])
     structure = graph.bridge | graph.tunnel
     mouth = np.zeros(len(graph.node_id), np.bool_)
     mouth[graph.tail[structure]] = mouth[graph.head[structure]] = True
     sizes = np.array([len(line) - 1 for line in lines])
     last = np.cumsum(sizes) - 1
     square_ends = np.zeros((len(start), 2), np.bool_)
-    square_ends[last - sizes + 1, 0] = mouth[graph.tail[once]]
-    square_ends[last, 1] = mouth[graph.head[once]]
+    roads = np.arange(len(once))
+    square_ends[(last - sizes + 1)[roads], 0] = mouth[graph.tail[once]]
+    square_ends[last[roads], 1] = mouth[graph.head[once]]
+    square_ends[last[len(once) :], 1] = True
     pieces = shapely.linestrings(np.stack([start[:, :2], end[:, :2]], axis=1))
     reach = float(half.max()) + batter
     rows = _beside_ramps(pieces, start, end=end, reach=2 * reach) if level else np.arange(len(pieces))
     rows = rows[shapely.STRtree(pieces[rows]).query(shapely.box(*shapely.total_bounds(pieces)))]
-    roads = _Pieces.of(start[rows], end[rows], half=half[rows], square_ends=square_ends[rows], batter=batter)
-    return partial(_graded_height, ground=ground, roads=roads, surveyed=surveyed)
+    table = _Pieces.of(start[rows], end[rows], half=half[rows], square_ends=square_ends[rows], batter=batter)
+    return partial(_graded_height, ground=ground, roads=table, surveyed=surveyed)
+
+
+@dataclass(frozen=True, slots=True)
+class Starts(Columns):
+    """First metres of bridges and tunnels that begin at the side of a road, within its carriageway.
+
+    line : (n,) object, (k, 3) float64 scene metres, from the node on
+    edge, node : (n,) int64
+    """
+
+    line: NDArray[np.object_]
+    edge: Ints
+    node: Ints
+
+
+def structure_starts(graph: RoadGraph) -> Starts:
+    """The first metres of bridges and tunnels that lie on the ground of the road where they begin."""
+    single = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
+    structure = graph.bridge | graph.tunnel
+    ends = np.unique(np.concatenate([graph.tail[structure], graph.head[structure]]))
+    arms: dict[int, list[tuple[Float, float]]] = {}
+    for node, step in ((graph.tail, 1), (graph.head, -1)):
+        for edge in np.flatnonzero(single & ~structure & np.isin(node, ends)).tolist():
+            ahead = _first_direction(graph.geometry[edge][::step])
+            arms.setdefault(int(node[edge]), []).append((ahead, float(graph.width[edge]) / 2))
+    lines, edges, nodes = [], [], []
+    for edge in np.flatnonzero(single & structure).tolist():
+        for node, step in ((graph.tail, 1), (graph.head, -1)):
+            line = graph.geometry[edge][::step]
+            ahead, metres = _first_direction(line), 0.0
+            for other, half in arms.get(int(node[edge]), []):
+                if abs(float(ahead @ other)) < PARALLEL:
+                    metres = max(metres, half / float(np.sqrt(1.0 - (ahead @ other) ** 2)) + _BEYOND)
+            metres = min(metres, polylines.length(line) / 2)
+            if metres > 0.0:
+                lines.append(polylines.cut(line, 0.0, end=metres))
+                edges.append(edge)
+                nodes.append(int(node[edge]))
+    column = np.fromiter(lines, object, len(lines))
+    return Starts(column, np.array(edges, np.int64), np.array(nodes, np.int64))
+
+
+def _first_direction(line: Float) -> Float:
+    """Unit vector (2,) along the first metres of a line."""
+    return polylines.unit(polylines.points_at(line[:, :2], [2.0])[0] - line[0, :2])
 
 
 def _beside_ramps(pieces: NDArray[np.object_], start: Float, *, end: Float, reach: float) -> Ints:

@@ -167,7 +167,9 @@ def path_members(
             detail = f"an end {worst:.1f} m from the ground"
             problems.append(Problem(str(ids[k]), "structure", "repaired", "no-ramp", detail))
     edge = np.full(count, -1, np.int32)
-    return Members(line, tunnel, foot_only, width, own_rows, approach, landed, level, edge, ids), problems
+    return Members(
+        line, tunnel, foot_only, width, own_rows, approach, landed, ~landed, level, edge, ids
+    ), problems
 
 
 def _ground(xy: Float, height: Height | None) -> Float:

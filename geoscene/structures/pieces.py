@@ -18,6 +18,7 @@ from geoscene.roadgraph.surface_rows import SurfaceRows, in_reach
 from geoscene.structures.layered import PRECISION
 from geoscene.structures.sheets import Sheets, areal, find_sheets, part_outlines, strips_of_equal_height
 from geoscene.structures.table import PARTED, SHEET, THINNEST, StructureOptions, Structures, nearest_on_line
+from geoscene.structures.verges import Clearances, without_ground_roads
 from geoscene.support.columns import Columns
 from geoscene.typing import Bools, Float, Ints
 
@@ -56,12 +57,13 @@ _WALK = 5.0
 
 
 def cut_pieces(
-    members: Members, raised: SurfaceRows, *, options: StructureOptions, area: Any | None
+    members: Members, raised: SurfaceRows, *, graph: RoadGraph, options: StructureOptions, area: Any | None
 ) -> Structures:
     """The pieces of all members, in order, without piers.
 
     Those far from an ``area``, a shapely geometry, have no area within their parapets; all have without one.
-    Where outlines of one carriageway overlap, as at junctions, the smaller one keeps the area.
+    Where outlines of one carriageway overlap, as at junctions, the smaller one keeps the area. Roads of the
+    graph that lie on the ground keep theirs.
     """
     member, polygon, line, around, half = _outlines(members, raised, options=options)
     tunnel = members.tunnel[member]
@@ -69,6 +71,16 @@ def cut_pieces(
     body = np.where(tunnel, options.wall, np.where(foot_only, options.slab, options.deck))
     free = np.where(foot_only, options.passage, options.headroom) + np.where(tunnel, THINNEST, 0.0)
     polygon = part_outlines(polygon, around, half=half, tunnel=tunnel, free=free, body=body)
+    at_end = _at_member_ends(members, member, line=line)
+    polygon = without_ground_roads(
+        polygon,
+        around,
+        foot=foot_only,
+        ends=np.fromiter((part[[0, -1], :2][own] for part, own in zip(line, at_end, strict=True)), object),
+        sizes=Clearances(half, free, body),
+        graph=graph,
+        headroom=options.headroom,
+    )
     sheets = find_sheets(polygon, around, tunnel=tunnel)
     near = sheets.near
     rim = np.where(tunnel, options.wall, options.rim)
@@ -79,6 +91,7 @@ def cut_pieces(
         half=half,
         sheets=sheets,
         approach=members.approach[member],
+        shut=members.closed[member] & at_end,
         rim=rim,
         rows=np.flatnonzero(in_reach(polygon, area, metres=NEAR)),
     )
@@ -147,6 +160,14 @@ def _outlines(
     return np.array(member, np.int64), outlines, parts, around, np.array(width, float)
 
 
+def _at_member_ends(members: Members, member: Ints, *, line: NDArray[np.object_]) -> Bools:
+    """Whether the start and the end of pieces (n, 2) are those of their members."""
+    own = np.array([part[[0, -1], :2] for part in line]).reshape(-1, 2, 2)
+    whole = np.array([part[[0, -1], :2] for part in members.line[member]]).reshape(-1, 2, 2)
+    same: Bools = np.abs(own - whole).max(axis=2, initial=0.0) < 1e-6
+    return same
+
+
 def _wholes(
     members: Members, lines: list[Float], *, raised: SurfaceRows, options: StructureOptions
 ) -> tuple[list[shapely.Geometry], Float]:
@@ -169,6 +190,13 @@ def _wholes(
             grown = shape.buffer(grow, join_style="mitre", mitre_limit=1.5)
             shape = grown.intersection(flat.buffer(_SIDE, cap_style="flat", join_style="mitre"))
         half[m] = _half(shape, flat)
+        # So that the road ends before the wall or the parapet across it.
+        thick = options.wall if members.tunnel[m] else options.rim
+        for end in np.flatnonzero(members.closed[m] & (members.edge[m] >= 0)).tolist():
+            first = line[:: 1 - 2 * end, :2]
+            beyond = first[0] + thick * polylines.unit(first[0] - first[1])
+            band = shapely.LineString([first[0], beyond]).buffer(half[m], cap_style="flat")
+            shape = _union([shape, band])
         whole.append(shape)
     flats = np.array([_flat(line) for line in lines], object)
     ends = np.array([line[e] for line in lines for e in (0, -1)]).reshape(-1, 3)
@@ -213,12 +241,13 @@ def _inner(
     half: Float,
     sheets: Sheets,
     approach: NDArray[np.object_],
+    shut: Bools,
     rim: Float,
     rows: Ints,
 ) -> NDArray[np.object_]:
     """The area within the parapets of a piece and its neighbours, open towards roads on the ground.
 
-    Of pieces in ``rows``; none of others.
+    Of pieces in ``rows``; none of others. ``shut`` (n, 2): no road continues from the start and the end.
     """
     inner = np.full(len(polygon), shapely.Polygon(), object)
     near = sheets.near
@@ -238,9 +267,8 @@ def _inner(
         closed = whole.buffer(0.05, join_style="mitre").buffer(-0.05 - rim[k], join_style="mitre")
         # Where two are so close that a wall would stand in the middle of the road, it is left out.
         wide = min(_VEHICLE, float(half[k]) / 2)
-        middle = _flat(polylines.cut(line[k], wide, end=polylines.length(line[k]) - wide)).buffer(
-            wide, cap_style="flat"
-        )
+        start, end = np.where(shut[k], wide, 0.0) * (1.0, -1.0) + (0.0, polylines.length(line[k]))
+        middle = _flat(polylines.cut(line[k], start, end=end)).buffer(wide, cap_style="flat")
         inner[k] = _union([closed, middle]).intersection(polygon[k].buffer(1.0))
     return inner
 
@@ -297,6 +325,7 @@ class Members(Columns):
     approach : (n,) object, shapely: the first metres of the roads at its ends that are of another kind:
                on the ground or, from a tunnel, on a bridge
     landed   : (n, 2) bool, start and end lie on the ground
+    closed   : (n, 2) bool, no road continues from start and end
     level    : (n,) int8
     edge     : (n,) int32, -1 for paths
     osm_id   : (n,) str
@@ -309,6 +338,7 @@ class Members(Columns):
     rows: NDArray[np.object_]
     approach: NDArray[np.object_]
     landed: Bools
+    closed: Bools
     level: NDArray[np.int8]
     edge: NDArray[np.int32]
     osm_id: NDArray[np.str_]
@@ -327,21 +357,20 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
     arms = _arms(graph, once)
     count = len(once)
     line, rows, approach = (np.empty(count, object) for _ in range(3))
-    landed = np.zeros((count, 2), np.bool_)
+    landed, closed = np.zeros((2, count, 2), np.bool_)
     for k, edge in enumerate(once.tolist()):
         line[k] = graph.geometry[edge]
         rows[k] = order[begin[edge] : stop[edge]]
         kind = _kind(graph, edge)
         ends = [arms[int(node)] for node in (graph.tail[edge], graph.head[edge])]
         landed[k] = [any(other == 0 for other, _, _ in found) for found in ends]
+        closed[k] = [len(found) <= 1 + (graph.twin[edge] >= 0) for found in ends]
         bands = [
-            _band(
-                np.concatenate([polylines.cut(inward[:, :2], 0.0, end=_SILL)[1:], first]),
-                max(width, graph.width[edge]),
-            )
+            _band(part, max(width, graph.width[edge]))
             for inward, found in zip((line[k], line[k][::-1]), ends, strict=True)
             for other, first, width in found
             if other != kind
+            for part in (polylines.cut(inward[:, :2], 0.0, end=_SILL), first)
         ]
         bands += [
             shapely.Point(line[k][e, :2]).buffer(graph.width[edge] / 2)
@@ -357,6 +386,7 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
         rows,
         approach,
         landed,
+        closed,
         graph.layer[once],
         once.astype(np.int32),
         graph.osm_id[once],

@@ -66,7 +66,7 @@ def read_structures(
     raised = surfaces.raised
     paths, problems = path_members(raised, osm, frame=frame, graph=graph, height=height, options=options)
     members = Members.concatenate([road_members(graph, raised), paths])
-    table = cut_pieces(members, raised, options=options, area=area)
+    table = cut_pieces(members, raised, graph=graph, options=options, area=area)
     near = in_reach(table.polygon, area, metres=NEAR)
     table = place_piers(table, surfaces, height=height, near=near, options=options)
     return find_low_decks(table, height, near=near), problems

@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
+from geoscene.roadgraph.grading import PARALLEL
 from geoscene.structures.table import PARTED, SHEET, nearest_on_line
 from geoscene.typing import Bools, Float
 
@@ -26,9 +27,6 @@ _TOUCH = 1.0
 
 _SIDE = 40.0
 """Metres: no carriageway reaches further from its centre line."""
-
-_PARALLEL = 0.85
-"""Cosine of the greatest angle at which one carriageway runs beside another rather than across it."""
 
 _TIGHT = 0.05
 """Metres of free height whose lack is of no account."""
@@ -126,7 +124,7 @@ def part_outlines(
         strips = [
             strip
             for a, b in ((p, q), (q, p))
-            for strip in _in_conflict(
+            for strip in conflict_strips(
                 around[a],
                 around[b],
                 reach=half[p] + half[q],
@@ -137,7 +135,9 @@ def part_outlines(
         where = areal(shapely.union_all(strips).intersection(shared))
         if where.area < _SCANT:
             continue
-        theirs = _nearer(where, around[q], half=float(half[q]), other=around[p], other_half=float(half[p]))
+        theirs = nearer_part(
+            where, around[q], half=float(half[q]), other=around[p], other_half=float(half[p])
+        )
         lost.setdefault(p, []).append(theirs)
         lost.setdefault(q, []).append(where.difference(theirs))
     out = polygon.copy()
@@ -153,12 +153,19 @@ def areal(shape: shapely.Geometry, *, least: float = 0.0) -> shapely.MultiPolygo
     return shapely.MultiPolygon(parts[kept].tolist())
 
 
-def _in_conflict(
-    line: Float, other: Float, *, reach: float, needs: tuple[float, float], least: float
+def conflict_strips(
+    line: Float,
+    other: Float,
+    *,
+    reach: float,
+    needs: tuple[float, float],
+    least: float,
+    parallel: float = PARALLEL,
 ) -> list[shapely.Geometry]:
     """Strips along a line where another line is too near in plan and in height to pass.
 
-    needs : metres that the line must be above the other to pass over it, and below it to pass under it
+    needs    : metres that the line must be above the other to pass over it, and below it to pass under it
+    parallel : cosine of the greatest angle between the lines
     """
     cuts, middle = _strip_cuts(line)
     z, away, beside = nearest_on_line(other, middle[:, :2])
@@ -170,9 +177,20 @@ def _in_conflict(
         start, end = shapely.line_locate_point(
             flat, [shapely.Point(part.coords[0]), shapely.Point(part.coords[-1])]
         )
-        if abs(end - start) > _PARALLEL * part.length:
+        if abs(end - start) >= parallel * part.length:
             strips.append(part.buffer(reach, cap_style="flat"))
     return strips
+
+
+def strips_between(
+    line: Float, other: Float, *, reach: float, low: float, high: float
+) -> list[shapely.Geometry]:
+    """Strips along a line where it is ``low`` to ``high`` metres above the nearest point of another line."""
+    cuts, middle = _strip_cuts(line)
+    z, _, _ = nearest_on_line(other, middle[:, :2])
+    up = middle[:, 2] - z
+    found = np.flatnonzero((up > low + _TIGHT) & (up < high - _TIGHT)).tolist()
+    return [_flat_part(line, cuts, k=k).buffer(reach, cap_style="flat") for k in found]
 
 
 def _strip_cuts(line: Float) -> tuple[Float, Float]:
@@ -188,7 +206,7 @@ def _flat_part(line: Float, cuts: Float, *, k: int) -> shapely.LineString:
     return shapely.LineString(polylines.cut(line, cuts[k] - _LAP, end=cuts[k + 1] + _LAP)[:, :2])
 
 
-def _nearer(
+def nearer_part(
     where: shapely.Geometry, line: Float, *, half: float, other: Float, other_half: float
 ) -> shapely.Geometry:
     """The part of an area that lies further within the one carriageway than within the other.

@@ -186,3 +186,62 @@ def test_streets_that_leave_the_extent_end_there(bench, tmp_path):
     np.testing.assert_allclose(graph.length, plan, rtol=1e-5)
     np.testing.assert_array_equal(graph.node_xyz[graph.tail], [line[0] for line in graph.geometry])
     np.testing.assert_array_equal(graph.node_xyz[graph.head], [line[-1] for line in graph.geometry])
+
+
+def SLOPE(x, y):  # noqa: N802 - a constant
+    return 100.0 + 0.25 * y + 0.05 * x
+
+
+def test_a_street_beside_a_bridge_on_a_slope_keeps_its_ground(bench, tmp_path):
+    """The bridge's edge reaches over the street, and their heights differ by a metre or two."""
+    places = {1: (-200, 0), 2: (-60, 0), 3: (60, 0), 4: (200, 0), 5: (-200, 6), 6: (200, 6)}
+    wide = {"width": "8"}
+    ways = [(ROAD | wide, [1, 2]), (BRIDGE | wide, [2, 3]), (ROAD | wide, [3, 4]), (STREET, [5, 6])]
+    assert not faults(bench, built(tmp_path, places, ways, terrain=SLOPE))
+
+
+@pytest.mark.parametrize("tags", [{"bridge": "yes"}, {"tunnel": "yes"}])
+@pytest.mark.parametrize("angle", [12.0, 30.0, 55.0, 90.0])
+def test_a_structure_that_forks_from_a_street_blocks_neither(tags, angle, bench, tmp_path):
+    turn = np.radians(angle)
+    far = (120 * np.cos(turn), 120 * np.sin(turn))
+    places = {1: (-150, 0), 2: (0, 0), 3: (200, 0), 4: far, 5: (1.6 * far[0], 1.6 * far[1])}
+    ways = [(ROAD, [1, 2, 3]), (STREET | tags, [2, 4]), (STREET, [4, 5])]
+    assert not faults(bench, built(tmp_path, places, ways, terrain=SLOPE))
+
+
+@pytest.mark.parametrize("tags", [{"bridge": "yes"}, {"tunnel": "yes"}])
+def test_a_structure_that_ends_nowhere_is_free_up_to_its_end(tags, bench, tmp_path):
+    scene = built(tmp_path, {1: (-200, 0), 2: (-80, 0), 3: (80, 0)}, [(ROAD, [1, 2]), (ROAD | tags, [2, 3])])
+    assert not faults(bench, scene)
+
+
+FOOT = {"highway": "footway"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        [(0, -80), (0, -3), (0, 3), (0, 80)],  # the bridge is as long as the street is wide
+        [(-80, 1), (-60, 1), (60, 1), (80, 1)],  # on the street
+        [(-30, -80), (-4, -2), (0, 4), (60, 40)],  # it ends in the street
+    ],
+)
+@pytest.mark.parametrize("tags", [{"bridge": "yes", "layer": "1"}, {"tunnel": "yes", "layer": "-1"}])
+def test_railings_and_walls_of_footways_do_not_stand_in_streets(path, tags, bench, tmp_path):
+    places = {1: (-150, 0), 2: (150, 0)} | {3 + k: place for k, place in enumerate(path)}
+    ways = [(STREET, [1, 2]), (FOOT, [3, 4]), (FOOT | tags, [4, 5]), (FOOT, [5, 6])]
+    assert not faults(bench, built(tmp_path, places, ways))
+    (tmp_path / "steep").mkdir()
+    assert not faults(bench, built(tmp_path / "steep", places, ways, terrain=SLOPE))
+
+
+@pytest.mark.parametrize("level", ["1", "-1", "2", "0"])
+def test_footways_with_a_level_alone_are_no_structures(level, bench, tmp_path):
+    places = {1: (-150, 0), 2: (150, 0), 3: (0, -80), 4: (0, 80)}
+    scene = built(tmp_path, places, [(STREET, [1, 2]), (FOOT | {"level": level}, [3, 4])])
+    assert not faults(bench, scene)
+    assert not scene.table_length("structures")
+    assert any("way/101,road,repaired,layer-without-structure" in row for row in problems(scene)) == (
+        level != "0"
+    )
