@@ -84,6 +84,7 @@ from geoscene.roadgraph.relief import (
     sidewalk_ends,
 )
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.roadgraph.short_structures import lengthen_structures
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.roadgraph.tags import find_unused_inclines
 from geoscene.roadgraph.walls import HEADROOM, Walls
@@ -234,6 +235,8 @@ def make_plan(
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
+    if "roads" in options.only:
+        osm = _collect(problems, lengthen_structures(osm, frame))
     passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
     solid = _on_ground(buildings, passages, free=HEADROOM)
     some = np.flatnonzero([shape is not None for shape in solid])
@@ -508,7 +511,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     height = roads.height
     if len(structures):
         height = ground_below(structures, height or terrain.height)
-    openings = find_openings(structures, height, area=area)
+    openings = find_openings(structures, height, graph=roads.graph, area=area)
 
     cover, surfaces, pads = _collect(
         problems,

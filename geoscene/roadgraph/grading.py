@@ -24,6 +24,10 @@ from geoscene.typing import Bools, Float, Height, Ints
 _SHARP = 0.002
 """Where carriageways overlap, a road counts for most near its middle: the less this is, the more so."""
 
+_PAST, _MOUTH = 1e-4, 0.1
+"""Weight of a road from so many metres beyond the end at which a bridge or a tunnel begins: streets that
+cross there keep their height."""
+
 PARALLEL = 0.85
 """Cosine of the greatest angle at which one road runs beside another rather than across it."""
 
@@ -258,13 +262,16 @@ def _weigh(
             if beyond >= batter:
                 continue
             ahead = abs(free - t) * math.sqrt(metres2)
-            if ahead > 0 and square_ends[r, 0 if free < t else 1]:
+            blunt = ahead > 0 and square_ends[r, 0 if free < t else 1]
+            if blunt:
                 aside = math.sqrt(max(away * away - ahead * ahead, 0.0)) - half[r]
                 beyond = math.hypot(max(aside, 0.0), ahead)
             share = min(max(1.0 - beyond / batter, 0.0), 1.0)
             nearness = away / half[r]
             fall = _SHARP + nearness * nearness
             weight = share * share / (fall * fall)
+            if blunt and ahead > _MOUTH:
+                weight *= _PAST
             total += weight
             heights += weight * (start[r, 2] + t * (end[r, 2] - start[r, 2]))
             most[p] = max(most[p], share)

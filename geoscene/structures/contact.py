@@ -15,11 +15,19 @@ from geoscene.buildings.table import GRID
 from geoscene.classes import Class, materials
 from geoscene.geometry import polylines
 from geoscene.ground.layers import PADS, Layers
+from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import in_reach
 from geoscene.structures.passages import PassageCuts
 from geoscene.structures.pieces import NEAR
 from geoscene.structures.sheets import areal
-from geoscene.structures.table import THINNEST, StructureOptions, Structures, surface_heights
+from geoscene.structures.table import (
+    THINNEST,
+    StructureOptions,
+    Structures,
+    nearest_on_line,
+    surface_heights,
+)
 from geoscene.support.problems import Problem
 from geoscene.typing import Bools, Float, Height, Ints
 
@@ -37,6 +45,9 @@ _BELOW = 0.1
 
 _STEP = 2.0
 """Metres along a tunnel at which the ground above it is looked at."""
+
+VERGE = 0.3
+"""Metres of ground beside the carriageway of a road that passes over a tunnel's mouth."""
 
 _EDGE = 0.05
 """Metres from a deck's outside to the outline along which the ground falls away below it."""
@@ -139,15 +150,19 @@ def _ground_on(strips: NDArray[np.object_], height: Height | None) -> tuple[Floa
 
 
 def find_openings(
-    table: Structures, height: Height | None, *, area: Any | None = None
+    table: Structures, height: Height | None, *, graph: RoadGraph, area: Any | None = None
 ) -> NDArray[np.object_]:
     """Areas (n,) above each tunnel piece without ground, as shapely polygons; None without any.
 
-    There the ground is not higher than the minimum roof over the tunnel's ceiling.
+    There the ground is not higher than the minimum roof over the tunnel's ceiling. Roads on the ground that
+    pass over the roof keep theirs.
 
     area : shapely geometry: pieces far from it have none
     """
     openings = np.empty(len(table), object)
+    on_ground = np.flatnonzero(~graph.bridge & ~graph.tunnel)
+    lines = edge_lines(graph)[on_ground]
+    tree = shapely.STRtree(lines)
     for k in np.flatnonzero(table.tunnel & in_reach(table.polygon, area, metres=NEAR)).tolist():
         strips = _strips(table, k)
         xy, strip, ground = _ground_on(strips, height)
@@ -156,9 +171,25 @@ def find_openings(
         if open_.any():
             within = table.inner[k].buffer(table.body[k] - _INTO, join_style="mitre")
             shape = shapely.union_all(shapely.buffer(strips[open_], 1e-3)).intersection(table.polygon[k])
-            opening = areal(shape.intersection(within), least=_TINY)
+            over = [
+                lines[row].intersection(table.polygon[k]).buffer(graph.width[on_ground[row]] / 2 + VERGE)
+                for row in tree.query(table.polygon[k], predicate="intersects").tolist()
+                if _passes_over(table, k, line=graph.geometry[on_ground[row]])
+            ]
+            free = shape.intersection(within).difference(shapely.union_all(over))
+            opening = areal(free, least=_TINY)
             openings[k] = None if opening.is_empty else opening
     return openings
+
+
+def _passes_over(table: Structures, k: int, *, line: Float) -> bool:
+    """Whether a road (n, 3) is above the roof of tunnel piece ``k`` wherever it is within its outline."""
+    flat = shapely.LineString(line[:, :2])
+    xy = shapely.get_coordinates(shapely.segmentize(flat.intersection(table.polygon[k]), _STEP))
+    if not len(xy):
+        return False
+    roof = surface_heights(table, k, xy=xy) + table.rise[k] + THINNEST
+    return bool((nearest_on_line(line, xy)[0] > roof).all())
 
 
 def opening_layers(table: Structures, openings: NDArray[np.object_]) -> Layers:

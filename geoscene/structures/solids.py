@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from geoscene.classes import Class, materials
 from geoscene.geometry import polylines
 from geoscene.geometry.mesh import FLOOR, OTHER, ROOF, WALL, Mesh, concatenate
-from geoscene.structures.contact import tunnel_roof
+from geoscene.structures.contact import LIP, VERGE, tunnel_roof
 from geoscene.structures.fittings import Built, tunnel_fittings
 from geoscene.structures.layered import SIDE, LayerTriangulation, Shell, cut_plan, raise_shell
 from geoscene.structures.lining import NICHE, WALKWAY, Lining, read_lining
@@ -160,6 +160,8 @@ def _linework(
         lines += [shapely.boundary(lining.walkway), shapely.boundary(lining.niches)]
     if openings is not None and openings[k] is not None:
         lines.append(shapely.boundary(openings[k]))
+        # The roof falls from its height at openings to below the ground within the verge of a road over it.
+        lines.append(shapely.boundary(shapely.buffer(openings[k], VERGE - LIP, join_style="mitre")))
     sloped = slopes_across(table, k)
     for piece in (k, *table.near[k].tolist()):
         line = table.around[piece]

@@ -245,3 +245,19 @@ def test_footways_with_a_level_alone_are_no_structures(level, bench, tmp_path):
     assert any("way/101,road,repaired,layer-without-structure" in row for row in problems(scene)) == (
         level != "0"
     )
+
+
+@pytest.mark.parametrize("half", [1.0, 3.0, 4.5, 8.0])
+@pytest.mark.parametrize("kind", ["bridge", "tunnel"])
+def test_structures_that_end_beside_or_within_the_street_they_cross_pass_it(kind, half, bench, tmp_path):
+    places = CROSSING | {1: (-200, 0), 2: (-half, 0), 3: (half, 0), 4: (200, 0)}
+    scene = built(tmp_path, places, crossing({kind: "yes"}, {}))
+    assert not faults(bench, scene)
+    assert np.abs(heights(scene, 104)).max() < 0.05
+    assert np.abs(heights(scene, 101)).max() > 5.0
+    rows = [row for row in problems(scene) if row.startswith(f"way/101,road,repaired,short-{kind}")]
+    assert len(rows) == (2 if half < 4.0 else 0)
+    at = np.array([(x, y, 0.0) for x in (-2.8, -1.5, 1.5, 2.8) for y in (-20.0, -3.0, 0.0, 3.0, 20.0)])
+    caster, _ = bench.mesh_of(scene)
+    down = np.broadcast_to([0.0, 0.0, -1.0], at.shape)
+    np.testing.assert_allclose(1.0 - caster.cast(at + np.array([0, 0, 1.0]), down).range, 0.0, atol=0.05)

@@ -49,7 +49,7 @@ class Tube:
             surfaces, self.graph, osm=osm, frame=FRAME, height=graded, options=options
         )
         height = ground_below(self.table, graded)
-        openings = find_openings(self.table, height)
+        openings = find_openings(self.table, height, graph=self.graph)
         self.built = built_structures(self.table, height=height, openings=openings, options=options)
         self.mesh = numbered([built.mesh for built in self.built])
 

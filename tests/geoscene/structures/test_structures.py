@@ -77,7 +77,7 @@ class Town:
         self.ground_rows = surfaces
         self.table, self.problems = read_structures(surfaces, self.graph, osm=osm, frame=frame, height=graded)
         self.height = ground_below(self.table, graded)
-        self.openings = find_openings(self.table, self.height)
+        self.openings = find_openings(self.table, self.height, graph=self.graph)
         self.meshes = structure_meshes(self.table, height=self.height, openings=self.openings)
 
     def mesh(self, *, only=None):
@@ -700,7 +700,8 @@ def test_structures_end_at_the_extent(bridge, tunnel):
     extent = (-55.0, -100.0, 20.0, 100.0)
     for whole in (bridge, tunnel):
         cut = within_extent(whole.table, extent)
-        meshes = structure_meshes(cut, height=whole.height, openings=find_openings(cut, whole.height))
+        openings = find_openings(cut, whole.height, graph=whole.graph)
+        meshes = structure_meshes(cut, height=whole.height, openings=openings)
         solid = numbered(meshes)
         assert validate_mesh(solid).ok.all()
         assert solid.vertices[:, 0].min() == pytest.approx(-55.0, abs=2e-3)
