@@ -20,7 +20,7 @@ from geoscene.buildings.footprints import Polygons
 from geoscene.buildings.guesses import kinds_of, palettes, seeds
 from geoscene.buildings.heights import CLOUD_TOP, typical_height
 from geoscene.buildings.resolve import BuildingRow, texts
-from geoscene.buildings.roofs import RECTANGULAR
+from geoscene.buildings.roofs import RECTANGULAR, takes_gables
 from geoscene.buildings.table import Buildings, Texts
 from geoscene.support.graphs import components
 from geoscene.support.splitmix import uniform_at
@@ -155,6 +155,9 @@ def _guess(rows: Sequence[BuildingRow], known: _KnownRoofs, *, region: str) -> l
     pitched = np.where(told == 0, draw[0] < share, told > 0)
     shape = _shapes(near, outline, party=party, hipped=usual["hipped"], draw=draw[1])
     rectangular = (outline.fill >= RECTANGULAR) & ~outline.hole
+    for k in np.flatnonzero(pitched & (shape == "gabled") & ~rectangular).tolist():
+        if not takes_gables(footprint[k]):
+            shape[k] = "hipped"
     ridged = rectangular & ~np.isin(shape, ("hipped", "mansard"))
     across = ridged & (np.abs(np.cos(party - outline.axis)) > np.sqrt(0.5))
     run = np.where(across, outline.long / 2, np.where(ridged, outline.short / 2, outline.inner))

@@ -276,6 +276,12 @@ def _inward(polygon: Any, spec: RoofSpec) -> tuple[RoofCells | None, bool]:
     return replace(cells, field=_profile(cells.field, span, profile=profile)), len(skeleton.xy) > corners
 
 
+def takes_gables(footprint: Any) -> bool:
+    """Whether a gabled roof on the straight skeleton of each part of a footprint has a gable."""
+    spec = RoofSpec("gabled", 0.0, 1.0, 1.0)
+    return all(_inward(polygon, spec)[1] for polygon in shapely.get_parts(footprint))
+
+
 def _raise_roof(cells: RoofCells, spec: RoofSpec) -> Float:
     """Triangles (m, 3, 3) of a roof above cells whose field is the share of its height."""
     # the highest point has the tagged height even if the footprint excludes the ridge

@@ -165,6 +165,23 @@ def test_courtyards_odd_outlines_and_parts():
     assert not pitched(divided).any()
 
 
+def test_gables_are_guessed_only_where_they_can_be_built():
+    """No roof on outlines of all kinds has to be replaced by another shape: tables tell what is built."""
+    rng = np.random.default_rng(3)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, (60, 7)), axis=1)
+    radius = rng.uniform(5, 10, angle.shape)
+    outlines = [
+        shapely.Polygon(np.stack([40 * (k % 8) + r * np.cos(a), 40 * (k // 8) + r * np.sin(a)], axis=1))
+        for k, (a, r) in enumerate(zip(angle, radius, strict=True))
+    ]
+    frame = Frame.at(*GERMANY)
+    osm = town(GERMANY, [o for o in outlines if o.is_valid], roof__material="roof_tiles", height="9")
+    table, _ = read_buildings(osm, frame, options=GUESS)
+    assert {"gabled", "hipped"} <= set(table.roof_shape)
+    _, problems = build_solids(table, base=np.zeros(table.count))
+    assert [p.detail for p in problems if p.reason == "roof-fallback"] == []
+
+
 def test_without_guess_storeys_keep_the_height_of_the_walls():
     table = guessed(scattered(12), building__levels="2")
     level = without_guess(table, np.arange(len(table)) % 2 == 0)
