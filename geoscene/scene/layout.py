@@ -317,11 +317,20 @@ class Scene(Previewed):
         """A file that has the digest which the manifest states; raises SceneFormatError for another one."""
         stated = self.manifest.get("files", {}).get(path.name)
         if path not in self._verified_files and stated is not None:
-            if content_digest(path) != stated:
+            if content_digest(path) not in (stated, self._digest_since(path.name)):
                 fault = DIFFERS if path.exists() else f"is missing; {BUILD_AGAIN}"
                 raise SceneFormatError(f"{path}: {fault}")
             self._verified_files.add(path)
         return path
+
+    def _digest_since(self, name: str) -> str | None:
+        """Digest of a file that another drive has replaced since by building more tiles of the scene."""
+        with suppress(OSError, ValueError, LookupError, AttributeError):
+            manifest = json.loads(self.files.manifest.read_text("utf-8-sig"))
+            whole = manifest["digest"] == manifest_digest(manifest)
+            if whole and all(manifest[key] == self.manifest[key] for key in ("map", "options")):
+                return str(manifest["files"][name])
+        return None
 
     @functools.cached_property
     def _verified_files(self) -> set[Path]:

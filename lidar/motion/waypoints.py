@@ -133,7 +133,7 @@ def route_through(
         part = find_components(graph).weak[graph.tail[edge]]
         why = "along one-way streets and permitted turns"
         if part[best] != part[best - 1]:
-            why = "because the streets at the two are not connected in the map"
+            why = "because the streets at the two are not connected within the scene"
         raise RouteError(
             f"waypoint {best + 1} ({lat[best]:.6f}, {lon[best]:.6f}) cannot be reached from waypoint {best}"
             f" {why}"

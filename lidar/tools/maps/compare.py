@@ -26,7 +26,6 @@ from lidar.dataset.layout import Dataset, reading_file
 from lidar.errors import InputError
 from lidar.geometry.box_tree import Tree, lower_to_nearest, tree_of
 from lidar.geometry.georeference import Georeference
-from lidar.settings import settings_of
 from lidar.tools.maps.colors import ramp
 from lidar.tools.maps.picture import cloud_picture, with_key
 
@@ -123,6 +122,8 @@ def far_reasons(dataset: Dataset, scene: Scene, *, rows: Sequence[SurfaceDistanc
 
     rows : distances of the map to the scene
     """
+    from lidar.settings import settings_of  # noqa: PLC0415  (loads cameras and ray casting)
+
     high = [row.name for row in rows if row.points and row.p95_m > _FAR and row.name not in _MOVING]
     if not high:
         return []

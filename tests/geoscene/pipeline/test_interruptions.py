@@ -55,6 +55,7 @@ def route(tmp_path_factory):
 CHANGES = {
     "crs": "utm",
     "lod": 1,
+    "roofs": "flat",
     "relief": "full",
     "dem": "a file",
     "dem_gaps": "nearest",

@@ -9,12 +9,12 @@ import laspy
 import numpy as np
 import pytest
 import shapely
+from helpers import DEMO_BOX
 from helpers.programs import run_program
 from helpers.rasters import write_slope
 
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
-from geoscene.scene import SceneFiles
 from geoscene.sources import demo_path, read_osm
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
@@ -304,9 +304,10 @@ def test_invalid_flight_options_end_with_one_line_and_exit_code_2(scene, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_scene_without_roads_can_be_flown_over_but_not_driven_through(scene, tmp_path):
-    shutil.copytree(scene.path, tmp_path / "bare")
-    SceneFiles(tmp_path / "bare").road_graph.unlink()
+def test_a_scene_without_roads_can_be_flown_over_but_not_driven_through(tmp_path):
+    build(
+        read_osm(demo_path(), bounds=DEMO_BOX), tmp_path / "bare", options=BuildOptions(only=("buildings",))
+    )
     done = program("drive", "bare", "--route", "random", "-o", "x", cwd=tmp_path)
     assert done.returncode == 2
     assert "no drivable roads" in done.stderr

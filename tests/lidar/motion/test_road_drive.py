@@ -43,13 +43,13 @@ def scene(tmp_path_factory):
 @pytest.mark.parametrize(
     ("place", "says"),
     [
-        ((50, 200), "road there is not connected to drivable streets: it is closed to the public, or"),
-        ((150, 250), "the street there leaves the scene; choose a place further inside"),
-        ((30, 100), r", more than 50 m$"),
+        ((50, 200), "is .* m from the nearest drivable street.*road there is not connected"),
+        ((150, 250), "cannot be reached from waypoint 1 because .* are not connected within the scene"),
+        ((30, 100), r"is .* m from the nearest drivable street, more than 50 m$"),
     ],
 )
 def test_a_waypoint_on_a_road_that_cannot_be_driven_says_why(scene, place, says):
-    with pytest.raises(RouteError, match=rf"waypoint 2 .* m from the nearest drivable street.*{says}"):
+    with pytest.raises(RouteError, match=rf"waypoint 2 .* {says}"):
         plan_road_drive(scene, [lat_lon(50, 0), lat_lon(*place)], options=RoadDriveOptions("car"))
 
 

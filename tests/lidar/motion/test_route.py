@@ -221,7 +221,7 @@ def test_of_a_tunnel_and_a_street_above_it_a_waypoint_is_on_the_street():
 def test_streets_that_are_not_connected_are_named_as_the_reason():
     graph = road_graph([(0, 0), (200, 0), (0, 100), (200, 100)], [(0, 1), (2, 3)])
     with pytest.raises(
-        RouteError, match=r"waypoint 2 .* the streets at the two are not connected in the map"
+        RouteError, match=r"waypoint 2 .* the streets at the two are not connected within the scene"
     ):
         plan_route(graph, FRAME, spec=[lat_lon(50, 0), lat_lon(50, 100)])
 

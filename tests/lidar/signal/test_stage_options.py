@@ -69,7 +69,7 @@ def test_the_recipe_lists_weather_and_attacks_as_stages(scene):
     recipe = wanted.recipe(scene)
     assert [row["name"] for row in recipe["stages"]] == ["weather", "inject"]
     assert recipe["stages"][0]["amount"] == 3
-    assert recipe["settings"] == (("link", "on"), ("cloud", "1"), ("wetness", "0.65"))
+    assert recipe["settings"] == [["link", "on"], ["cloud", "1"], ["wetness", "0.65"]]
     assert not {"weather", "attacks"} & recipe.keys()
 
 

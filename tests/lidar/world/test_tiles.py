@@ -90,7 +90,7 @@ def test_the_option_is_short_for_the_setting_and_in_no_other_way_part_of_the_rec
     short = DriveOptions(relief="plain", **given)
     assert short == DriveOptions(settings=(("relief", "plain"),), **given)
     assert short.recording_settings.world.relief == "plain"
-    assert short.recipe(scene)["settings"] == (("relief", "plain"),)
+    assert short.recipe(scene)["settings"] == [["relief", "plain"]]
     assert "relief" not in DriveOptions(**given).recipe(scene)
     with pytest.raises(InputError, match="`settings` relief is given, too"):
         DriveOptions(relief="plain", settings=(("relief", "off"),), **given)
