@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 import lidar
+import lidar.simulation.frames
 from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.png import depth_to_counts, encode_png, flow_to_image, image_to_feature, read_png

@@ -74,7 +74,7 @@ def dataset(scene, tmp_path_factory):
     options = DriveOptions(
         route="random",
         duration=0.5,
-        seed=11,
+        seed=20,
         formats=("pcd",),
         settings=(("supersample", "1"), ("shadows", "off")),
         workers=1,

@@ -34,8 +34,12 @@ def graph(scene):
 
 @pytest.fixture(scope="module")
 def street(scene, graph):
-    """The middle of the right half of the longest street level but for its camber, (n, 2) every metre."""
-    for edge in np.argsort(-graph.length * (graph.twin >= 0)).tolist():
+    """The middle of the right half of the longest public street level but for its camber, (n, 2) every metre.
+
+    Vehicles park along public streets, not along service roads.
+    """
+    two_way = (graph.twin >= 0) & (graph.highway != "service")
+    for edge in np.argsort(-graph.length * two_way).tolist():
         line = shapely.linestrings(parallel(graph.geometry[edge], -graph.width[edge] / 4)[:, :2])
         xy = shapely.get_coordinates(shapely.line_interpolate_point(line, np.arange(0.0, line.length - 1.0)))
         z = ground_heights(scene, np.column_stack([xy, np.zeros(len(xy))]))

@@ -67,7 +67,7 @@ def drive(scene, tmp_path_factory):
         "--duration",
         3,
         "--seed",
-        4,
+        20,
         "--rig",
         folder / "rig.toml",
         "--format",
