@@ -65,7 +65,7 @@ class Samples:
 def samples(graph: RoadGraph) -> Samples:
     """Samples of all streets, of two-way streets once, at the heights of the graph."""
     places, edges = [np.empty((0, 3))], [np.empty(0, np.int64)]
-    for edge in np.flatnonzero((graph.twin < 0) | (graph.twin > np.arange(len(graph)))).tolist():
+    for edge in np.flatnonzero(graph.once).tolist():
         line = graph.geometry[edge]
         along = polylines.stations(line)
         count = max(int(along[-1] / SPACING), 1)

@@ -91,6 +91,17 @@ _WORDS = (
 )
 """What messages of Python become in plain words."""
 
+
+def schema_fault(schema: object, *, reads: int, remedy: str) -> str:
+    """Fault of a manifest of another schema version than this program ``reads``, and what to do.
+
+    remedy : for former versions
+    """
+    newer = isinstance(schema, int) and schema > reads
+    what = "a newer version wrote it: upgrade this program" if newer else remedy
+    return f"schema version {schema}, this program reads {reads}; {what}"
+
+
 _FORM = "contents of another form than expected"
 
 

@@ -256,7 +256,7 @@ def road_metres(graph: RoadGraph, extent: Sequence[float]) -> tuple[float, float
 
     A carriageway of two directions counts once.
     """
-    once = np.flatnonzero((graph.twin < 0) | (np.arange(len(graph)) < graph.twin))
+    once = np.flatnonzero(graph.once)
     if not len(once):
         return 0.0, 0.0
     lines = graph.geometry[once]

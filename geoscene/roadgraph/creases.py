@@ -46,7 +46,7 @@ def crease_lines(graph: RoadGraph, height: Height, *, area: Any | None = None) -
     height : of the ground, graded to it
     area   : shapely geometry, scene metres: roads far from it have none; all have by default
     """
-    single = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
+    single = graph.once
     on_ground = ~graph.bridge & ~graph.tunnel
     uneven = np.array([bool(np.abs(line[:, 2]).max() > _LEVEL) for line in graph.geometry], np.bool_)
     once = np.flatnonzero(single & on_ground & uneven)

@@ -84,9 +84,7 @@ def graded_ground(
     surveyed : the terrain shows the roads as they were built: it is kept beyond the shoulder, but where it is
                over a cut or under a fill with slopes of 1 to 2. Graded again, such ground stays as it is
     """
-    once = np.flatnonzero(
-        ((graph.twin < 0) | (graph.twin > np.arange(len(graph)))) & ~graph.bridge & ~graph.tunnel
-    )
+    once = np.flatnonzero(graph.once & ~graph.bridge & ~graph.tunnel)
     if not len(once):
         return ground
     begun = structure_starts(graph)
@@ -128,7 +126,7 @@ class Starts(Columns):
 
 def structure_starts(graph: RoadGraph) -> Starts:
     """The first metres of bridges and tunnels that lie on the ground of the road where they begin."""
-    single = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
+    single = graph.once
     structure = graph.bridge | graph.tunnel
     ends = np.unique(np.concatenate([graph.tail[structure], graph.head[structure]]))
     arms: dict[int, list[tuple[Float, float]]] = {}

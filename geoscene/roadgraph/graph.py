@@ -120,6 +120,12 @@ class RoadGraph:
         """Seconds (m,) that each edge takes at its speed limit."""
         return self.length / self.speed
 
+    @property
+    def once(self) -> Bools:
+        """Whether (m,) each edge is the first of its street, so that two-way streets count once."""
+        first: Bools = (self.twin < 0) | (self.twin > np.arange(len(self)))
+        return first
+
     def take(self, keep: Bools | NDArray[np.integer]) -> RoadGraph:
         """The chosen edges, in the given order, with the nodes they use.
 

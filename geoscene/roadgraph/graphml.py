@@ -87,8 +87,7 @@ def _text(value: str) -> str:
 
 def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[str, str]]:
     lon, lat = frame.to_geographic(graph.node_xyz[:, 0], graph.node_xyz[:, 1])
-    once = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
-    ends = np.concatenate([graph.tail[once], graph.head[once]])
+    ends = np.concatenate([graph.tail[graph.once], graph.head[graph.once]])
     streets = np.bincount(ends, minlength=len(graph.node_id))
     for k in range(len(graph.node_id)):
         at_node = [tag for name, tag in _FLAGS.items() if getattr(graph, name)[k]]

@@ -104,7 +104,7 @@ def _pairs(group: Ints) -> tuple[Ints, Ints]:
 
 def place_stations(graph: RoadGraph, *, spacing: float) -> Stations:
     """Stations at all vertices and, between them, at most ``spacing`` metres apart."""
-    once = np.flatnonzero((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
+    once = np.flatnonzero(graph.once)
     if not len(once):
         none = np.empty(0, np.int64)
         empty = np.empty(0), np.empty(0, np.bool_), np.empty((0, 2))

@@ -23,6 +23,7 @@ from geoscene.errors import (
     SceneFormatError,
     reading,
     reason_of,
+    schema_fault,
 )
 from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
@@ -317,7 +318,8 @@ class Scene(Previewed):
         """A file that has the digest which the manifest states; raises SceneFormatError for another one."""
         stated = self.manifest.get("files", {}).get(path.name)
         if path not in self._verified_files and stated is not None:
-            if content_digest(path) not in (stated, self._digest_since(path.name)):
+            found = content_digest(path)
+            if found != stated and found != self._digest_since(path.name):
                 fault = DIFFERS if path.exists() else f"is missing; {BUILD_AGAIN}"
                 raise SceneFormatError(f"{path}: {fault}")
             self._verified_files.add(path)
@@ -440,11 +442,8 @@ def open_scene(path: SceneLike) -> Scene:
         manifest = json.loads(manifest_file.read_text("utf-8-sig"))
         schema = manifest["schema"]
         if schema != SCHEMA:
-            newer = isinstance(schema, int) and schema > SCHEMA
-            remedy = "a newer version wrote it: upgrade this program" if newer else "build the scene again"
-            raise SceneFormatError(
-                f"{folder}: schema version {schema}, this program reads {SCHEMA}; {remedy}"
-            )
+            fault = schema_fault(schema, reads=SCHEMA, remedy="build the scene again")
+            raise SceneFormatError(f"{folder}: {fault}")
         if manifest.get("digest") != manifest_digest(manifest):
             raise SceneFormatError(f"{manifest_file}: {DIFFERS}")
         scene = Scene(folder, manifest, Frame.from_json(manifest["frame"]))

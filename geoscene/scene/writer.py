@@ -20,10 +20,9 @@ from geoscene.geometry.frames import Frame
 from geoscene.geometry.mesh import Mesh
 from geoscene.roadgraph import RoadGraph, write_graphml
 from geoscene.scene.geopackage import Layer, write_geopackage
-from geoscene.scene.layout import SCHEMA, SceneFiles, manifest_digest
+from geoscene.scene.layout import SCHEMA, SceneFiles, content_digest, manifest_digest
 from geoscene.scene.tile_files import write_shapes
 from geoscene.support.columns import write_columns
-from geoscene.support.digests import file_digest
 from geoscene.support.files import exclusive, write_json
 from geoscene.support.problems import Problem
 from geoscene.support.urls import redacted
@@ -168,7 +167,7 @@ class SceneWriter:
             **({"cut": cut} if cut else {}),
             "classes": {c.name.lower(): int(c) for c in Class},
             "materials": {name: m.code for name, m in materials().items()},
-            "files": {file.name: file_digest(file) for file in tables if file.exists()},
+            "files": {file.name: content_digest(file) for file in tables if file.exists()},
         }
         write_json(self.files.manifest, document | {"digest": manifest_digest(document)}, indent=1)
         if self.path.exists():

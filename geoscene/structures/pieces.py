@@ -351,9 +351,7 @@ def road_members(graph: RoadGraph, raised: SurfaceRows) -> Members:
     begin, stop = (
         np.searchsorted(raised.edge[order], np.arange(len(graph)), side=s) for s in ("left", "right")
     )
-    once = np.flatnonzero(
-        structure & (begin < stop) & ((graph.twin < 0) | (graph.twin > np.arange(len(graph))))
-    )
+    once = np.flatnonzero(structure & (begin < stop) & graph.once)
     arms = _arms(graph, once)
     count = len(once)
     line, rows, approach = (np.empty(count, object) for _ in range(3))

@@ -62,8 +62,7 @@ def without_ground_roads(
     ends     : (n,) object, (k, 2) places at which a piece's way begins or ends
     headroom : free height over roads
     """
-    single = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
-    once = np.flatnonzero(single & ~graph.bridge & ~graph.tunnel)
+    once = np.flatnonzero(graph.once & ~graph.bridge & ~graph.tunnel)
     lines = edge_lines(graph)[once]
     piece, road = shapely.STRtree(lines).query(
         polygon, predicate="dwithin", distance=float(graph.width[once].max(initial=0.0)) / 2

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from pyproj import CRS
 
-from geoscene.errors import reading
+from geoscene.errors import reading, schema_fault
 from geoscene.geometry.frames import Frame
 from geoscene.support.digests import digest
 from geoscene.support.files import delete_leftovers, write_json
@@ -292,9 +292,7 @@ def open_dataset(path: DatasetLike) -> Dataset:
         manifest = json.loads(manifest_path.read_text("utf-8-sig"))
         schema = manifest["schema"]
         if schema != SCHEMA:
-            newer = isinstance(schema, int) and schema > SCHEMA
-            remedy = "a newer version wrote it: upgrade this program" if newer else "drive again"
-            raise DatasetError(f"{folder}: schema version {schema}, this program reads {SCHEMA}; {remedy}")
+            raise DatasetError(f"{folder}: {schema_fault(schema, reads=SCHEMA, remedy='drive again')}")
         dataset = Dataset(folder, manifest, stored)
         _ = dataset.frame, dataset.start, dataset.crs, dataset.frames, int(manifest["frames_done"])
         _ = dataset.scene_path
@@ -349,14 +347,15 @@ def opened_rows(path: Path) -> Iterator[Iterator[dict[str, str]]]:
         reading(path, DatasetError, remedy=remedy, known=LidarError),
         path.open(newline="", encoding="utf-8-sig") as file,
     ):
+        file.seek(max(path.stat().st_size - 1, 0))
+        last = file.read()
+        file.seek(0)
         rows = csv.DictReader(file, strict=True)
         if not rows.fieldnames:
             raise ValueError("no line with the names of columns")
-        file.seek(max(path.stat().st_size - 1, 0))
-        if file.read() != "\n":
+        if last != "\n":
             raise ValueError("ends within a line")
-        file.seek(0)
-        yield csv.DictReader(file, strict=True)
+        yield rows
 
 
 def read_sensors(paths: Paths, *kinds: str) -> dict[str, dict[str, Any]]:
@@ -406,9 +405,8 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
         remove_dataset(path)
         return 0
     manifest = open_dataset(path).manifest
-    old, new = manifest["recipe"], json.loads(json.dumps(recipe))
-    if changed := _changed(old, new):
-        changes = ", ".join(f"{k} {_text(old.get(k))} (now {_text(new.get(k))})" for k in changed)
+    if changed := _changed(manifest["recipe"], recipe):
+        changes = ", ".join(f"{name} {_text(old)} (now {_text(new)})" for name, (old, new) in changed.items())
         raise DatasetError(
             f"{path}: holds a drive made with other options: {changes};"
             " set `overwrite` to replace it, or give another directory"
@@ -417,9 +415,10 @@ def prepare(path: Path, recipe: Mapping[str, Any], *, overwrite: bool) -> int:
     return int(manifest["frames_done"])
 
 
-def _changed(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Names of options that differ between recipes, as JSON gives them."""
-    return [key for key in {**old, **new} if old.get(key) != new.get(key)]
+def _changed(old: Mapping[str, Any], recipe: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Former and new values of options that differ between the recipe of a manifest and another one."""
+    new = json.loads(json.dumps(recipe))
+    return {key: (old.get(key), new.get(key)) for key in {**old, **new} if old.get(key) != new.get(key)}
 
 
 def finished(path: Path, recipe: Mapping[str, Any], *, progress: Progress = silent) -> Dataset | None:
@@ -429,9 +428,7 @@ def finished(path: Path, recipe: Mapping[str, Any], *, progress: Progress = sile
         return None
     dataset = open_dataset(path)
     manifest = dataset.manifest
-    if not manifest["frames_done"] == manifest["frames"] > 0 or _changed(
-        manifest["recipe"], json.loads(json.dumps(recipe))
-    ):
+    if not manifest["frames_done"] == manifest["frames"] > 0 or _changed(manifest["recipe"], recipe):
         return None
     own = own_files(path)
     for found in differences(path, read_checksums(paths.checksums), progress=progress):

@@ -18,6 +18,7 @@ from geoscene.geometry.frames import Frame
 from geoscene.pipeline.reach import RoadMap
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.routing import edge_lines
+from geoscene.roadgraph.walls import HEADROOM
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float
@@ -34,7 +35,6 @@ ROUTE_MARGIN_S = 15.0
 """Seconds at the speed limits by which the route of a drive that starts and ends at speed exceeds its record.
 
 It covers the braking distance at any speed that streets allow."""
-_HEADROOM = 2.5  # metres below a building from which on vehicles pass under it
 _SEARCH_M = 1.5  # metres above and below the road graph within which the road surface is searched
 _NO_ROADS = "has no drivable roads within its bounds; choose a place with roads"
 _ON_ROAD = 5.0  # metres from a waypoint to a road that is meant
@@ -148,7 +148,7 @@ def _buildings(scene: Scene) -> _Buildings:
 def _obstacles(buildings: _Buildings, *, height: float) -> NDArray[np.object_]:
     """What buildings take of the ground for vehicles of a height: without what these pass under."""
     footprints, min_height, passages, free = buildings
-    blocked = footprints[min_height < _HEADROOM]
+    blocked = footprints[min_height < HEADROOM]
     passages = passages[free > height]
     of, which = shapely.STRtree(passages).query(blocked, predicate="intersects")
     for k in np.unique(of).tolist():

@@ -56,8 +56,7 @@ def zones_of(graph: RoadGraph) -> Zones:
 
     Those with signals are united where they are close to each other: they are one junction to traffic.
     """
-    one = (graph.twin < 0) | (graph.twin > np.arange(len(graph)))
-    ends = np.concatenate([graph.tail[one], graph.head[one]])
+    ends = np.concatenate([graph.tail[graph.once], graph.head[graph.once]])
     arms = np.bincount(ends, minlength=len(graph.node_id))
     half = np.zeros(len(graph.node_id))
     np.maximum.at(half, graph.tail, graph.width / 2)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from geoscene.errors import SceneFormatError
 from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
+from geoscene.roadgraph.walls import HEADROOM
 from geoscene.scene import Scene
 from geoscene.scene.geopackage import Layer
 from lidar.geometry.poses import Trajectory
@@ -31,7 +32,6 @@ from lidar.traffic.trips import Trip, vehicle_trips
 from lidar.world.actors import Actors, first_feature, join_actors
 
 _ROAD = ("road", "lane_marking", "crossing", "parking")
-_HEADROOM = 2.5  # metres, height of vehicles that pass through buildings
 _BUILDING_AREA = 1.0  # square metres from which an obstacle is a building
 _POST_RADIUS = 0.2  # metres, of posts and trunks
 
@@ -259,7 +259,7 @@ def _union(
 def _obstacles(scene: Scene, area: shapely.Geometry) -> NDArray[np.object_]:
     """Footprints (k,) in an area of posts, trunks and buildings without a passage below."""
     parts: list[NDArray[np.object_]] = [np.empty(0, object)]
-    parts.append(building_obstacles(scene, height=_HEADROOM))
+    parts.append(building_obstacles(scene, height=HEADROOM))
     near = shapely.intersects(area, shapely.box(*scene.tile_boxes.T))
     for i, j in itertools.compress(scene.tile_indices, near):
         tile = scene.tile(i, j)
