@@ -6,6 +6,7 @@ where that is more than the memory. Byte offsets are those of LAS 1.4 R15 (ASPRS
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 from collections.abc import Iterator
@@ -28,6 +29,9 @@ _LONGEST = 4096
 
 _LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}
 """Layers of a chunk by point format: nine of the point, one each of colour, infrared and wave packets."""
+
+_SPARE, _SPARE_BYTES = 64, 16
+"""Points, and bytes' worth of points, that a chunk seems to hold beyond its own, at most."""
 
 
 @contextmanager
@@ -160,6 +164,35 @@ def _check_points(path: Path, header: Any) -> None:
         if not low <= header.point_count <= high:
             held = f"{high}" if low == high else f"{low} to {high}"
             raise _damaged(path, f"its header states {header.point_count} points, and its chunks hold {held}")
+        if low < high:
+            last = int(table[-1, 1])
+            file.seek(start + int(table[:-1, 1].sum()))
+            stated = header.point_count - low + 1
+            if _holds_more(file.read(last), laz, record=compressed[0].record_data, points=stated):
+                raise _damaged(path, f"its header states {header.point_count} points, and it holds more")
+
+
+def _holds_more(chunk: bytes, laz: Any, *, record: bytes, points: int) -> bool:
+    """Whether a chunk without its number of points holds far more than stated.
+
+    Its bytes last for the points that it holds, and for few more if these need parts of a bit each.
+    """
+    import lazrs  # noqa: PLC0415
+
+    few = _SPARE + _SPARE_BYTES * points // len(chunk)
+    file = io.BytesIO()
+    file.write((8 + len(chunk)).to_bytes(8, "little") + chunk)
+    lazrs.write_chunk_table(file, [(points, len(chunk))], laz)
+    file.seek(0)
+    reader = lazrs.LasZipDecompressor(file, record)
+    file.truncate(8 + len(chunk))
+    try:
+        reader.decompress_many(np.empty((points + few) * laz.item_size(), np.uint8))
+    except BaseException as error:
+        if isinstance(error, lazrs.LazrsError) or type(error).__name__ == "PanicException":
+            return False
+        raise
+    return True
 
 
 def _chunk_points(path: Path, file: IO[bytes], *, at: int, size: int, point: Any, layers: int) -> int:

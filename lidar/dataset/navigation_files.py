@@ -103,4 +103,6 @@ def read_samples(path: Path) -> Inertial:
         names = next(file, "").rstrip("\n").split(",")
         columns = [names.index(name) for name in _SAMPLES]
         values = np.loadtxt(file, delimiter=",", usecols=columns, ndmin=2).reshape(-1, len(columns))
+        if not (sound := np.isfinite(values).all(axis=1)).all():
+            raise ValueError(f"line {sound.argmin() + 2} has a number that is not finite")
         return Inertial(values[:, 0].astype(np.int64), *np.split(values[:, 1:], 4, axis=1))

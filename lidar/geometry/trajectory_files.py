@@ -61,9 +61,13 @@ def _parse(path: Path, lines: TextIO) -> Trajectory:
     if values.shape != (len(rows), len(_TRAJECTORY)):
         raise DatasetError(f"{path}: rows and columns disagree")
     time, quat, scale = values[:, 0], values[:, 4:8], values[:, 11]
-    finite = bool((np.abs(values) < _LARGEST).all())
-    if not (finite and (np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3).all() and (scale > 0).all()):
-        raise DatasetError(f"{path}: a row holds no pose")
+    with np.errstate(over="ignore", invalid="ignore"):
+        unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
+        sound = (np.abs(values) < _LARGEST).all(axis=1) & unit & (scale > 0)
+    if not sound.all():
+        raise DatasetError(f"{path}: line {sound.argmin() + 2} holds no pose")
+    if len(late := np.flatnonzero(np.diff(time) <= 0)):
+        raise DatasetError(f"{path}: line {late[0] + 3} is not later than the line before")
     return Trajectory(
         time.astype(np.int64), values[:, 1:4].copy(), quat.copy(), values[:, 8:11].copy(), scale.copy()
     )

@@ -88,9 +88,9 @@ def _from_poses(path: Path, recorded: Frame, *, frame: Frame) -> Trajectory:
     if (np.diff(time) <= 0).any() or time[-1] > _LATEST_NS:
         raise FormatError(f"{path}: its times do not increase, or span over eleven days")
     x, y = frame.from_geographic(lon, lat)
-    unit = np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3
-    if not (np.isfinite([x, y, h]).all() and unit.all()):
-        raise FormatError(f"{path}: a row holds no pose")
+    sound = np.isfinite([x, y, h]).all(axis=0) & (np.abs(np.linalg.norm(quat, axis=1) - 1) < 1e-3)
+    if not sound.all():
+        raise FormatError(f"{path}: line {sound.argmin() + 2} holds no pose")
     _check_speed(path, time, position=np.column_stack([x, y, h]))
     seconds = time * 1e-9
     at = np.append(np.arange(0, time[-1], _STEP_NS), time[-1])

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.classes import Class
+from geoscene.errors import reason_of
 from geoscene.scene.layout import SceneFiles
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.storage import shown, url_of
@@ -167,7 +168,7 @@ def _extent(dataset: Dataset) -> dict[str, Any] | None:
     """Bounds of the ego vehicle's poses; None of a drive without any."""
     path = dataset.paths.poses
     with reading_file(path), opened_rows(path) as rows:
-        places = np.array([(float(r["lon"]), float(r["lat"]), float(r["h"])) for r in rows])
+        places = np.array([_place_of(row, line=line) for line, row in enumerate(rows, 2)])
     if not len(places):
         if dataset.frames:
             raise DatasetError(
@@ -181,6 +182,17 @@ def _extent(dataset: Dataset) -> dict[str, Any] | None:
     south, low = places[:, 1:].min(axis=0).tolist()
     north, high = places[:, 1:].max(axis=0).tolist()
     return {"west": west, "south": south, "east": east, "north": north, "low_m": low, "high_m": high}
+
+
+def _place_of(row: Mapping[str, str], *, line: int) -> tuple[float, float, float]:
+    """Longitude, latitude and height of a row of poses; raises ValueError for one that holds no pose."""
+    try:
+        values = {name: float(text) for name, text in row.items() if name != "timestamp"}
+    except ValueError as error:
+        raise ValueError(f"line {line}: {reason_of(error)}") from None
+    if bad := [name for name, value in values.items() if not math.isfinite(value)]:
+        raise ValueError(f"line {line}: {bad[0]} is {row[bad[0]]}, not a finite number")
+    return values["lon"], values["lat"], values["h"]
 
 
 def _sensor(

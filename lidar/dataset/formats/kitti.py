@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import class_codes
 from geoscene.support.files import write_atomically
-from lidar.dataset.formats.table import PointLabels, Table, columns_as_rows, read_rows
+from lidar.dataset.formats.table import PointLabels, Table, check_column, columns_as_rows, read_rows
 
 # Moving road users have codes of their own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle.
 _MOVING = {10: 252, 31: 253, 30: 254, 32: 255, 13: 257, 18: 258, 20: 259}
@@ -29,9 +29,11 @@ def write(path: Path, table: Table) -> None:
 def read(path: Path) -> Table:
     """The table x, y, z and intensity (0 to 255) of a file, all float32.
 
-    Raises FormatError for a file whose length is not a multiple of 16 bytes.
+    Raises FormatError for a file whose length is not a multiple of 16 bytes, and for reflectances outside of
+    0 to 1.
     """
     x, y, z, reflectance = read_rows(path, 4).T
+    check_column(path, reflectance, name="reflectance", highest=1)
     return {"x": x, "y": y, "z": z, "intensity": reflectance * np.float32(255)}
 
 

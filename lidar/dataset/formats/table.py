@@ -181,6 +181,15 @@ def read_rows(path: Path, columns: int) -> NDArray[np.float32]:
     return found
 
 
+def check_column(path: Path, values: NDArray[np.float32], *, name: str, highest: int) -> None:
+    """Raise FormatError for values (n,) of a file outside of 0 to ``highest``."""
+    if len(bad := np.flatnonzero((values < 0) | (values > highest))):
+        raise FormatError(
+            f"{path}: row {bad[0]} has {name} {values[bad[0]]:g}, outside of 0 to {highest}, as have"
+            f" {len(bad)} in all; scale them"
+        )
+
+
 def number_in_header(path: Path, start: bytes) -> int:
     """The last word, a number from 0, of the line of a text header that begins with ``start``.
 

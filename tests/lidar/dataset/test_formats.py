@@ -47,6 +47,16 @@ STEPS = {
 """Largest error of a column by format; 0 for others."""
 
 
+@pytest.mark.parametrize(("name", "highest"), [("kitti", 1), ("nuscenes", 255)])
+@pytest.mark.parametrize("value", [-0.01, 1.01])
+def test_intensities_that_the_layout_does_not_have_are_told_with_their_row(tmp_path, name, highest, value):
+    points = np.zeros((4, {"kitti": 4, "nuscenes": 5}[name]), "<f4")
+    points[2, 3] = value * highest
+    points.tofile(tmp_path / "a.bin")
+    with pytest.raises(FormatError, match=rf"a\.bin: row 2 has .*, outside of 0 to {highest}, as have 1 "):
+        FORMATS[name].read(tmp_path / "a.bin")
+
+
 def table(n, seed=0):
     rng = np.random.default_rng(seed)
     xyz = rng.normal(size=(n, 3)).astype(np.float32) * 40

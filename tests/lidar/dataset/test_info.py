@@ -215,6 +215,19 @@ def test_a_sensor_without_a_rate_is_refused(copy, rate):
         describe(copy)
 
 
+@pytest.mark.parametrize("column", ["lat", "x", "qw"])
+def test_a_pose_that_is_no_number_is_told_with_its_line(copy, column):
+    path = copy / "poses.csv"
+    names, *lines = path.read_text().splitlines()
+    values = dict(zip(names.split(","), lines[2].split(","), strict=True)) | {column: "nan"}
+    lines[2] = ",".join(values.values())
+    path.write_text("\n".join([names, *lines]) + "\n")
+    done = run_program("lidar", "info", copy)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"poses.csv: damaged (line 4: {column} is nan, not a finite number)" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_box_that_has_lost_its_class_is_damage(copy):
     path = copy / "boxes.csv"
     lines = path.read_text().splitlines()

@@ -131,6 +131,18 @@ def test_trajectories_are_read_as_they_were_written(tmp_path):
         read_trajectory(path)
 
 
+@pytest.mark.parametrize(("column", "text", "told"), [(1, "nan", "holds no pose"), (0, "10", "not later")])
+def test_a_damaged_pose_of_a_trajectory_is_told_with_its_line(tmp_path, column, text, told):
+    still, turn, path = np.zeros((4, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (4, 1)), tmp_path / "trajectory.csv"
+    write_trajectory(path, Trajectory(np.arange(4) * 10, still, turn, still, np.ones(4)))
+    lines = path.read_text().splitlines()
+    words = lines[3].split(",")
+    words[column] = text
+    path.write_text("\n".join([*lines[:3], ",".join(words), lines[4]]) + "\n")
+    with pytest.raises(DatasetError, match=rf"trajectory\.csv: line 4 .*{told}"):
+        read_trajectory(path)
+
+
 def test_trajectories_need_poses_at_increasing_times():
     still, turn = np.zeros((4, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (4, 1))
     for time in ([0, 2, 2, 3], [0]):
