@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import class_codes
 from geoscene.support.files import write_atomically
+from geoscene.typing import Ints
 from lidar.dataset.formats.table import PointLabels, Table, check_column, columns_as_rows, read_rows
 
 # Moving road users have codes of their own: car, bicyclist, person, motorcyclist, bus, truck, other vehicle.
@@ -35,6 +36,16 @@ def read(path: Path) -> Table:
     x, y, z, reflectance = read_rows(path, 4).T
     check_column(path, reflectance, name="reflectance", highest=1)
     return {"x": x, "y": y, "z": z, "intensity": reflectance * np.float32(255)}
+
+
+def laser_order(table: Table) -> Ints:
+    """Rows (n,) of a table with rings in the order of KITTI's recordings.
+
+    Lasers follow each other from the top ring down, the points of each by azimuth from forward (the x axis),
+    counter-clockwise. Points of the same azimuth, as echoes of a pulse, keep their order.
+    """
+    azimuth = np.remainder(np.arctan2(table["y"], table["x"]), 2 * np.pi)
+    return np.lexsort((azimuth, -table["ring"].astype(np.int64)))
 
 
 def count(path: Path) -> int:

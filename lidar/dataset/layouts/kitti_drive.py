@@ -127,7 +127,11 @@ class KittiDrive:
         return boxes_by_frame(path, columns)
 
     def write_cloud(self, path: Path, *, row: int, labels: Path | None = None) -> None:
-        """Write a frame's cloud and, if wanted and recorded, SemanticKITTI's labels of its points."""
+        """Write a frame's cloud and, if wanted and recorded, SemanticKITTI's labels of its points.
+
+        Points are in the order of `lidar.dataset.formats.kitti.laser_order`; those recorded in KITTI's
+        format, which has no rings, keep theirs.
+        """
         source = self.clouds.files[row]
         if source.name.endswith(FORMATS["kitti"].suffix):
             copy_file(source, path)
@@ -136,7 +140,9 @@ class KittiDrive:
             if labels is not None and self.dataset.frame_file(recorded).exists():
                 copy_file(recorded, labels)
             return
-        table = still_points(self.clouds, self.trajectory, row=row)
+        points = still_points(self.clouds, self.trajectory, row=row)
+        order = kitti.laser_order(points)
+        table = {name: column[order] for name, column in points.items()}
         kitti.write(path, table)
         if labels is not None:
             found = recorded_labels(table, self.boxes.get(int(self.clouds.frames[row]), {}).values())

@@ -18,11 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.classes import Class
 from lidar.dataset.formats import read_table
+from lidar.dataset.formats.kitti import laser_order
 from lidar.dataset.ground_truth import read_boxes
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.dataset.layouts.coco import THINGS, encoded_mask
 from lidar.dataset.layouts.kitti_360 import SEQUENCE
+from lidar.dataset.layouts.kitti_drive import read_drive
 from lidar.dataset.layouts.waymo_components import RangeImageGrid, pixels
 from lidar.dataset.recorded import Stream, labelled_clouds, still_points
 from lidar.errors import DatasetError
@@ -238,6 +240,7 @@ def test_kitti_360_boxes_hold_the_points_of_their_road_users(dataset, kitti_360)
         assert numbers["timestamp"] == -1 or node.find("dynamic").text == "1"
     assert len(boxes) == counts["boxes"] == len(objects)
     owner, inside = {}, {True: [], False: []}
+    clouds, trajectory = read_drive(dataset).clouds, dataset.trajectory()
     for frame in range(5):
         world_from_unit = rigid(poses[frame, 1:])
         np.testing.assert_allclose(cam0[frame, 1:].reshape(4, 4), world_from_unit @ unit_from_cam0, atol=1e-9)
@@ -245,7 +248,9 @@ def test_kitti_360_boxes_hold_the_points_of_their_road_users(dataset, kitti_360)
         points = np.fromfile(path, "<f4").reshape(-1, 4)
         world = points[:, :3] @ (world_from_unit @ unit_from_cam0 @ np.linalg.inv(velo_from_cam0))[:3, :3].T
         world += (world_from_unit @ unit_from_cam0 @ np.linalg.inv(velo_from_cam0))[:3, 3]
-        recorded_cloud = read_table(dataset.path / "top" / "pcd" / f"{frame:06d}.pcd")
+        recorded_cloud = still_points(clouds, trajectory, row=frame)
+        order = laser_order(recorded_cloud)
+        recorded_cloud = {name: column[order] for name, column in recorded_cloud.items()}
         for key, transform in boxes.items():
             if key[2] not in (-1, frame):
                 continue
