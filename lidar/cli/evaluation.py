@@ -11,6 +11,7 @@ from cyclopts import Parameter
 from geoscene.errors import need
 from geoscene.support.console import Report, command_line, note_new_folder
 from geoscene.support.progress import progress_bar
+from geoscene.support.storage import url_of
 from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions
@@ -116,13 +117,13 @@ def detect(
     Parameters
     ----------
     dataset
-        Directory or URL of the dataset.
+        Directory or URL of the dataset, or a folder with clouds of KITTI or nuScenes.
     detector
         rules, learned, or the file of a model (lidar train).
     out
         Folder to make: NNNNNN.txt of each frame, or results.json.
     """
-    from lidar.dataset.layout import open_dataset  # noqa: PLC0415
+    from lidar.dataset.layout import Paths  # noqa: PLC0415
     from lidar.tools.detection.learned import read_detector  # noqa: PLC0415
     from lidar.tools.evaluation.detect import LAYOUTS  # noqa: PLC0415
     from lidar.tools.evaluation.detect import detect as detected  # noqa: PLC0415
@@ -132,13 +133,14 @@ def detect(
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
         counts = detected(
-            open_dataset(dataset),
+            dataset,
             out,
             layout=to,
             detector=read_detector(detector),
             overwrite=report.overwrite,
             progress=progress,
         )
-    words = command_line("lidar", "evaluate", out, "--against", dataset)
-    text = f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames; next: {words}"
+    text = f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames"
+    if url_of(dataset) or Paths(dataset).manifest.exists():
+        text += f"; next: {command_line('lidar', 'evaluate', out, '--against', dataset)}"
     return show({"path": str(out), **counts}, text, json=report.json)

@@ -2,17 +2,23 @@
 
 import json
 import math
+import shutil
 
 import numpy as np
 import pytest
 from helpers.programs import run_program
 from shapely import affinity, box
 
+from geoscene.classes import Class, class_codes
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts.kitti import true_lines
 from lidar.dataset.layouts.kitti_drive import read_drive
 from lidar.dataset.layouts.nuscenes import token_of
+from lidar.dataset.nuscenes_folder import key_clouds
+from lidar.dataset.recorded import cloud_points, still_points
 from lidar.errors import FormatError, InputError
+from lidar.tools.convert import convert
+from lidar.tools.detection.detector import Detections
 from lidar.tools.detection.learned import read_detector
 from lidar.tools.evaluation.detect import detect
 from lidar.tools.evaluation.kitti_detection import (
@@ -384,3 +390,149 @@ def test_labels_with_other_numbers_are_refused():
     with pytest.raises(FormatError, match="not finite"):
         labels_of(["Car " + "nan " * 15], name="x")
     assert set(OVERLAPS) == {"Car", "Pedestrian", "Cyclist"}
+
+
+class FarthestPoints:
+    """A detector that puts a box at each of the farthest points, whatever their order in the cloud."""
+
+    name = identity = "farthest"
+
+    def detect(self, cloud):
+        far = cloud.xyz[np.lexsort((*cloud.xyz.T, -np.linalg.norm(cloud.xyz, axis=1).round(3)))[:40]]
+        n = len(far)
+        size, kind = np.tile([4.0, 1.8, 1.5], (n, 1)), np.array(["vehicle", "person", "cycle"] * n)[:n]
+        return Detections(
+            far, size, np.linspace(-1.5, 1.5, n), np.linspace(0.9, 0.1, n), kind, np.ones(n, np.int64)
+        )
+
+
+@pytest.fixture(scope="module")
+def converted(drive, tmp_path_factory):
+    """The drive in the layouts of KITTI and nuScenes, by name."""
+    folder = tmp_path_factory.mktemp("converted")
+    names = ("kitti", "kitti-raw", "nuscenes")
+    return {name: convert(drive, folder / name, to=name).path for name in names}
+
+
+@pytest.mark.parametrize("name", ["kitti", "kitti-raw"])
+def test_a_folder_of_kitti_has_the_detections_of_the_drive(drive, converted, tmp_path, name):
+    made = detect(drive, tmp_path / "drive", layout="kitti", detector=FarthestPoints())
+    counts = detect(converted[name], tmp_path / "folder", layout="kitti", detector=FarthestPoints())
+    assert counts == made
+    assert made["boxes"] > 0
+    for own, other in zip(*(sorted((tmp_path / k).iterdir()) for k in ("drive", "folder")), strict=True):
+        assert own.read_text() == other.read_text()
+
+
+def test_a_folder_of_nuscenes_has_the_detections_of_the_drive(drive, converted, tmp_path):
+    results = []
+    for k, source in enumerate((drive, converted["nuscenes"])):
+        detect(source, tmp_path / str(k), layout="nuscenes", detector=FarthestPoints())
+        results.append(json.loads((tmp_path / str(k) / "results.json").read_text())["results"])
+    assert results[0].keys() == results[1].keys()
+    for token, boxes_there in results[0].items():
+        for own, other in zip(boxes_there, results[1][token], strict=True):
+            for name, value in own.items():
+                exact = isinstance(value, str)
+                assert other[name] == (value if exact else pytest.approx(value, abs=1e-6)), name
+
+
+def test_points_of_kitti_follow_its_lasers_from_the_top_and_labels_follow_the_points(drive, converted):
+    """Of real recordings, a laser begins where the azimuth passes from negative to positive at the front."""
+    sequence = converted["kitti"] / "sequences" / "00"
+    xyz = np.fromfile(sequence / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)[:, :3].astype(float)
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0])
+    laser = np.cumsum(np.append(False, np.diff(np.remainder(azimuth, 2 * np.pi)) < 0))
+    table = cloud_points(drive / "velodyne" / "pcd" / "000000.pcd")
+    rings = np.unique(table["ring"])
+    assert laser[-1] + 1 == len(rings)
+    assert np.bincount(laser).tolist() == np.bincount(table["ring"])[rings][::-1].tolist()
+    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    middle = np.array([np.median(elevation[laser == k]) for k in range(laser[-1] + 1)])
+    assert (np.diff(middle) < 0).all()
+    recorded = still_points(read_drive(open_dataset(drive)).clouds, open_dataset(drive).trajectory(), row=0)
+    road = np.column_stack([recorded[axis] for axis in "xyz"])[recorded["label"] == Class.ROAD]
+    codes = np.fromfile(sequence / "labels" / "000000.label", "<u4") & 0xFFFF
+    code = int(class_codes().semantic_kitti[Class.ROAD])
+    ours = np.isin(class_codes().semantic_kitti[recorded["label"]], code).sum()
+    assert (codes == code).sum() == ours
+    assert {tuple(p) for p in road.tolist()} <= {tuple(p) for p in xyz[codes == code].tolist()}
+
+
+def damaged_calibration(line, text):
+    """Lines of a calibration of which one is another."""
+    rows = {
+        "P2": "700 0 600 0 0 700 180 0 0 0 1 0",
+        "R0_rect": "1 0 0 0 1 0 0 0 1",
+        "Tr_velo_to_cam": "0 -1 0 0 0 0 -1 0 1 0 0 0",
+    } | {line: text}
+    return "".join(f"{name}: {values}\n" for name, values in rows.items() if values)
+
+
+@pytest.mark.parametrize(
+    ("line", "text", "told"),
+    [
+        ("Tr_velo_to_cam", "0 1 0 0 0 0 -1 0 1 0 0 0", "Tr_velo_to_cam mirrors"),
+        ("Tr_velo_to_cam", "0 0 0 0 0 0 0 0 0 0 0 0", "Tr_velo_to_cam holds no rotation"),
+        ("R0_rect", "1 0 0 0 1 0 0 0 -1", "R0_rect mirrors"),
+        ("R0_rect", "", "has no row R0_rect"),
+        ("P2", "", "has no row P2"),
+        ("P2", "nan 0 600 0 0 700 180 0 0 0 1 0", "P2 has a number that is not finite"),
+        ("P2", "700 0 600 0 0 700", "P2 has 6 numbers, not 12"),
+        ("P2", "a 0 600 0 0 700 180 0 0 0 1 0", "'a' is not a number"),
+        ("P2", "-700 0 600 0 0 700 180 0 0 0 1 0", "focal length"),
+    ],
+)
+def test_a_damaged_calibration_of_kitti_is_told_in_a_line(tmp_path, line, text, told):
+    for folder in ("velodyne", "calib"):
+        (tmp_path / "k" / folder).mkdir(parents=True)
+    np.ones((8, 4), "<f4").tofile(tmp_path / "k" / "velodyne" / "000000.bin")
+    (tmp_path / "k" / "calib" / "000000.txt").write_text(damaged_calibration(line, text))
+    run = run_program("lidar", "detect", tmp_path / "k", "--to", "kitti", "-o", tmp_path / "out", "-q")
+    assert run.returncode == 2
+    assert "000000.txt" in run.stderr
+    assert told in run.stderr
+    assert run.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "told"),
+    [
+        ("calibrated_sensor", {"rotation": [0.0, 0.0, 0.0, 0.0]}, "no unit quaternion"),
+        ("calibrated_sensor", {"rotation": np.diag([1.0, 1.0, -1.0]).tolist()}, "no unit quaternion"),
+        ("calibrated_sensor", {"translation": [0.0, math.nan, 0.0]}, "no place"),
+        ("calibrated_sensor", {"camera_intrinsic": [[math.nan] * 3] * 3}, "no finite 3 x 3 matrix"),
+        ("ego_pose", {"rotation": [math.nan, 0.0, 0.0, 0.0]}, "no unit quaternion"),
+        ("sample", {"timestamp": 0}, "is not later"),
+        ("sample_data", {"filename": "samples/none.pcd.bin"}, "is missing"),
+        ("sample_data", {"ego_pose_token": "x"}, "'x' is missing"),
+    ],
+)
+def test_damaged_tables_of_nuscenes_are_told_in_a_line(converted, tmp_path, table, change, told):
+    (tmp_path / "n").mkdir()
+    shutil.copytree(converted["nuscenes"] / "v1.0-mini", tmp_path / "n" / "v1.0-mini")
+    (tmp_path / "n" / "samples").symlink_to(converted["nuscenes"] / "samples")
+    path = tmp_path / "n" / "v1.0-mini" / f"{table}.json"
+    path.write_text(json.dumps([row | change for row in json.loads(path.read_text())]))
+    with pytest.raises(FormatError, match=r"\.json|none.pcd.bin") as raised:
+        key_clouds(tmp_path / "n")
+    assert told in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_clouds_without_calibration_or_tables_are_searched_in_their_own_frame(tmp_path):
+    cloud = np.zeros((50, 5), "<f4")
+    cloud[:, 0], cloud[:, 2] = np.linspace(5, 30, 50), -1.0
+    (tmp_path / "k" / "velodyne").mkdir(parents=True)
+    cloud[:, :4].tofile(tmp_path / "k" / "velodyne" / "a.bin")
+    cloud.tofile(tmp_path / "n.pcd.bin")
+    detect(tmp_path / "k", tmp_path / "out_k", layout="kitti", detector=FarthestPoints())
+    found = read_labels(tmp_path / "out_k" / "a.txt")
+    assert found.place[0] == pytest.approx([0.0, 1.0 + 0.75, 30.0])  # x right, y down, z forward; lower face
+    assert (found.box == -1).all()
+    detect(tmp_path, tmp_path / "out_n", layout="nuscenes", detector=FarthestPoints())
+    results = json.loads((tmp_path / "out_n" / "results.json").read_text())["results"]
+    assert results["n"][0]["translation"] == pytest.approx([30.0, 0.0, -1.0])
+    with pytest.raises(InputError, match="holds clouds of kitti; give kitti"):
+        detect(tmp_path / "k", tmp_path / "no", layout="nuscenes")
