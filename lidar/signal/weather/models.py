@@ -79,7 +79,8 @@ def lisa(
     """The returns in rain or snow (rate in mm/h) or fog, which only dims.
 
     A particle matters only if it returns more than the threshold, which it cannot beyond a distance; so of
-    the particles of a beam only those nearer than that are drawn.
+    the particles of a beam only those nearer than that are drawn. Returns of reflectance 0 are lost, as in
+    the authors' program.
     """
     threshold = 0.9 / lidar.max_range**2
     power = reflectance * np.exp(-2 * extinction * distance) / distance**2
@@ -92,7 +93,7 @@ def lisa(
         best, place, bright = _chosen_particles(
             distance, kind=kind, rate=rate, extinction=extinction, rng=rng, lidar=lidar
         )
-    hit = (best > threshold) & (~seen if lidar.last else (best > power))
+    hit = (best > threshold) & (~seen if lidar.last else (best > power)) & (reflectance > 0)
     state = np.where(hit, SCATTERED, np.where(seen, TARGET, LOST)).astype(np.uint8)
     return RemainingReturns(state, np.where(hit, place, noisy), np.where(hit, bright, measured))
 

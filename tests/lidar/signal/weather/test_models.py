@@ -96,6 +96,20 @@ def test_lisas_last_return_is_the_target_where_it_is_seen():
     assert np.any(strongest.state == SCATTERED)
 
 
+@pytest.mark.parametrize("last", [False, True])
+def test_lisa_loses_returns_of_reflectance_zero(last):
+    """They are not replaced by drops, although these are brighter."""
+    dark, dim = (
+        lisa(
+            np.full(3000, 15.0), np.full(3000, reflectance), kind="rain", rate=100, extinction=0.01,
+            rng=RNG(0), lidar=Lidar(last=last),
+        )
+        for reflectance in (0, 1e-9)
+    )  # fmt: skip
+    assert np.all(dark.state == LOST)
+    assert np.any(dim.state == SCATTERED)
+
+
 # Goodin
 
 
