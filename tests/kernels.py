@@ -1,6 +1,8 @@
 """Write the lists of compiled functions of both packages, ``kernels.json``, by what commands compile.
 
 python -P tests/kernels.py   (-P: tests/geoscene must not hide the package)
+
+The processor must be of the highest of `LEVELS`.
 """
 
 import importlib
@@ -13,6 +15,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from geoscene.support.compiled import LEVELS
 from geoscene.support.kernels import LIST, PACKAGES, Kernel, describe_type
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -72,13 +75,14 @@ def find_module(folder: str, module: str, function: str) -> str:
     raise LookupError(f"{folder}/{module}.py: no function {function}")
 
 
-def record() -> dict[str, dict[str, int]]:
-    """Kernels as JSON and the bytes of their machine code, by use."""
+def record(level: str) -> dict[str, dict[str, int]]:
+    """Kernels as JSON and the bytes of their machine code, by use, on processors of a level of x86-64."""
     known: set[str] = set()
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         cache = Path(folder, "cache")
         settings = {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(ROOT)}
+        settings |= {"NUMBA_CPU_NAME": level, "NUMBA_CPU_FEATURES": ""}
         for use, commands in USES.items():
             for program, *words in commands:
                 command = [sys.executable, "-m", program, *words]
@@ -89,6 +93,17 @@ def record() -> dict[str, dict[str, int]]:
             found[use] = {entry: size for entry, size in listed.items() if entry not in known}
             known |= listed.keys()
     return found
+
+
+def by_level(found: Mapping[str, Mapping[str, Mapping[str, int]]]) -> dict[str, dict[str, int]]:
+    """Kernels by use, and by use and level those that not all levels have; ``found`` is by level and use."""
+    keyed: dict[str, dict[str, int]] = {}
+    for use in USES:
+        common = set.intersection(*(set(uses[use]) for uses in found.values()))
+        for level, uses in found.items():
+            keyed[f"{use} {level}"] = {e: size for e, size in uses[use].items() if e not in common}
+        keyed[use] = {e: size for e, size in next(iter(found.values()))[use].items() if e in common}
+    return keyed
 
 
 def write_lists(found: Mapping[str, Mapping[str, int]]) -> None:
@@ -104,4 +119,4 @@ def write_lists(found: Mapping[str, Mapping[str, int]]) -> None:
 
 
 if __name__ == "__main__":
-    write_lists(record())
+    write_lists(by_level({level: record(level) for level in LEVELS}))

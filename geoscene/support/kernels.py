@@ -2,7 +2,8 @@
 
 ``kernels.json`` of a package lists its compiled functions by use, with the types of their arguments: a name
 for numbers; a name, the dimensions and the layout for arrays (``float64 2 C``); a list for tuples, and one
-under the name of the class for named tuples. Functions that it lacks are compiled on their first call.
+under the name of the class for named tuples. Types that depend on the width of the processor's vectors are
+listed under the use and a level of x86-64. Functions that it lacks are compiled on their first call.
 ``tests/kernels.py`` writes the lists.
 
 python -m geoscene.support.kernels [USE...]   compiles what both packages list, or what they list for the uses
@@ -27,7 +28,7 @@ import numpy as np
 from numba.core import types
 from numba.np.numpy_support import from_dtype
 
-from geoscene.support.compiled import is_compiled
+from geoscene.support.compiled import is_compiled, level
 from geoscene.support.processes import run_tasks
 
 PACKAGES = ("geoscene", "lidar")
@@ -115,13 +116,17 @@ def _named(name: str) -> Any:
 
 
 def read_kernels(uses: Sequence[str] = ()) -> list[Kernel]:
-    """Kernels that the installed packages list for some uses, or for all; first those with most code."""
+    """Kernels that the installed packages list for some uses, or for all, on processors of this level.
+
+    Of each use and package those with most code are first.
+    """
     found = []
     for package in PACKAGES:
         if find_spec(package):
             listed = json.loads(files(package).joinpath(LIST).read_text("utf-8"))
-            for use, entries in listed.items():
-                if not uses or use in uses:
+            for key, entries in listed.items():
+                use, _, needs = key.partition(" ")
+                if (not uses or use in uses) and needs in ("", level()):
                     found += [Kernel(name, tuple(arguments)) for name, *arguments in entries]
     return found
 

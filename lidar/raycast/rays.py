@@ -25,6 +25,7 @@ EXACTLY = (0.0, 0.0)
 
 
 _NO_OFFSETS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
+_NO_OFFSETS.flags.writeable = False  # as all directions and offsets; else kernels would be compiled again
 _NONE, _NO_TIMES = np.empty(0, np.int64), np.empty(0, np.float32)
 _ENDLESS = np.array([np.inf])
 

@@ -175,6 +175,18 @@ def test_each_use_of_a_program_is_listed():
     assert all(kernels.read_kernels([use]) for use in ("build", "drive", "cameras", "traffic"))
 
 
+def test_functions_are_listed_for_the_level_of_this_processor_alone(monkeypatch):
+    """Packets of rays are as wide as the processor's vectors, and so are the types of what casts them."""
+    listed = {}
+    for level in compiled.LEVELS:
+        monkeypatch.setattr(kernels, "level", lambda level=level: level)
+        listed[level] = [
+            k.arguments for k in kernels.read_kernels(["drive"]) if k.name.endswith("kernels.cast")
+        ]
+    assert [len(casts) for casts in listed.values()] == [1, 1]
+    assert listed["x86-64-v4"] != listed["x86-64-v3"]
+
+
 @pytest.mark.parametrize("kernel", LISTED, ids=lambda kernel: kernel.name)
 def test_types_are_read_as_they_are_described(kernel):
     assert kernel.function.py_func.__name__ == kernel.name.rpartition(".")[2]

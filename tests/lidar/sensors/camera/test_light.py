@@ -172,7 +172,9 @@ class SignalWorld(MeshWorld):
     def __init__(self):
         head = shapes()["traffic_signals"]
         super().__init__(
-            concatenate([plate(-30.0, tilt=0.0), replace(head, feature=np.full(len(head), FEATURE))])
+            concatenate(
+                [plate(-30.0, tilt=0.0), replace(head, feature=np.full(len(head), FEATURE, np.int32))]
+            )
         )
         self.wall = len(self.mesh) - len(head)
         back = self.mesh.take(np.arange(self.wall))
