@@ -77,7 +77,7 @@ def triangle_areas(xy):
 @example(footprint(1389), 0.8)
 @example(footprint(5620), 0.8)
 @given(footprints(), st.sampled_from([0.2, 0.5, 0.8]))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_the_skeleton_roof_cut_at_a_height_is_the_footprint_moved_in_by_as_much(polygon, share):
     skeleton = straight_skeleton(polygon)
     assert skeleton is not None
@@ -157,9 +157,9 @@ def test_every_shape_over_any_footprint_keeps_its_floor_and_its_heights(
 @pytest.mark.parametrize("shape", SHAPES[1:])
 def test_shells_are_closed_over_all_but_the_oddest_footprints(shape):
     # those that the grid breaks are found and made flat; one in a hundred would be too many
-    made = [footprint(seed) for seed in range(120)]
+    made = [footprint(seed) for seed in range(60)]
     shells = [roof_shell(p, RoofSpec(shape, 0.0, 10.0, 3.0)) for p in made if p is not None]
-    assert len(shells) > 80
+    assert len(shells) > 40
     assert sum(not solid(shell) or "flat" in fallback for shell, fallback in shells) <= 1
 
 

@@ -38,6 +38,7 @@ def assert_off_carriageways(path):
     return plan, problems
 
 
+@pytest.mark.full
 def test_no_object_of_the_demo_stands_on_a_carriageway():
     plan, _ = assert_off_carriageways(demo_path())
     assert (plan.furniture.place_source == "moved").sum() > 100

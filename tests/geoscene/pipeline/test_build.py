@@ -218,6 +218,7 @@ def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, mon
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
 
+@pytest.mark.full
 def test_rebuild_reuses_no_tile_of_another_schema(osm, scene, tmp_path, monkeypatch):
     shutil.copytree(scene.path, tmp_path / "scene")
     made, whole = [], geoscene.pipeline.tiles.build_tile

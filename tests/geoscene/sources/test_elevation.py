@@ -276,6 +276,7 @@ def program(*words):
     return run_program("geoscene", "build", *words)
 
 
+@pytest.mark.full
 def test_the_program_builds_on_tiles_and_credits_them(serve, tmp_path):
     bounds = read_osm(demo_path()).bounds
     lon, lat = (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2

@@ -228,6 +228,7 @@ def test_every_row_of_the_registry_is_complete():
         assert callable(reader_of(name))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("roads", [True, False])
 def test_the_program_builds_with_buildings_of_overture(demo, tmp_path, roads):
     words = ["build", "--source", f"overture={demo}", "-o", tmp_path / "s", "--json"]

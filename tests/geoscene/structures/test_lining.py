@@ -126,10 +126,10 @@ def test_walkways_stand_beside_the_carriageway_and_vehicles_have_its_whole_width
 
 
 def test_niches_are_set_back_into_the_wall_below_their_ceiling():
-    long = {1: (-700, 0), 2: (-300, 0), 3: (300, 0), 4: (700, 0)}
+    long = {1: (-400, 0), 2: (-150, 0), 3: (150, 0), 4: (400, 0)}
     tube = Tube("plain", places=long)
     count = tube.guessed("niches")
-    assert 600 / 150 <= count <= 600 / 50
+    assert 300 / 150 <= count <= 300 / 50
     low = np.concatenate([walls_along(tube, NICHE - 0.4, side) for side in (-1.0, 1.0)])
     wall = np.median(low)
     inside = low > wall + 0.3

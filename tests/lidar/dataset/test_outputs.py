@@ -532,6 +532,7 @@ def _sixteen_bit_colour(path):
     return image.copy().view(">u2").reshape(height, width, 3).astype(int)
 
 
+@pytest.mark.full
 def test_a_resumed_drive_counts_all_of_its_points(scene, rig, recorded, tmp_path):
     dataset, summary = recorded
     assert set(summary.points) == {"top", "ahead"}

@@ -43,6 +43,7 @@ def planned(scene, options, kit):
     )
 
 
+@pytest.mark.full
 def test_scanners_are_off_between_survey_lines_by_default(scene, tmp_path):
     options = DriveOptions(rig="drone", survey="all", altitude=90.0, overlap=0.0, formats=("pcd",))
     kit = load_rig("drone")

@@ -122,6 +122,7 @@ def test_feature_numbers_follow_those_of_the_scene(actors, scene):
     np.testing.assert_array_equal(actors.feature, beyond + np.arange(len(actors)))
 
 
+@pytest.mark.full
 def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, scene, ego):
     again = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=5, options=BUSY)
     for name in ("shape", "size", "time_ns", "position", "angles", "velocity"):

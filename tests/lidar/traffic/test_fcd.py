@@ -249,6 +249,7 @@ def test_road_users_that_would_touch_the_ego_are_removed(scene, graph, street, t
             assert near.min() > 1.6
 
 
+@pytest.mark.full
 def test_the_same_file_and_seed_give_the_same_bytes(scene, graph, street, tmp_path):
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, 20.0 + np.arange(6.0)))
     net = net_at(tmp_path / "n.net.xml")

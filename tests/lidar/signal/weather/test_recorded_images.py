@@ -51,6 +51,7 @@ def test_weather_on_a_record_gives_the_images_of_the_drive(scene, options, tmp_p
         assert np.array_equal(plain[1][truth["changed"]], truth["removed"])
 
 
+@pytest.mark.full
 def test_bytes_do_not_depend_on_workers(scene, options, tmp_path):
     for workers in (1, 2):
         drive(scene, tmp_path / str(workers), options=replace(options, weather=FOG, workers=workers))

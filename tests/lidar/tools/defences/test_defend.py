@@ -107,6 +107,7 @@ def test_a_verdict_has_a_row_for_each_return_and_scores_against_the_truth(attack
     }
 
 
+@pytest.mark.full
 def test_defences_see_no_ground_truth(attacked, tmp_path):
     """The verdicts are the same without truth files and with other labels."""
     blind = tmp_path / "blind"

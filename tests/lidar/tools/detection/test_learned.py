@@ -268,6 +268,7 @@ def test_a_road_user_is_one_cluster() -> None:
     assert vehicle[FEATURES.index("points")] == pytest.approx(np.log(200), abs=0.1)
 
 
+@pytest.mark.full
 def test_data_that_cannot_be_learned_from_are_refused(empty: Path, recorded: Any, tmp_path: Path) -> None:
     out = tmp_path / "model.npz"
     with pytest.raises(InputError, match="no road users in the clouds; drive with `traffic`"):

@@ -81,6 +81,7 @@ def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
     assert not [p for p in tmp_path.iterdir() if "voxels" in p.name or "part" in p.name]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("voxel", [None, 0.5])
 def test_memory_does_not_grow_with_the_number_of_frames(tmp_path, monkeypatch, voxel):
     monkeypatch.setattr("lidar.tools.maps.squares._SHRINK_AT", 200_000)

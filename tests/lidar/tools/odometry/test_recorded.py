@@ -118,12 +118,13 @@ def test_the_first_motion_is_that_of_the_vehicle_not_of_its_rings(scene, tmp_pat
     np.testing.assert_allclose(found[:3, 3], ahead, atol=0.05)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("method", "share"),
     [
         ("small_gicp", 0.01),
-        pytest.param("orb+depth", 0.03, marks=pytest.mark.full),
-        pytest.param("stereo", 0.05, marks=pytest.mark.full),
+        ("orb+depth", 0.03),
+        ("stereo", 0.05),
     ],
 )
 def test_methods_follow_a_recorded_drive(drive, tmp_path, method, share):
@@ -162,6 +163,7 @@ def test_images_have_the_same_poses_in_every_run_and_without_the_truth(drive, tm
         assert path.read_bytes() == (tmp_path / "second" / path.name).read_bytes()
 
 
+@pytest.mark.full
 def test_sensors_that_do_not_fit_are_refused(drive):
     def refused(method, *names):
         with pytest.raises((InputError, DatasetError)) as error:
@@ -176,6 +178,7 @@ def test_sensors_that_do_not_fit_are_refused(drive):
     assert not (drive.path.parent / "no").exists()
 
 
+@pytest.mark.full
 def test_sweeps_hold_what_is_within_range(drive):
     points, share = scans_of(drive, least=5.0, most=20.0).sweep(3)
     distance = np.linalg.norm(points - [1.0, 0, 1.9], axis=1)

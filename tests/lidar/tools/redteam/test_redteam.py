@@ -288,6 +288,7 @@ use = ["shadow"]
 """
 
 
+@pytest.mark.full
 def test_attacks_without_truth_files_of_clouds_are_told_from_the_drive_without_attack(
     written: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -332,6 +333,7 @@ def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> Non
     np.testing.assert_equal(again.matrix.success, first.matrix.success)
 
 
+@pytest.mark.full
 def test_detectors_stand_side_by_side_on_the_same_drives(
     written: Callable[..., Path], tmp_path: Path
 ) -> None:

@@ -77,6 +77,7 @@ def test_repeated_sweep_keeps_finished_drives_and_mends_the_others(scene, tmp_pa
     assert [path.stat().st_mtime_ns for path in clouds][1:] == times[1:]
 
 
+@pytest.mark.full
 def test_unchanged_drives_are_kept_without_planning_them(scene, tmp_path, monkeypatch):
     file, log = written(tmp_path / "grid.toml", scene), tmp_path / "planned"
     plan_drive = lidar.simulation.drive.plan_drive
@@ -239,6 +240,7 @@ def test_maps_are_built_once_with_their_options_and_shared(tmp_path, monkeypatch
     assert again.rows[:2] == first.rows[:2]
 
 
+@pytest.mark.full
 def test_a_map_that_cannot_be_built_fails_its_drives_and_the_others_go_on(tmp_path):
     write_street(tmp_path / "street.osm")
     far = write_slope(tmp_path / "far.tif", (10.0, 50.0, 10.01, 50.01))
@@ -295,6 +297,7 @@ def test_errors_of_maps_are_found_before_the_first_build(tmp_path, changes, mess
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.full
 def test_a_map_is_built_into_a_scene_that_is_kept(tmp_path):
     write_street(tmp_path / "street.osm")
     text = '[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.2\n[grid]\nscene = ["{}"]\nseed = [1]\n'

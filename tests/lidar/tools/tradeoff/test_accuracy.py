@@ -427,6 +427,7 @@ def test_units_that_no_sensor_has_are_refused(scene, tmp_path, images, accuracy,
         pick_settings(scene, replace(DRIVE, rig=str(rig)), wanted=AccuracyOptions(accuracy))
 
 
+@pytest.mark.full
 def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
     rig = tmp_path / "eye.toml"
     rig.write_text(EYE.replace("IMAGES", '["rgb", "depth"]'))
@@ -452,6 +453,7 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
         pick_settings(scene, replace(options, settings=(("supersample", "2"),)), wanted=by)
 
 
+@pytest.mark.full
 def test_the_program_says_what_it_picks_and_what_was_reached(scene, tmp_path):
     words = ["drive", scene.path, "--route", "random", "--duration", "0.5", "--rig", "vlp16", "--seed", "3"]
     words += ["--format", "pcd"]
@@ -487,6 +489,7 @@ def test_a_missed_accuracy_or_budget_is_named():
     assert replace(done, summary=replace(summary, resumed=2)).speed is None
 
 
+@pytest.mark.full
 def test_drives_of_a_sweep_have_picks_of_their_own(scene, between, tmp_path, monkeypatch):
     (tmp_path / "grid.toml").write_text(
         f'[drive]\nroute = "random"\nrig = "vlp16"\nduration = 0.5\nformat = ["pcd"]\nseed = 3\n'
@@ -510,6 +513,7 @@ def test_a_budget_leaves_time_for_planning_and_loading():
         pace_of("2x-realtime", **more)
 
 
+@pytest.mark.full
 def test_a_drive_within_a_budget_is_planned_once(scene, tmp_path, monkeypatch):
     plans = []
 

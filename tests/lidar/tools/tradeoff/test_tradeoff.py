@@ -172,6 +172,7 @@ def test_georeferencing_is_within_its_promise(found):
     assert 0 <= found.georeferencing["99.9_m"] <= found.georeferencing["max_m"] <= 1e-4
 
 
+@pytest.mark.full
 def test_errors_repeat_by_seed(scene, found):
     again = compare_settings(scene, DRIVE, compared=FEW)
     assert [r.error for r in again.comparisons[0].rows] == [r.error for r in found.comparisons[0].rows]
@@ -254,6 +255,7 @@ def test_bad_input_is_one_clear_line(scene, scene_utm):
         TradeoffOptions(frames=1)
 
 
+@pytest.mark.full
 def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
     compared = TradeoffOptions(
         ("forests", "trees", "barriers", "furniture"), frames=2, pulses=200, reference_rays=7

@@ -146,6 +146,7 @@ def test_of_several_scanners_the_nearest_sweeps_are_shown_together(town_drive, t
     assert not any("lidar_front" in note for note in summary.notes)
 
 
+@pytest.mark.full
 def test_of_a_drive_that_is_too_large_each_nth_frame_is_shown(town_drive, tmp_path):
     data, out = open_dataset(town_drive), tmp_path / "page.html"
     whole = view_drive(data, out)
