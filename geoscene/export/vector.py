@@ -15,6 +15,7 @@ from pyproj.exceptions import CRSError
 
 from geoscene.classes import Class
 from geoscene.errors import InputError, need
+from geoscene.export import styles
 from geoscene.export.kinds import Summary, compact_json, plain
 from geoscene.export.objects import attribution
 from geoscene.geometry.watertight import volumes
@@ -56,10 +57,11 @@ def write_gpkg(
     layers: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> Summary:
-    """Write the features as a GeoPackage: one layer for each kind, and the table ``building_solids``.
+    """Write the features as a GeoPackage: one layer for each kind, styles, and the table ``building_solids``.
 
     The table has the faces, heights and volume of each building's solid but no geometry: GeoPackage has no
-    type for solids, and as polygons, which are valid in plan only, their walls would be invalid.
+    type for solids, and as polygons, which are valid in plan only, their walls would be invalid. QGIS opens
+    the layers in the colours of classes, by the table ``layer_styles``.
 
     crs    : of the coordinates; default the scene's
     layers : names to write; default all
@@ -69,10 +71,15 @@ def write_gpkg(
     names = chosen_layers(scene, layers, others=tables)
     layers_in_plan = [name for name in names if name != SOLIDS]
     objects = count = faces = 0
+    classes: dict[str, set[str]] = {name: set() for name in layers_in_plan}
     with open_geopackage(path) as append:
         for _, chunk in _reading(scene, layers_in_plan, crs=target, stage="GeoPackage", progress=progress):
             append(chunk, geometry_type(scene, chunk.name, crs=target), target.to_wkt())
             objects += len(chunk)
+            if (column := styles.column_of(chunk.name)) in chunk.columns:
+                classes[chunk.name].update(np.unique(chunk.columns[column].astype(str)).tolist())
+        if layers_in_plan:
+            append(styles.layer_styles(classes), None, None)
         if SOLIDS in names:
             table = solids(scene)
             append(table, None, None)

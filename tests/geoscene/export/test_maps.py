@@ -6,6 +6,7 @@ import json
 import re
 import sqlite3
 import subprocess
+import xml.etree.ElementTree as ET
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
 
-from geoscene.classes import Class
+from geoscene.classes import Class, class_codes
 from geoscene.errors import InputError, MissingExtraError
 from geoscene.export import KINDS, export_scene, kind_of
 from geoscene.export.raster import RasterGrid, _cells_on_disk, draw_triangles
@@ -117,7 +118,11 @@ def test_cell_has_the_height_of_the_highest_triangle_at_its_centre(corners):
 
 def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     path = export_scene(scene, tmp_path / "a.gpkg").path
-    assert pyogrio.list_layers(path)[:, 0].tolist() == [*scene.layers, "building_solids"]
+    assert pyogrio.list_layers(path)[:, 0].tolist() == [
+        *scene.layers,
+        "layer_styles",
+        "building_solids",
+    ]
     plan = geopandas.read_file(path, layer="buildings")
     assert plan.crs.to_epsg() == 32633
     assert plan["osm_id"].tolist() == list(NAMES)
@@ -129,13 +134,42 @@ def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     assert moved.crs.to_epsg() == 25833
 
 
+def test_a_geopackage_is_drawn_in_the_colours_of_its_classes(scene, tmp_path):
+    path = export_scene(scene, tmp_path / "a.gpkg").path
+    with closing(sqlite3.connect(path)) as db:
+        kinds = db.execute("SELECT data_type FROM gpkg_contents WHERE table_name = 'layer_styles'").fetchall()
+        assert kinds == [("attributes",)]
+    styles = pyogrio.read_dataframe(path, layer="layer_styles").set_index("f_table_name")
+    assert set(styles.index) == set(scene.layers)
+    assert styles["useAsDefault"].all()
+    assert set(styles["f_geometry_column"]) == {"geom"}  # by which, and empty texts, QGIS finds them
+    assert set(styles["f_table_catalog"]) == set(styles["f_table_schema"]) == {""}
+    assert styles["update_time"].nunique() == 1
+    by_class = set()
+    for name, text in styles["styleQML"].items():
+        qml = ET.fromstring(text)  # noqa: S314  (our own text)
+        table = geopandas.read_file(path, layer=name)
+        codes = {"Point": "0", "LineString": "1", "Polygon": "2"}
+        assert qml.findtext("layerGeometryType") == codes[table.geom_type[0].removeprefix("Multi")]
+        symbols = {symbol.get("name"): symbol for symbol in qml.iter("symbol")}
+        categories = {node.get("value"): symbols[node.get("symbol")] for node in qml.iter("category")}
+        if (column := qml.find("renderer-v2").get("attr")) is not None:
+            assert set(categories) == set(table[column])
+            by_class.add(name)
+        for value, symbol in categories.items():
+            color = next(o.get("value") for o in symbol.iter("Option") if o.get("name") == "color")
+            wanted = class_codes().color[Class[value.upper()]].tolist()
+            assert list(map(int, color.split(","))) == [*wanted, 255]
+    assert by_class == {"road_surfaces"}
+
+
 @pytest.mark.parametrize("crs", ["utm", "local"])
 def test_a_geopackage_has_valid_geometry_and_the_volumes_of_solids_without_geometry(crs, tmp_path):
     scene = write_world(tmp_path / "scene", crs=crs)
     path = export_scene(scene, tmp_path / "a.gpkg").path
     for layer, kind in pyogrio.list_layers(path):
         table = geopandas.read_file(path, layer=layer)
-        assert layer == "building_solids" if kind is None else table.geometry.is_valid.all()
+        assert layer in ("building_solids", "layer_styles") if kind is None else table.geometry.is_valid.all()
     assert table["osm_id"].tolist() == list(NAMES)
     wanted = np.array(SOLID_VOLUMES) / scene.frame.scale(13.35, 52.51) ** 2
     np.testing.assert_allclose(table["volume"][:3], wanted, rtol=1e-5)
