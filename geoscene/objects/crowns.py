@@ -60,7 +60,7 @@ HABITS: dict[str, Habit] = {
     "ovoid": Habit("broadleaved", _OVOID, 13, (0.4, 0.6), branches=4, crown=0.5, base=0.22),
     "columnar": Habit("broadleaved", _COLUMN, 9, (0.72, 0.36), branches=0, crown=0.2, base=0.08),
     "weeping": Habit("broadleaved", _DOME, 15, (0.3, 2.0), branches=4, crown=0.85, base=0.12),
-    "conical": Habit("needleleaved", _CONE, 7, (1.0, 0.3), branches=0, crown=0.4, base=0.08),
+    "conical": Habit("needleleaved", _CONE, 9, (1.0, 0.3), branches=0, crown=0.4, base=0.08),
     "cypress": Habit("needleleaved", _FLAME, 5, (0.95, 0.42), branches=0, crown=0.15, base=0.04),
     "umbrella": Habit("needleleaved", _DISC, 11, (0.4, 0.75), branches=6, crown=0.75, base=0.5),
     "palm": Habit("palm", _ROUND, 11, (0.5, 1.0), branches=0, crown=0.45, base=0.7),
@@ -154,7 +154,7 @@ def _trunk(top: float) -> Mesh:
 def _crown(name: str, habit: Habit, *, nth: int) -> Mesh:
     """One variant of a habit's crown, within the unit box."""
     seed = 1 + list(HABITS).index(name)
-    draw = uniform_at(np.arange(64), np.full(64, nth), count=4, seed=seed)  # (4, 64)
+    draw = uniform_at(np.arange(256), np.full(256, nth), count=4, seed=seed)  # (4, 256)
     if habit.form == "palm":
         leaves, limbs = _fronds(habit, draw), np.empty((0, 3))
     elif name == "conical":
@@ -213,11 +213,29 @@ def _clusters(habit: Habit, draw: Float) -> tuple[list[Body], Float]:
 
 
 def _cluster(centre: Float, size: tuple[float, float], *, draw: Float) -> Body:
-    """An uneven icosahedron about a point, of some width and height."""
+    """A ball of leaves about a point, of some width and height, with an uneven surface."""
     width, height = size
-    points, faces = _icosahedron()
-    radius = 0.5 * (0.82 + 0.36 * draw[:12])
+    points, faces = _ball()
+    radius = 0.5 * (0.75 + 0.45 * draw[: len(points)])
     return centre + points * radius[:, None] * [width, width, height], faces
+
+
+@functools.cache
+def _ball() -> Body:
+    """A ball of radius 1: an icosahedron whose edges are in three parts each, 180 faces."""
+    corners, triangles = _icosahedron()
+    # Barycentric coordinates of the points of a triangle, and its nine parts.
+    grid = [(i, j) for i in range(4) for j in range(4 - i)]
+    number = {place: k for k, place in enumerate(grid)}
+    share = np.array([(3 - i - j, i, j) for i, j in grid]) / 3
+    parts = [[number[i, j], number[i + 1, j], number[i, j + 1]] for i, j in grid if i + j < 3]
+    parts += [[number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]] for i, j in grid if i + j < 2]
+    points = (share @ corners[triangles]).reshape(-1, 3)
+    # Triangles share the points on their edges.
+    _, first, same = np.unique(np.round(points, 9), axis=0, return_index=True, return_inverse=True)
+    faces = same.reshape(-1)[10 * np.arange(len(triangles))[:, None, None] + np.array(parts)]
+    points = points[first] / np.linalg.norm(points[first], axis=1, keepdims=True)
+    return points, faces.reshape(-1, 3).astype(np.int32)
 
 
 @functools.cache
@@ -262,7 +280,7 @@ def _limb(tip: Float) -> Body:
 
 def _tiers(habit: Habit, draw: Float) -> list[Body]:
     """Tiers of boughs that hang outwards, each a cone with uneven rim."""
-    n, sides = habit.clusters, 9
+    n, sides = habit.clusters, 17
     bodies = []
     for k in range(n):
         low = k / (n + 0.6)
