@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -230,9 +231,14 @@ class ExportOptions:
     height_offset: float | None = None
     """3D Tiles: metres added to all heights, such as the geoid height to make them ellipsoidal."""
 
+    size_limit: float | None = None
+    """OBJ: largest file in MB, 500 by default; a larger one is refused before it is written."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
         take_values(self, error=InputError)
+        if self.size_limit is not None and not 0 < self.size_limit < math.inf:
+            raise InputError(f"`size_limit` {self.size_limit:g}: give megabytes above 0")
         if self.roofs not in (None, "guess", "flat"):
             raise InputError(f"`roofs` {self.roofs}: guess or flat")
         if self.relief not in (None, MESH):

@@ -62,7 +62,7 @@ KINDS: Registry[ExportFormat] = Registry(
             "Wavefront OBJ and MTL",
             "triangles:write_obj",
             suffixes=".obj",
-            options="layers relief roofs",
+            options="layers relief roofs size_limit",
             beside=".mtl",
         ),
         "ply": _kind("PLY", "triangles:write_ply", suffixes=".ply", options="layers relief roofs"),

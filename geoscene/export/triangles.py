@@ -19,6 +19,7 @@ from geoscene.geometry.watertight import degenerate_faces, validate_mesh
 from geoscene.scene import Scene
 from geoscene.support.files import append, atomic_file, spool
 from geoscene.support.progress import Progress, silent
+from geoscene.typing import Float, Ints
 
 
 def meshes_of(
@@ -45,13 +46,33 @@ def _head(scene: Scene) -> list[str]:
     ]
 
 
+SIZE_LIMIT = 500.0
+"""Megabytes of an OBJ file, at most, by default."""
+
+
 def write_obj(
-    scene: Scene, path: Path, *, layers: Collection[str] | None = None, progress: Progress = silent
+    scene: Scene,
+    path: Path,
+    *,
+    layers: Collection[str] | None = None,
+    size_limit: float = SIZE_LIMIT,
+    progress: Progress = silent,
 ) -> Summary:
     """Write a scene as Wavefront OBJ with an MTL file: one object per feature, z up, scene metres.
 
     Coordinates are multiples of 0.1 mm, the grid of the solids, and so are exact.
+
+    size_limit : megabytes of the file, at most
+
+    Raises InputError if it would be larger.
     """
+    size, copies = estimate_obj(scene, layers, progress=progress)
+    if size > size_limit * 1e6:
+        raise InputError(
+            f"{path}: would have about {size / 1e6:,.0f} MB, more than `size_limit` {size_limit:g}, as OBJ"
+            f" repeats the triangles of all {copies:,} trees and other copies; write a .glb file, choose"
+            " `layers`, or raise `size_limit`"
+        )
     features = read_features(scene)
     objects = solids = faces = first = 0
     looks: dict[tuple[int, ...], str] = {}
@@ -82,6 +103,41 @@ def write_obj(
             colors.write(f"newmtl {material}\nKd {color}\nKa 0 0 0\nKs 0 0 0\nd 1\nillum 1\n\n".encode())
     size = size_of(path)[1] + size_of(library)[1]
     return Summary(path, "obj", 2, size, objects, solids, faces, scene.frame.name)
+
+
+def estimate_obj(
+    scene: Scene, layers: Collection[str] | None, *, progress: Progress = silent
+) -> tuple[int, int]:
+    """Bytes that `write_obj` would write, to a few percent, and the number of copies of shapes."""
+    shapes = list(scene.shapes().values())
+    corners, triangles = (np.array([count(s) for s in shapes], np.int64) for count in (_corners, len))
+    size = first = copies = 0
+    for part in parts(scene, layers, stage="OBJ: size", progress=progress):
+        mesh, shape = part.mesh, part.instances.shape
+        places = part.instances.transform[:, :, 3] + part.origin
+        size += _vertex_bytes(mesh.vertices + part.origin).sum() + _vertex_bytes(places) @ corners[shape]
+        count = len(mesh.vertices) + int(corners[shape].sum())
+        faces = len(mesh) + int(triangles[shape].sum())
+        size += faces * len("f   \n" + 3 * str(first + count // 2 + 1))
+        looks = np.unique(mesh.feature.astype(np.int64) * 256 + mesh.material)
+        size += len(looks) * _LOOK_BYTES
+        first, copies = first + count, copies + len(shape)
+    return int(size), copies
+
+
+_LOOK_BYTES = 60
+"""Bytes of the lines ``o`` and ``usemtl`` of an object, or of a part of it with another material."""
+
+
+def _corners(mesh: Mesh) -> int:
+    return len(mesh.vertices)
+
+
+def _vertex_bytes(points: Float) -> Ints:
+    """Bytes (n,) of the lines of vertices at points (n, 3)."""
+    digits = np.floor(np.log10(np.maximum(np.abs(points), 1.0))) + 1 + (points < 0)
+    lengths: Ints = (len("v   \n") + 3 * len(".0000") + digits.sum(axis=1)).astype(np.int64)
+    return lengths
 
 
 def _lines(form: str, values: NDArray[Any]) -> bytes:

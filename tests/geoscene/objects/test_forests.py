@@ -9,7 +9,9 @@ import pytest
 import shapely
 
 from geoscene.classes import Class
+from geoscene.errors import InputError
 from geoscene.export import export_scene
+from geoscene.export.triangles import estimate_obj
 from geoscene.export.vector import solids
 from geoscene.geometry.mesh import Mesh
 from geoscene.ground import Layers, building_pads, ground_tile, plan_ground, tile_box
@@ -178,6 +180,19 @@ def test_rays_views_and_exports_meet_the_same_trees(scene, tmp_path):
     glb = export_scene(scene, tmp_path / "a.glb", options=ExportOptions())
     assert glb.objects >= len(table)
     assert view_scene(scene, tmp_path / "a.html").path.stat().st_size > 12 * len(table) / 4
+
+
+def test_an_obj_that_would_be_too_large_is_refused_with_its_size(scene, tmp_path):
+    out = tmp_path / "a.obj"
+    written = export_scene(scene, out).path.stat().st_size
+    options = ExportOptions(size_limit=0.8 * written / 1e6)
+    with pytest.raises(InputError, match=r"would have about .* MB, more than `size_limit` .*\.glb") as raised:
+        export_scene(scene, out, options=options, overwrite=True)
+    assert out.stat().st_size == written
+    size, copies = estimate_obj(scene, None)
+    assert size == pytest.approx(written, rel=0.05)
+    assert f"{copies:,} trees" in str(raised.value)
+    assert copies == sum(len(tile.instances) for tile in scene.tiles())
 
 
 @pytest.mark.parametrize("trees", [True, False])
