@@ -22,7 +22,7 @@ from lidar.signal.run import altered_image
 from lidar.signal.truth import image_truth
 from lidar.simulation.boxes import image_boxes
 from lidar.simulation.recording import MeasuredImages, Recording
-from lidar.simulation.situations import situation_of, sun_during
+from lidar.simulation.situations import clouds_during, situation_of, sun_during
 from lidar.traffic.signal_heads import STATES, SignalStates
 from lidar.world.world import World, Worlds
 
@@ -109,6 +109,7 @@ def _render(
             sun=sun_during(recording, start),
             times=None if recording.actors is None else (times - start) / (end - start),
             lamps=lamps,
+            clouds=clouds_during(recording, start),
             random=generator(settings.seed, camera.name, frame, "image"),
             settings=settings.camera,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from datetime import datetime, timedelta
 
@@ -16,16 +17,21 @@ from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Poses, Trajectory
+from lidar.geometry.random_streams import generator
 from lidar.sensors.camera.light import Light, sun_direction
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.signal.situation import Effects, Situation
+from lidar.signal.weather.setting import WeatherSetting
 from lidar.simulation.recording import Recording
 from lidar.world.ground import ground_height
 from lidar.world.world import World
 
 _SUN_NS = 10_000_000_000
 """Nanoseconds between updates of the sun's direction, which changes by 0.04 degrees meanwhile."""
+
+_SKY = 100_000.0
+"""Metres within which the pattern of clouds begins."""
 
 _AROUND = 20.0
 """Metres around points within which their surroundings are loaded."""
@@ -132,6 +138,20 @@ def light_during(recording: Recording, time_ns: int) -> Light:
 
     settings = recording.settings
     return light_of(sun_during(recording, time_ns), cloud=settings.camera.cloud, snow=settings.world.snow)
+
+
+def clouds_during(recording: Recording, time_ns: int) -> tuple[float, float]:
+    """Where the pattern of clouds begins at a time, metres east and north of the scene's origin.
+
+    The seed chooses the part of the pattern, the wind of the weather moves it.
+    """
+    settings = recording.settings
+    east, north = generator(settings.seed, "clouds").uniform(-_SKY, _SKY, 2).tolist()
+    stages = [named.stage for named in settings.stages.stages]
+    for weather in (stage for stage in stages if isinstance(stage, WeatherSetting) and stage.wind):
+        blown, bearing = weather.wind * time_ns * 1e-9, math.radians(weather.wind_from)
+        return east - blown * math.sin(bearing), north - blown * math.cos(bearing)
+    return east, north
 
 
 def sun_during(recording: Recording, time_ns: int) -> Float:

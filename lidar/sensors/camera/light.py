@@ -12,6 +12,7 @@ from geoscene.classes import Class, materials
 from geoscene.geometry.frames import Frame
 from geoscene.typing import Float
 from lidar.errors import InputError
+from lidar.sensors.camera.sky import LIMB, cloud_pattern
 
 _LIGHT, _GLASS = int(Class.TRAFFIC_LIGHT), materials()["glass"].code
 
@@ -160,8 +161,7 @@ _MULTIPLE = 3.0
 _GREYING = 0.4  # share of ambient light that is reflected by grey walls and pavements
 
 # Irradiance under clouds by their share N of the sky: G = G0 (1 - 0.75 N^3.4), of which the diffuse share is
-# 0.3 + 0.7 N^2 (Kasten and Czeplak, Solar Energy 24, 1980). The radiance of an overcast sky is
-# (1 + 2 sin(elevation)) / 3 of that of its zenith (CIE standard overcast sky, ISO 15469).
+# 0.3 + 0.7 N^2 (Kasten and Czeplak, Solar Energy 24, 1980).
 _CLOUD_LOSS, _CLOUD_POWER = 0.75, 3.4
 
 
@@ -176,6 +176,9 @@ class Light:
                 the cosine of the azimuth from the sun, from 1 to -1
     horizon   : (3,) mean radiance at the horizon, the colour of haze
     mean      : (3,) mean radiance from all directions, the sun's beam included: the colour of dense fog
+    clear     : as ``sky``, without clouds, of which ``sky`` has the mean
+    veil      : (3,) radiance of clouds at the zenith
+    clouds    : (5,) where they are, `lidar.sensors.camera.sky.cloud_pattern`
     exposure  : factor that brings a level surface of 18 % in sun and sky to a quarter of full scale
     lamps     : signal heads that are lit; None for none
     """
@@ -186,8 +189,17 @@ class Light:
     sky: Float
     horizon: Float
     mean: Float
+    clear: Float
+    veil: Float
+    clouds: Float
     exposure: float
     lamps: Lamps | None = None
+
+    @property
+    def columns(self) -> tuple[Float, Float, Float, Float, Float, Float, Float, Float]:
+        """What `lidar.sensors.camera.shade.shade` takes of the light."""
+        sun = self.direction, self.beam, self.ambient
+        return *sun, self.sky, self.horizon, self.clear, self.veil, self.clouds
 
 
 def _air_mass(sine: Float) -> Float:
@@ -271,8 +283,10 @@ def daylight(
     above = normal[:, 2] > 0
     diffuse = (radiance * (weight * normal[:, 2])[:, None])[above].sum(axis=0)
     down = diffuse + beam * max(rise, 0.0)
+    clear_sky, veil = sky, np.zeros(3)
     if cloud > 0:
-        beam, sky, down = _add_clouds(beam, sky, diffuse=diffuse, rise=rise, sine=sine, cloud=cloud)
+        beam, veil, down = _add_clouds(beam, diffuse=diffuse, rise=rise, cloud=cloud)
+        sky = (1 - cloud) * sky + cloud * (1 - LIMB * cloud * (1 - sine[..., None])) * veil
         radiance = sky_colour(sky, normal[:, 2], cos_turn=cos_turn)
     radiance[~above] = (_GROUND + snow * (_SNOW - _GROUND)) / np.pi * down
     basis = _harmonics(normal)
@@ -282,24 +296,21 @@ def daylight(
     ambient += _GREYING * (ambient.mean(axis=1, keepdims=True) - ambient)
     exposure = 0.25 / 0.18 * np.pi / float(down.mean()) / (1 + snow * (_SNOW / 0.18 * 0.25 / 0.75 - 1))
     mean = (np.einsum("k,kc->c", weight, radiance) + beam) / (4 * np.pi)
-    return Light(s, beam, ambient, sky, sky[1].mean(axis=0), mean, exposure)
+    clouds = cloud_pattern(cloud, (0.0, 0.0))
+    return Light(s, beam, ambient, sky, sky[1].mean(axis=0), mean, clear_sky, veil, clouds, exposure)
 
 
-def _add_clouds(
-    beam: Float, sky: Float, *, diffuse: Float, rise: float, sine: Float, cloud: float
-) -> tuple[Float, Float, Float]:
-    """Beam, sky and downward irradiance under clouds that cover a share of the sky.
+def _add_clouds(beam: Float, *, diffuse: Float, rise: float, cloud: float) -> tuple[Float, Float, Float]:
+    """Beam, radiance of clouds at the zenith, downward irradiance under clouds that cover a share of the sky.
 
     diffuse : (3,) irradiance of the clear sky on level ground
     rise    : sine of the sun's elevation
-    sine    : (rows, 1) of the elevation, of the rows of ``sky``
     """
     clear = diffuse + beam * max(rise, 0.0)
     down = clear * (1 - _CLOUD_LOSS * cloud**_CLOUD_POWER)
     beam = beam * (1 - _CLOUD_LOSS * cloud**_CLOUD_POWER) * (1 - cloud**2)
     rest = down - beam * max(rise, 0.0) - (1 - cloud) * diffuse
-    overcast = (1 + 2 * sine[..., None]) / 3 * rest / (7 * np.pi / 9)
-    return beam, (1 - cloud) * sky + overcast, down
+    return beam, rest / cloud / (np.pi * (1 - LIMB / 3 * cloud)), down
 
 
 def _sphere(rows: int, columns: int) -> tuple[Float, Float]:

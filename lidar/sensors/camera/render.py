@@ -22,6 +22,7 @@ from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.facades import RenderedFacades, facades_of, flatten, walls_of
 from lidar.sensors.camera.light import Lamps, Light, daylight, emit
 from lidar.sensors.camera.settings import PLAIN, CameraSettings
+from lidar.sensors.camera.sky import cloud_pattern
 from lidar.sensors.physics.reflect import reflect
 from lidar.sensors.rig.camera_model import project, unproject
 from lidar.sensors.rig.specs import CameraSpec
@@ -99,6 +100,7 @@ def render(
     sun: ArrayLike,
     times: Float | None = None,
     lamps: Lamps | None = None,
+    clouds: tuple[float, float] = (0.0, 0.0),
     random: np.random.Generator | None = None,
     settings: CameraSettings = PLAIN,
     threads: int = 1,
@@ -111,6 +113,7 @@ def render(
     sun     : (3,) direction towards the sun, scene axes, from `lidar.sensors.camera.light.sun_direction`
     times   : ray times 0 to 1 of the poses, for actors that move
     lamps   : signal heads that are lit; none by default
+    clouds  : where the pattern of clouds begins, metres east and north of the scene's origin
     random  : source of the noise of ``settings.camera_noise``
     threads : threads to use; the image does not depend on it
 
@@ -125,7 +128,11 @@ def render(
         raise InputError(f"camera {camera.name}: `camera_noise` needs `random`")
     h, w = camera.height, camera.width
     coloured = "rgb" in camera.images
-    light = replace(light_of(sun, cloud=settings.cloud, snow=world.settings.snow), lamps=lamps)
+    light = replace(
+        light_of(sun, cloud=settings.cloud, snow=world.settings.snow),
+        lamps=lamps,
+        clouds=cloud_pattern(settings.cloud, clouds),
+    )
     exposure = light.exposure * 2.0**camera.exposure_ev
     walls = facades_of(world)
     k = settings.supersample
@@ -449,7 +456,7 @@ def _shade(
         wall,
         walls,
         lit,
-        (light.direction, light.beam, light.ambient, light.sky, light.horizon),
+        light.columns,
         (*shade.material_tables(), shade.linear_table()),
         (*size, 3.912 / settings.haze, settings.detail),
         shade.covers(world.settings.wetness, world.settings.snow),

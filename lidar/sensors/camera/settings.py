@@ -43,7 +43,7 @@ class CameraSettings:
         endless="unlimited",
     )
     cloud: float = parameter(
-        0.0, "share of the sky that clouds cover; overcast light casts no shadows", low=0, high=1
+        0.3, "share of the sky that clouds cover; overcast light casts no shadows", low=0, high=1
     )
     camera_noise: bool = parameter(
         default=False, meaning="shot noise and read noise (the camera's full_well, read_noise)"

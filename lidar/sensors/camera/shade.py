@@ -19,6 +19,7 @@ from lidar.sensors.camera.facades import ASIDE, BEHIND, GLASS, LIGHT, SEEN, Rend
 from lidar.sensors.camera.facades import PAINTED as PAINTED_PARTS
 from lidar.sensors.camera.facades import UPRIGHT as UPRIGHT_SIDES
 from lidar.sensors.camera.ground_texture import HIGHEST, LOWEST, PAVED, ground
+from lidar.sensors.camera.sky import background, sky_radiance
 from lidar.sensors.camera.texture import compiled, detail, grain, hash_place, inlined, noise
 from lidar.sensors.camera.texture_blocks import BLOCK, DETAIL, PAINTED, PLACES, UPRIGHT, factors
 from lidar.sensors.camera.texture_blocks import scratch as block_scratch
@@ -211,29 +212,13 @@ def shadow_rays(
 
 
 @inlined
-def _sky(sky: Float, x: float, y: float, z: float, sun: Float, out: Float) -> None:
-    """Radiance of the sky towards a unit vector with z >= 0, between the entries of the table."""
-    rows, columns = sky.shape[0] - 1, sky.shape[1] - 1
-    flat = math.sqrt((x * x + y * y) * (sun[0] * sun[0] + sun[1] * sun[1]))
-    turn = (x * sun[0] + y * sun[1]) / flat if flat > 1e-12 else 0.0
-    a = math.sqrt(math.asin(min(max(z, 0.0), 1.0)) * (2.0 / math.pi)) * rows
-    b = (1.0 - min(max(turn, -1.0), 1.0)) * 0.5 * columns
-    i, j = min(int(a), rows - 1), min(int(b), columns - 1)
-    a, b = a - i, b - j
-    for c in range(3):
-        low = sky[i, j, c] + b * (sky[i, j + 1, c] - sky[i, j, c])
-        high = sky[i + 1, j, c] + b * (sky[i + 1, j + 1, c] - sky[i + 1, j, c])
-        out[c] = low + a * (high - low)
-
-
-@inlined
 def _mirror(
     sky: Float, sun: Float, d: Float, nx: float, ny: float, nz: float, town: Float, out: Float
 ) -> None:
     """Radiance that a mirror reflects: the sky where the ray rises, else ``town``, the lit surroundings."""
     along = 2.0 * (nx * d[0] + ny * d[1] + nz * d[2])
     x, y, z = d[0] - along * nx, d[1] - along * ny, d[2] - along * nz
-    _sky(sky, x, y, max(z, 0.0), sun, out)
+    sky_radiance(sky, x, y, max(z, 0.0), sun, out)
     s = min(max((z - 0.03) / 0.4, 0.0), 1.0)
     for c in range(3):
         out[c] = town[c] + s * (out[c] - town[c])
@@ -360,22 +345,6 @@ def _factor(texture_: Any, at: Any) -> float:
 
 
 @inlined
-def _background(i: int, direction: Any, light: Any, colors: Any, out: Any) -> None:
-    """Fill row ``i`` of ``out`` where nothing is hit."""
-    sun, beam, _, sky, horizon = light
-    d, glow = colors[0], colors[1]
-    dx, dy, dz = direction[i, 0], direction[i, 1], direction[i, 2]
-    length = math.sqrt(dx * dx + dy * dy + dz * dz)
-    d[0], d[1], d[2] = dx / length, dy / length, dz / length
-    _sky(sky, d[0], d[1], max(d[2], 0.0), sun, glow)
-    below = min(max(-50.0 * d[2], 0.0), 1.0)  # beyond the edge of the scene there is haze
-    facing = d[0] * sun[0] + d[1] * sun[1] + d[2] * sun[2]
-    disc = min(max((facing - 0.999985) / 4e-6, 0.0), 1.0)  # 0.27 degrees, softened
-    for c in range(3):
-        out[i, c] = glow[c] + below * (horizon[c] - glow[c]) + disc * beam[c] * 100.0
-
-
-@inlined
 def pixel(
     i: int,
     view: Any,
@@ -392,12 +361,12 @@ def pixel(
     facet: Any,
 ) -> None:
     """Fill row ``i`` of what `shade` fills; ``scratch`` is overwritten. For devices."""
-    _, _, direction, range_, _ = view
+    _, _, _, range_, _ = view
     _, _, _, _, wall = found
-    _, _, _, detailed = settings
+    _, angle, _, detailed = settings
     colors, _, _ = scratch
     if not range_[i] < np.inf:
-        _background(i, direction, light, colors, out)
+        background(i, view, light, angle, colors, out)
         return
     at = _place(i, view, wall, walls.tables.frame, settings)
     factor = 1.0
@@ -430,7 +399,7 @@ def _surface(
     _, _, _, _, normal = view
     klass, material, color, feature, wall = found
     frame = walls.tables.frame
-    sun, beam, ambient, sky, horizon = light
+    sun, beam, ambient, sky, horizon, _, _, _ = light
     kinds, _, mirrors, plain, soaked, linear = tables
     _, _, extinction, detailed = settings
     wetness, pools, snow, patches = covers
@@ -550,7 +519,7 @@ def shade(
     wall: NDArray[np.int32],
     walls: RenderedFacades,
     lit: NDArray[np.bool_],
-    light: tuple[Float, Float, Float, Float, Float],
+    light: tuple[Float, Float, Float, Float, Float, Float, Float, Float],
     tables: tuple[NDArray[np.uint8], NDArray[np.uint8], Float, NDArray[np.uint8], Float, Float],
     settings: tuple[float, float, float, bool],
     covers: tuple[float, float, float, float],
@@ -564,7 +533,7 @@ def shade(
     in ``out``, and ``facet`` (n, 3) with the films' normals; both are empty in a dry world.
 
     walls    : `facades.RenderedFacades`; ``wall`` (n,) are rows of its tables, -1 for other surfaces
-    light    : direction, beam, ambient, sky, horizon of `lidar.sensors.camera.light.Light`
+    light    : `lidar.sensors.camera.light.Light.columns`
     tables   : `material_tables` and `linear_table`
     settings : size of a pixel at distance 0 (metres) and its growth with distance (radians), extinction of
                haze (1/m), whether detail is drawn
@@ -592,7 +561,7 @@ def shade(
         for j in range(n):
             i = first + j
             if not range_[i] < np.inf:
-                _background(i, direction, light, scratch[0], out)
+                background(i, view, light, settings[1], scratch[0], out)
                 continue
             p = at[j]
             _surface(

@@ -77,6 +77,9 @@ class WarpLight:
     ambient: wp.array2d[wp.float64]
     sky: wp.array3d[wp.float64]
     horizon: wp.array[wp.float64]
+    clear: wp.array3d[wp.float64]
+    veil: wp.array[wp.float64]
+    clouds: wp.array[wp.float64]
 
 
 @wp.struct
@@ -208,7 +211,7 @@ class WarpShader:
                 self._kept_in(Materials, tables),
                 _fill(WarpSettings, settings),
                 _fill(Covers, covers),
-                upload(shade.TOWN * light[-1]),
+                upload(shade.TOWN * light[4]),
                 *results,
                 self._globals,
             )

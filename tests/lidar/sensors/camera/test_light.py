@@ -17,6 +17,8 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
 from lidar.raycast import Caster, MeshInstances
+from lidar.sensors.camera import shade
+from lidar.sensors.camera.facades import facades_of
 from lidar.sensors.camera.light import (
     APART,
     LENSES,
@@ -30,6 +32,7 @@ from lidar.sensors.camera.light import (
 )
 from lidar.sensors.camera.render import render
 from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.camera.sky import cloud_pattern
 from lidar.sensors.rig.specs import CameraSpec
 
 # Computed with Astropy 7 (ERFA): azimuth and elevation without an atmosphere, degrees.
@@ -159,6 +162,44 @@ def test_an_overcast_sky_is_three_times_as_bright_overhead_as_at_the_horizon():
     np.testing.assert_allclose(light.sky[-1].mean(axis=0) / light.sky[0].mean(axis=0), 3.0)
     # Fog in this light is bright: 0.7 to 0.9 of full scale.
     assert 0.7 < light.mean[1] * light.exposure < 0.9
+
+
+@pytest.mark.parametrize("cloud", [0.1, 0.3, 0.8])
+def test_clouds_cover_their_share_of_the_sky_and_keep_its_mean_light(cloud):
+    """The sky that surfaces are lit by is the mean of the clouds and the clear sky of images."""
+    light = daylight([0.5, 0.2, 0.8], cloud=cloud)
+    x, y = np.random.default_rng(5).uniform(-3e5, 3e5, (2, 6000))
+    up, origin = np.tile([0.0, 0.0, 1.0], (6000, 1)), np.column_stack([x, y, np.full(6000, 2.0)])
+    sky = sky_of(light, up, origin=origin)
+    clear = sky_of(replace(light, clouds=np.zeros(5)), up[:1], origin=origin[:1])
+    cloudy = sky[:, 0] > (clear[0, 0] + light.veil[0]) / 2
+    assert cloudy.mean() == pytest.approx(cloud, abs=0.04)
+    np.testing.assert_allclose(sky.mean(axis=0), light.sky[-1].mean(axis=0), rtol=0.06)
+
+
+def test_clouds_hide_the_sun_and_drift_with_the_pattern():
+    light = daylight([0.0, 0.0, 1.0], cloud=0.5)
+    towards, origin = np.tile([0.0, 0.0, 1.0], (300, 1)), np.zeros((300, 3))
+    origin[:, 0] = np.linspace(0, 20_000, 300)
+    sky = sky_of(light, towards, origin=origin)
+    sunny = sky[:, 1] > 10
+    assert 0.2 < sunny.mean() < 0.8
+    blown = replace(light, clouds=cloud_pattern(0.5, (700.0, -40.0)))
+    np.testing.assert_array_equal(sky_of(blown, towards, origin=origin + np.array([700.0, -40.0, 0.0])), sky)
+
+
+def sky_of(light, direction, *, origin):
+    """Radiance (n, 3) of the sky towards directions (n, 3) from places (n, 3)."""
+    n = len(direction)
+    out, none = np.empty((n, 3), np.float32), np.zeros(n, np.uint8)
+    view = origin, np.arange(n, dtype=np.int32), direction, np.full(n, np.inf), np.zeros((n, 3))
+    found = none, none, np.zeros((n, 3), np.uint8), none.astype(np.int32), np.full(n, -1, np.int32)
+    tables = *shade.material_tables(), shade.linear_table()
+    wet = np.zeros(0, np.float32), np.zeros((0, 3), np.float32)
+    settings, dry = (0.0, 0.001, 0.0, True), shade.covers(0.0, 0.0)
+    walls = facades_of(MeshWorld(plate(10.0)))
+    shade.shade(*view, *found, walls, none > 0, light.columns, tables, settings, dry, out, *wet)
+    return out
 
 
 CAMERA = CameraSpec("c", Mount(), 200, 160, 400.0, 400.0, 99.5, 79.5)

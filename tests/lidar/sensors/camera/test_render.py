@@ -24,7 +24,7 @@ from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
 
 CAMERA = CameraSpec("c", Mount(), 160, 120, 100.0, 100.0, 79.5, 59.5)
-FLAT = CameraSettings(detail=False, haze=np.inf, edge_rays=1)
+FLAT = CameraSettings(detail=False, haze=np.inf, edge_rays=1, cloud=0.0)
 NOON = (0.0, -1.0, 1.0)  # half way up in the south
 
 

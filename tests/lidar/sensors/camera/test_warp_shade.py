@@ -97,14 +97,14 @@ def test_the_radiance_of_any_surface_is_that_of_the_cpu(seed, weather, detailed,
     rng = np.random.default_rng(seed)
     given_columns = pixels(rng, facades(rng, deep=deep))
     n = len(given_columns[1])
-    light = daylight(turned(rng, 1)[0] * [1, 1, 0.5] + [0, 0, 0.5])
+    light = daylight(turned(rng, 1)[0] * [1, 1, 0.5] + [0, 0, 0.5], cloud=rng.random())
     results = []
     for fill in (shade.shade, shader(DEVICE).shade):
         out, wet = np.full((n, 3), np.nan, np.float32), n if weather[0] else 0
         gloss, facet = np.zeros(wet, np.float32), np.zeros((wet, 3), np.float32)
         fill(
             *given_columns,
-            (light.direction, light.beam, light.ambient, light.sky, light.horizon),
+            light.columns,
             (*shade.material_tables(), shade.linear_table()),
             (blur, 0.002, 3.912 / 20_000.0, detailed),
             shade.covers(*weather),
