@@ -184,6 +184,7 @@ def _edges(
         signals=none,
         stop=none,
         give_way=none,
+        node_island=np.zeros(len(none)),
     )
     return graph, (chain_of, backward)
 

@@ -10,10 +10,10 @@ from typing import Protocol
 import numpy as np
 
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.tags import CLASSES
+from geoscene.roadgraph.tags import CLASSES, LOOP_LANE, read_diameter
 from geoscene.sources.data import TaggedNode, Tags, Way
 from geoscene.support.problems import Action, Problem
-from geoscene.typing import Bools, Ints
+from geoscene.typing import Bools, Float, Ints
 
 # Metres before a node within which a signal or a sign is the node's own.
 _REACH = 30.0
@@ -138,6 +138,19 @@ def _join(pieces: Sequence[RoadChain]) -> RoadChain:
     return RoadChain(np.concatenate(nodes), np.concatenate([piece.way for piece in pieces]))
 
 
+def _islands(graph: RoadGraph, points: Iterable[TaggedNode]) -> Float:
+    """Metres (n,) of the radius of the island of a turning loop at each node."""
+    loops = {
+        int(point.osm_id.removeprefix("node/")): point.tags
+        for point in points
+        if point.tags.get("highway") == "turning_loop"
+    }
+    island = np.zeros(len(graph.node_id))
+    for k in np.flatnonzero(np.isin(graph.node_id, list(loops))).tolist():
+        island[k] = max(read_diameter(loops[int(graph.node_id[k])], []) / 2 - LOOP_LANE, 0.0)
+    return island
+
+
 def add_controls(
     graph: RoadGraph,
     points: Iterable[TaggedNode],
@@ -218,6 +231,7 @@ def add_controls(
         signals=flags["traffic_signals"],
         stop=flags["stop"],
         give_way=flags["give_way"],
+        node_island=_islands(graph, points),
         control_edge=np.array([row[0] for row in rows], np.int32),
         control_offset=np.array([row[1] for row in rows], float),
         control_kind=np.array([row[2] for row in rows], np.str_),

@@ -130,6 +130,7 @@ def _assemble(graph: RoadGraph, pieces: Sequence[_Piece], *, twin_of: dict[int, 
     columns |= {name: np.append(getattr(graph, name), none) for name in ("signals", "stop", "give_way")}
     columns |= {
         "node_id": np.append(graph.node_id, first - np.arange(added)),
+        "node_island": np.append(graph.node_island, np.zeros(added)),
         "node_xyz": np.concatenate([graph.node_xyz, *(place[None] for place in xyz)]),
         "tail": tail,
         "head": head,

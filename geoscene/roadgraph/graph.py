@@ -44,6 +44,7 @@ class RoadGraph:
     osm_id   : (m,) str, ``way/123``; ``way/123;way/124`` where ways of equal tags were joined
     twin     : (m,) int32, the edge of the same carriageway in the other direction, -1 if there is none
     signals, stop, give_way : (n,) bool, traffic control at the node
+    node_island : (n,) float64, metres of the radius of the island of a turning loop at the node; 0 without
 
     Turn restrictions, one row each:
 
@@ -95,6 +96,7 @@ class RoadGraph:
     signals: Bools
     stop: Bools
     give_way: Bools
+    node_island: Float
     turn_from: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     turn_via: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
     turn_to: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
@@ -137,7 +139,7 @@ class RoadGraph:
         edge[chosen] = np.arange(len(chosen))
         node = np.full(len(self.node_id), -1, np.int32)
         node[used] = np.arange(len(used))
-        per_node = ("node_id", "node_xyz", "signals", "stop", "give_way")
+        per_node = ("node_id", "node_xyz", "signals", "stop", "give_way", "node_island")
         apart = {*per_node, "tail", "head", "twin"}
         columns = {name: getattr(self, name)[used] for name in per_node} | {
             f.name: getattr(self, f.name)[chosen]

@@ -38,7 +38,7 @@ def write_graphml(graph: RoadGraph, frame: Frame, *, path: Path) -> None:
     ``lane_widths`` and ``lane_turns`` (of each lane, as in `RoadGraph`), ``edge`` (its number), ``twin`` (the
     number of the other direction), ``turns`` (``no_left_turn 17`` names a restriction and the edge turned
     into, ``no_u_turn 12 17`` one via other edges and these first) and ``controls`` (``12.5 stop``: metres
-    from the tail).
+    from the tail), and of nodes ``island`` (metres of the radius of that of a turning loop).
     """
     write_atomically(path, "\n".join(_document(graph, frame)).encode())
 
@@ -98,6 +98,7 @@ def _node_rows(graph: RoadGraph, frame: Frame, *, tall: bool) -> Iterator[dict[s
             "street_count": str(streets[k]),
             "highway": at_node[0] if at_node else "",
             "controls": ";".join(at_node),
+            "island": f"{graph.node_island[k]:.2f}" if graph.node_island[k] else "",
         }
 
 
@@ -259,6 +260,7 @@ def _graph(nodes: dict[int, _Row], edges: list[tuple[int, int, _Row]], *, frame:
         osm_id=column("osmid", _way_ids, dtype=np.str_),
         twin=column("twin", lambda text: row_of.get(int(text), -1) if text else -1, dtype=np.int32),
         **flags,
+        node_island=np.array([float(node.get("island") or 0) for node in nodes.values()]),
         turn_from=np.array([turn[0] for turn in turns], np.int32),
         turn_via=np.array([turn[1] for turn in turns], np.int32),
         turn_to=np.array([turn[2] for turn in turns], np.int32),

@@ -51,6 +51,8 @@ _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "cu
 # mini-roundabouts are 13 to 20 m wide.
 TURNING = {"turning_circle": 12.0, "turning_loop": 16.0, "mini_roundabout": 14.0}
 """Values of ``highway`` of nodes where roads widen for turning, and metres of those of unknown diameter."""
+LOOP_LANE = 5.0
+"""Metres from the island of a turning loop to its outer kerb. Assumed."""
 
 
 @dataclass(frozen=True, slots=True)

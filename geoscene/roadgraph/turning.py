@@ -10,13 +10,11 @@ from geoscene.classes import Class
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, Carriageways
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roadgraph.tags import TURNING, read_diameter
+from geoscene.roadgraph.tags import LOOP_LANE, TURNING, read_diameter
 from geoscene.sources.data import OsmData, TaggedNode
 
 _NEAR = 3.0
 """Metres from a node within which the middles of its carriageways are looked for."""
-_LANE = 5.0
-"""Metres from the island of a loop to its outer kerb. Assumed."""
 _DOME = 3.0
 """Metres, diameter of the painted middle of a mini-roundabout (1 to 4 m in British practice)."""
 _CARRIAGEWAY, _PRIORITY, _PAINT = 130.25, 146.9, 170.0
@@ -85,7 +83,7 @@ def _rows_at(
             found.append(
                 SurfaceRows.of(disc(metres), klass=klass, material=material, priority=high, **common)
             )
-    island = radius - _LANE
+    island = radius - LOOP_LANE
     if kind == "turning_loop" and island > 2 * KERB:
         for klass, more, material, metres in (
             (Class.KERB, 0.0, "concrete", island),

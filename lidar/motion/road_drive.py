@@ -285,14 +285,16 @@ def plan_route_and_path(
 ) -> tuple[Route, Path]:
     """A route and a path along it on which the vehicle touches no obstacle.
 
-    Parameters are those of `plan_route` and `lidar.motion.path.plan_path`; ``body_width`` is the vehicle's.
-    Where the body does not pass, the route is planned again without that street or turn; ``tried`` is called
-    with each route.
+    Parameters are those of `plan_route` and `lidar.motion.path.plan_path`; ``body_width`` and
+    ``turning_radius`` are the vehicle's. Where the body does not pass, the route is planned again without that
+    street or turn; ``tried`` is called with each route.
 
     Raises RouteError as `plan_route` does and for a given route that takes longer than a drive lasts, and
     BlockedError if every route is blocked.
     """
-    options = replace(options or RouteOptions(), body_width=vehicle.width)
+    options = replace(
+        options or RouteOptions(), body_width=vehicle.width, turning_radius=vehicle.turning_radius
+    )
     if not isinstance(obstacles, shapely.STRtree):
         obstacles = shapely.STRtree([] if obstacles is None else list(obstacles))
     avoid: set[tuple[int, int]] = set()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -28,6 +29,7 @@ Spec = str | Path | Sequence[tuple[float, float]]
 
 _STEP = 0.3  # metres between the lanes of two streets from which on a change of lane is drawn out
 _STRAIGHT = 0.5  # cosine of the turn up to which a junction is gone straight over
+_TURN_ROOM = 0.75  # turning radii that a U-turn takes beyond the place where the vehicle stops
 _KEEP = 0.2  # metres between the body and the kerb where the carriageway is narrow
 
 
@@ -72,6 +74,7 @@ class RouteOptions:
     length     : true metres of a random route
     side       : side of two-way streets that is driven on
     body_width : metres; the body stays inside narrow carriageways
+    turning_radius : metres; the vehicle turns round before the island of a turning loop
     """
 
     seed: int = 0
@@ -79,6 +82,7 @@ class RouteOptions:
     length: float | None = None
     side: Side = "right"
     body_width: float = 1.82
+    turning_radius: float = 5.5
 
 
 def plan_route(
@@ -100,7 +104,13 @@ def plan_route(
     graph without streets.
     """
     options = options or RouteOptions()
-    side, body_width = options.side, options.body_width
+    lanes = functools.partial(
+        lane_route,
+        graph,
+        side=options.side,
+        body_width=options.body_width,
+        turning_radius=options.turning_radius,
+    )
     if spec == "random":
         _need_streets(graph)
         metres = np.inf if options.length is None else options.length
@@ -113,23 +123,23 @@ def plan_route(
             seconds=seconds,
             metres=metres,
             avoid=avoid,
-            body_width=body_width,
+            body_width=options.body_width,
             roofs=roofs,
         )
-        return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
+        return lanes(edges, ends=ends)
 
     if isinstance(spec, str | Path):
         track = read_track(Path(spec), frame)
         _need_streets(graph)
         if track.dense:
             edges, ends = match_track(graph, track, frame=frame, avoid=avoid)
-            return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
+            return lanes(edges, ends=ends)
         points = track.lat_lon
     else:
         points = [(float(lat), float(lon)) for lat, lon in spec]
     _need_streets(graph)
     edges, ends = route_through(graph, frame, points=points, avoid=avoid)
-    return lane_route(graph, edges, ends=ends, side=side, body_width=body_width)
+    return lanes(edges, ends=ends)
 
 
 def _need_streets(graph: RoadGraph) -> None:
@@ -202,8 +212,11 @@ def lane_route(
     ends: tuple[float, float],
     side: Side = "right",
     body_width: float = 1.82,
+    turning_radius: float = 5.5,
 ) -> Route:
     """The route along edges, in the outermost lane of each that is open to cars and leads into the next.
+
+    It ends, begins and turns round before the island of a turning loop, with room for the manoeuvre.
 
     edges : (k,) each follows from the one before
     ends  : true metres from the first edge's tail to the start, and from the last one's tail to the end
@@ -217,21 +230,24 @@ def lane_route(
     offset = layout.offsets(chosen, body_width=body_width, clearance=_KEEP)
     offset = offset * (-1.0 if side == "right" else 1.0)
     lanes: list[Float] = []
+    rounds = np.append(turns_back(graph, order[:-1], after=order[1:]), False)
+    island = graph.node_island + _TURN_ROOM * turning_radius * (graph.node_island > 0)
     for k, e in enumerate(order):
         lane = polylines.offset_curve(graph.geometry[e], float(offset[e]))
         whole = max(float(graph.length[e]), 1e-9)
         begin = min(max(ends[0] / whole, 0.0), 1.0) if k == 0 else 0.0
         end = min(max(ends[1] / whole, 0.0), 1.0) if k == len(order) - 1 else 1.0
+        if k == 0 or rounds[k - 1]:
+            begin = max(begin, min(float(island[graph.tail[e]]) / whole, 0.5))
+        if k == len(order) - 1 or rounds[k]:
+            end = min(end, max(1.0 - float(island[graph.head[e]]) / whole, 0.5))
         lanes.append(_cut(lane, begin, end=max(end, begin + 1e-6)))
-    turns: list[int] = []
-    rounds = np.append(turns_back(graph, order[:-1], after=order[1:]), False)
     for k in range(len(order) - 1):
         if not rounds[k]:
             reach = 2.0 * max(abs(float(offset[order[k]])), abs(float(offset[order[k + 1]])), 1.0)
             lanes[k], lanes[k + 1] = _joined_lanes(lanes[k], lanes[k + 1], reach=reach)
     sizes = np.array([len(lane) for lane in lanes])
     last = np.cumsum(sizes) - 1
-    turns = last[rounds].tolist()
     under = np.repeat(order, sizes).astype(np.int32)
     covered = graph.bridge | graph.tunnel
     return Route(
@@ -239,7 +255,7 @@ def lane_route(
         under,
         graph.speed[under],
         covered[under],
-        np.array(turns, np.int64),
+        last[rounds].astype(np.int64),
         order,
         side,
     )

@@ -55,6 +55,7 @@ def road_graph(nodes, pairs, *, twoway=True, width=7.0, speed=13.9, lanes=1.0, b
         signals=np.zeros(n, bool),
         stop=np.zeros(n, bool),
         give_way=np.zeros(n, bool),
+        node_island=np.zeros(n),
         **values,
     )
 

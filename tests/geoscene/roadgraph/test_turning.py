@@ -7,6 +7,7 @@ import shapely
 from geoscene.classes import Class
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph import build_road_graph
+from geoscene.roadgraph.graphml import read_graphml, write_graphml
 from geoscene.roadgraph.surfaces import road_surfaces
 from geoscene.sources.data import OsmData, TaggedNode, Way
 
@@ -15,11 +16,11 @@ PLACES = {1: (-100.0, 0.0), 2: (0.0, 0.0), 3: (100.0, 0.0), 4: (0.0, 100.0), 5: 
 END, ON_THE_WAY, CROSS = ((1, 2),), ((1, 2, 3),), ((1, 2, 3), (4, 2, 5))
 
 
-def classes_beside(tags, ways=END, *, metres, street=None):
-    """Class of the ground north-east of node 2, at distances from it, and problems."""
+def streets_with(tags, ways=END, *, street=None):
+    """A map of streets with a node of these tags."""
     lonlat = {n: np.array(FRAME.to_geographic(*xy)) for n, xy in PLACES.items()}
     street = {"highway": "residential"} | (street or {})
-    osm = OsmData(
+    return OsmData(
         bounds=(9.9, 49.9, 10.1, 50.1),
         ways=[
             Way(f"way/{k}", street, np.array(nodes), np.array([lonlat[n] for n in nodes]))
@@ -29,6 +30,11 @@ def classes_beside(tags, ways=END, *, metres, street=None):
         points=[TaggedNode("node/2", tags, *lonlat[2])],
         relations=[],
     )
+
+
+def classes_beside(tags, ways=END, *, metres, street=None):
+    """Class of the ground north-east of node 2, at distances from it, and problems."""
+    osm = streets_with(tags, ways, street=street)
     graph, problems = build_road_graph(osm, FRAME)
     rows = road_surfaces(osm, graph, frame=FRAME)
     order = np.argsort(-rows.priority, kind="stable")
@@ -68,6 +74,16 @@ def test_a_turning_loop_has_an_island():
     assert small == [Class.ROAD, Class.ROAD]
     found, _ = classes_beside({"highway": "turning_loop"}, metres=[1.0, 7.9, 8.1], street={"sidewalk": "no"})
     assert found == [Class.GRASS, Class.ROAD, None]
+
+
+def test_the_road_graph_keeps_the_size_of_the_island(tmp_path):
+    graph, _ = build_road_graph(streets_with({"highway": "turning_loop", "diameter": "20"}), FRAME)
+    assert graph.node_island[graph.node_id == 2] == 5.0
+    write_graphml(graph, FRAME, path=tmp_path / "roads.graphml")
+    read = read_graphml(tmp_path / "roads.graphml", FRAME)
+    assert read.node_island.tolist() == graph.node_island.tolist()
+    circle, _ = build_road_graph(streets_with({"highway": "turning_circle"}), FRAME)
+    assert not circle.node_island.any()
 
 
 def test_a_mini_roundabout_is_road_with_a_painted_middle():

@@ -1,5 +1,7 @@
 """Paths are drivable, stay on the street and avoid obstacles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import shapely
@@ -175,6 +177,15 @@ def test_at_a_dead_end_the_vehicle_turns_round_in_three_moves():
     closed = [shapely.box(80, 3.6, 110, 20), shapely.box(80, -20, 110, -3.6)]
     with pytest.raises(BlockedError, match="no room to turn round"):
         plan_path(route, CAR, frame=FRAME, obstacles=closed)
+
+
+@pytest.mark.parametrize("name", ["car", "van"])
+def test_the_vehicle_turns_before_the_island_of_a_turning_loop(name):
+    vehicle = load_vehicle(name)
+    graph = replace(road_graph([(0, 0), (100, 0)], [(0, 1)]), node_island=np.array([0.0, 3.0]))
+    route = lane_route(graph, [0, 1], ends=(0.0, 100.0), turning_radius=vehicle.turning_radius)
+    path = plan_path(route, vehicle, frame=FRAME)
+    assert shapely.distance(outlines(path, vehicle), shapely.Point(100.0, 0.0)).min() > 3.0
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]))
