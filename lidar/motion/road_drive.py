@@ -286,8 +286,8 @@ def plan_route_and_path(
     """A route and a path along it on which the vehicle touches no obstacle.
 
     Parameters are those of `plan_route` and `lidar.motion.path.plan_path`; ``body_width`` and
-    ``turning_radius`` are the vehicle's. Where the body does not pass, the route is planned again without that
-    street or turn; ``tried`` is called with each route.
+    ``turning_radius`` are the vehicle's. Where the body does not pass, the route is planned again without
+    that street or turn; ``tried`` is called with each route.
 
     Raises RouteError as `plan_route` does and for a given route that takes longer than a drive lasts, and
     BlockedError if every route is blocked.
