@@ -6,7 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from geoscene.geometry import polylines
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lane_tags import Lane
+from geoscene.roadgraph.lanes import edge_lanes
+from geoscene.roadgraph.routing import HEADING_REACH
 from geoscene.typing import Float
 
 STRAIGHT = np.radians(30.0)
@@ -67,3 +71,18 @@ def lanes_by_turn(lanes: Sequence[Lane], turns: Float, *, left_hand: bool) -> li
             left = staying or free or everything
             found[k] = {left[0]} if turn > STRAIGHT else {left[-1]} if turn < -STRAIGHT else set(left)
     return [tuple(sorted(numbers)) for numbers in found]
+
+
+def lanes_into(graph: RoadGraph, edge: int, *, left_hand: bool) -> dict[int, list[int]]:
+    """Numbers from the kerb of the lanes of an edge that lead into each edge that may follow."""
+    out = np.flatnonzero(graph.tail == graph.head[edge])
+    out = out[out != graph.twin[edge]]
+    _, leaves = polylines.end_headings(graph.geometry[edge], reach=HEADING_REACH)
+    enters = [polylines.end_headings(graph.geometry[e], reach=HEADING_REACH)[0] for e in out.tolist()]
+    turns = (np.array(enters) - leaves + np.pi) % (2 * np.pi) - np.pi
+    lanes = edge_lanes(graph, edge)
+    leading = lanes_by_turn(lanes, turns, left_hand=left_hand)
+    return {
+        following: sorted(lane if left_hand else len(lanes) - 1 - lane for lane in numbers)
+        for following, numbers in zip(out.tolist(), leading, strict=True)
+    }

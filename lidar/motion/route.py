@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.lanes import LaneLayout, edge_lanes, graph_lanes
-from geoscene.roadgraph.routing import HEADING_REACH, turns_back
-from geoscene.roadgraph.turn_lanes import lanes_by_turn
+from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
+from geoscene.roadgraph.routing import turns_back
+from geoscene.roadgraph.turn_lanes import lanes_into
 from geoscene.typing import Float
 from lidar.errors import RouteError
 from lidar.motion.random_route import random_edges
@@ -192,15 +192,7 @@ def _joined_lanes(a: Float, b: Float, *, reach: float) -> tuple[Float, Float]:
 
 def _turning_lane(graph: RoadGraph, layout: LaneLayout, *, edge: int, following: int, side: Side) -> int:
     """Number from the kerb of the outermost lane of an edge for cars whose arrow leads into the next edge."""
-    left_hand = side == "left"
-    out = np.flatnonzero(graph.tail == graph.head[edge])
-    out = out[out != graph.twin[edge]]
-    _, leaves = polylines.end_headings(graph.geometry[edge], reach=HEADING_REACH)
-    enters = [polylines.end_headings(graph.geometry[e], reach=HEADING_REACH)[0] for e in out.tolist()]
-    turns = (np.array(enters) - leaves + np.pi) % (2 * np.pi) - np.pi
-    lanes = edge_lanes(graph, edge)
-    leading = lanes_by_turn(lanes, turns, left_hand=left_hand)[out.tolist().index(following)]
-    from_kerb = sorted(lane if left_hand else len(lanes) - 1 - lane for lane in leading)
+    from_kerb = lanes_into(graph, edge, left_hand=side == "left")[following]
     closed = layout.closed[edge]
     return next((lane for lane in from_kerb if not closed[lane]), int(layout.take([edge]).open_lane()[0]))
 

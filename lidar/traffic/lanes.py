@@ -13,6 +13,7 @@ from geoscene.geometry import polylines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import LaneLayout, graph_lanes
 from geoscene.roadgraph.routing import HEADING_REACH, turn_states
+from geoscene.roadgraph.turn_lanes import lanes_into
 from geoscene.support.columns import Columns
 from geoscene.typing import Float, Ints
 from lidar.motion.steering import relax
@@ -199,10 +200,11 @@ def random_lanes(
 ) -> tuple[list[int], list[int]]:
     """Edges and lanes of a random drive from an edge, up to ``metres`` or out of the edges ``inside``.
 
-    From the kerb lane, road users go straight on or turn towards the kerb; from the innermost lane straight
-    on or away from it, if possible. Straight on is preferred.
+    Road users go where the arrows of their lane point. Without arrows they go straight on or turn towards the
+    kerb from the kerb lane; from the innermost lane straight on or away from it, if possible. Straight on is
+    preferred.
 
-    any_kind : also use lanes that are closed to cars
+    any_kind : also use lanes that are closed to cars, whatever the arrows
     """
     edges, picked = [edge], [lane]
     far = float(lanes.graph.length[edge])
@@ -223,7 +225,11 @@ def random_lanes(
         weight = weight * np.where(np.abs(turns) > np.radians(140), 0.02, 1.0)
         weight = weight * np.where(lanes.leads_on[states], 1.0, 1e-9)
         here = open_lanes(lanes, edge, any_kind=any_kind)
-        if len(here) > 1:
+        if len(here) > 1 and lanes.graph.lane_turns[edge] and not any_kind:
+            into = lanes_into(lanes.graph, edge, left_hand=lanes.side < 0)
+            leads = np.array([lane in into.get(int(way), ()) for way in ways])
+            weight = np.where(leads, weight, 1e-6 * weight)
+        elif len(here) > 1:
             inward = turns * lanes.side > _STRAIGHT
             outward = turns * lanes.side < -_STRAIGHT
             weight = np.where((lane > here[0]) & outward, 1e-6 * weight, weight)

@@ -74,6 +74,35 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
     assert np.mean([len(driven) > 15 for driven in drives]) > 0.9
 
 
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_traffic_goes_where_the_arrows_of_its_lane_point(side):
+    nodes = [(-100, 0), (0, 0), (0, 100), (100, 0), (0, -100)]
+    arrows = np.array(["left|left|through;right", *[""] * 7])
+    graph = road_graph(nodes, [(0, 1), (1, 2), (1, 3), (1, 4)], lanes=3.0, width=21.0, lane_turns=arrows)
+    lanes, inside = lanes_of(graph, side=side), np.ones(len(graph), bool)
+    north, east, south = (int(np.flatnonzero((graph.tail == 1) & (graph.head == k))[0]) for k in (2, 3, 4))
+
+    def taken(lane):
+        """Edges that follow the first one from a lane, counted from the left."""
+        from_kerb = 2 - lane if side == "right" else lane
+        drives = [
+            random_lanes(
+                lanes,
+                np.random.default_rng(seed),
+                edge=0,
+                lane=from_kerb,
+                metres=150.0,
+                inside=inside,
+                width=1.8,
+            )[0]
+            for seed in range(40)
+        ]
+        return {edges[1] for edges in drives}
+
+    assert taken(0) == taken(1) == {north}
+    assert taken(2) == {east, south}
+
+
 def overlaps(boxes):
     a, b = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     return int((a < b).sum())
