@@ -4,6 +4,7 @@ import gc
 import itertools
 import threading
 import weakref
+import zlib
 from collections import Counter
 from dataclasses import replace
 
@@ -81,6 +82,12 @@ def options_with(stages, folder):
     )
 
 
+def filtered_rows(png):
+    """The rows of a PNG file before compression: its pixels, whatever compressed them."""
+    size = int.from_bytes(png[33:37])  # of the chunk behind the header
+    return zlib.decompress(png[41 : 41 + size])
+
+
 @pytest.mark.parametrize(
     "altered", [pytest.param(False, marks=pytest.mark.full), True], ids=["clear", "stages"]
 )
@@ -114,7 +121,9 @@ def test_simulated_frames_are_those_that_a_drive_records(altered, scene, tmp_pat
             np.testing.assert_array_equal(one.image.klass, semantic)
             np.testing.assert_array_equal(one.image.feature, image_to_feature(instance))
             flow = encode_png(flow_to_image(one.flow))
-            assert flow == paths.image("front", one.frame, kind="flow").read_bytes()
+            written = paths.image("front", one.frame, kind="flow").read_bytes()
+            assert filtered_rows(flow) == filtered_rows(written)
+            assert flow == written
             continue
         table = read_table(paths.sensor(one.sensor) / "pcd" / f"{one.frame:06d}.pcd")
         own = cloud_table(one.cloud)
