@@ -234,7 +234,7 @@ def _step(value: float, level: float, edge: float) -> float:
 def _paint(feature: int, wall: int, albedo: Float) -> None:
     """Replace a building's default colour by one derived from its number."""
     shade = hash_place(feature, 7, 20)
-    shade = 0.5 + 0.6 * shade if wall else 0.7 + 1.1 * shade
+    shade = 0.5 + 0.6 * shade if wall else 0.7 + 0.6 * shade
     warm = 0.24 * (hash_place(feature, 8, 20) - 0.35)
     albedo[0] *= shade * (1.0 + 0.6 * warm)
     albedo[1] *= shade

@@ -18,7 +18,7 @@ from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.render import _shared_rays, optical_flow, render
 from lidar.sensors.camera.settings import CameraSettings
-from lidar.sensors.camera.shade import straight_rays
+from lidar.sensors.camera.shade import linear_table, straight_rays
 from lidar.sensors.rig.camera_model import exposure_times, pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
@@ -497,6 +497,27 @@ def test_a_camera_that_does_not_record_colour_skips_it():
     frame = render(replace(CAMERA, images=("depth",)), looking(), world=street(), sun=NOON)
     assert frame.rgb is None
     assert np.isfinite(frame.depth).any()
+
+
+def test_roofs_without_a_mapped_colour_differ_about_that_of_their_material():
+    roofs = [
+        house((x, y, 0), (x + 8, y + 8, 5), feature=x + 7 * y, material="tar_roof")
+        for x in range(0, 80, 10)
+        for y in range(0, 80, 10)
+    ]
+    over = looking((40.0, 40.0, 70.0), down=np.pi / 2)
+    town = world(*roofs)
+
+    def brightness(settings):
+        frame = render(CAMERA, over, world=town, sun=NOON, settings=settings)
+        light = linear_table()[frame.rgb].mean(axis=2)
+        return np.array(
+            [light[frame.feature == k].mean() for k in np.unique(frame.feature[frame.feature >= 0])]
+        )
+
+    found = brightness(replace(FLAT, detail=True)) / brightness(FLAT)
+    assert found.mean() == pytest.approx(1.0, abs=0.1)
+    assert found.std() > 0.1
 
 
 def test_night_is_dark_but_not_empty():
