@@ -29,7 +29,7 @@ from geoscene.support.columns import nth
 from geoscene.support.problems import Problem
 from geoscene.support.splitmix import number_of, uniform_at
 from geoscene.tags import parse_length
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 
 _WIDEST = 3000.0
 """Metres; larger widths are taken for typing errors."""
@@ -40,6 +40,8 @@ _ASIDE = 0.01
 _CELL = 20.0  # metres
 _AROUND = 2  # cells on each side that a cell's density is taken over: 100 m in all
 _DENSE = 0.2  # built-up share from which yards are paved; assumed
+_CLOSED = 0.4  # built-up share from which all of it is paved; assumed
+_APRON = 8.0  # metres around buildings that are paved where the share is less; assumed
 _ROUND = 4  # segments of a quarter circle at corners
 _PRIORITY = -1.0  # below everything that is mapped
 
@@ -245,11 +247,20 @@ def _shores(faces: NDArray[np.object_], coastlines: Sequence[Float]) -> tuple[Fl
     return shores[0], shores[1]
 
 
+def _cells(chosen: NDArray[np.bool_], *, low: Ints, wider: float) -> Any:
+    """The chosen cells of a grid from cell ``low`` on, and the land around, with rounded corners."""
+    x, y = ((np.argwhere(chosen) + low) * _CELL).T
+    cells = shapely.coverage_union_all(shapely.box(x, y, x + _CELL, y + _CELL))
+    wide = shapely.buffer(cells, 2 * wider, quad_segs=_ROUND)
+    return shapely.buffer(wide, -wider, quad_segs=_ROUND)
+
+
 def paved_fabric(footprints: NDArray[Any]) -> Layers:
     """Paved ground between dense buildings, as the lowest layer: an assumption, marked as such.
 
-    Where buildings cover more than a fifth of the 100 m around, unmapped ground is paved (yards, pavements);
-    in suburbs and in the country it remains the base. Source ``assumed-built-up``.
+    Where buildings cover more than a fifth of the 100 m around, unmapped ground is paved (yards, pavements).
+    It remains the base, as in suburbs and in the country, between blocks that stand apart: more than 8 m from
+    buildings where these cover less than two fifths. Source ``assumed-built-up``.
 
     footprints : shapely polygons, scene metres
     """
@@ -266,13 +277,17 @@ def paved_fabric(footprints: NDArray[Any]) -> Layers:
     width = 2 * _AROUND + 1
     padded = np.pad(built, _AROUND)
     around = np.lib.stride_tricks.sliding_window_view(padded, (width, width)).sum(axis=(2, 3))
-    dense = around > _DENSE * (width * _CELL) ** 2
-    x, y = ((np.argwhere(dense) + low) * _CELL).T
-    cells = shapely.coverage_union_all(shapely.box(x, y, x + _CELL, y + _CELL))
-    wide = shapely.buffer(cells, 30.0, quad_segs=_ROUND)
-    smooth = shapely.get_parts(shapely.buffer(wide, -15.0, quad_segs=_ROUND))
+    dense, closed = (
+        _cells(around > share * (width * _CELL) ** 2, low=low, wider=15.0) for share in (_DENSE, _CLOSED)
+    )
+    beside = shapes[shapely.STRtree(shapes).query(dense, predicate="intersects")]
+    # Lawns of less than 8 m across are closed.
+    aprons = shapely.union_all(shapely.buffer(beside, _APRON + 4.0, quad_segs=_ROUND // 2))
+    aprons = shapely.buffer(aprons, -4.0, quad_segs=_ROUND // 2)
+    paved = shapely.get_parts(shapely.intersection(dense, shapely.union(closed, aprons)))
+    paved = paved[shapely.area(paved) > 0]
     return Layers.of(
-        smooth,
+        paved,
         klass=Class.PAVED,
         material=materials()["paving"].code,
         priority=_PRIORITY,

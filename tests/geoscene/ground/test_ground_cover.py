@@ -16,7 +16,7 @@ from geoscene.ground import (
     plan_ground,
     water_levels,
 )
-from geoscene.ground.landcover import sea
+from geoscene.ground.landcover import paved_fabric, sea
 from geoscene.ground.terrain import open_terrain
 from geoscene.roadgraph.paths import path_surfaces, square_surfaces
 from geoscene.sources import read_osm
@@ -335,3 +335,15 @@ def test_monaco_starts_at_sea_level_and_rises_inland(shared_osm, shared_dem):
     error = middle[land, 2] - terrain.height(middle[land, 0], middle[land, 1])
     assert np.median(np.abs(error)) < 0.3
     assert z.max() > 100.0
+
+
+@pytest.mark.parametrize(("gap", "paved"), [(8.0, True), (45.0, False)])
+def test_between_blocks_that_stand_apart_land_is_paved_beside_them_alone(gap, paved):
+    """Slabs of 14 x 60 m in rows: closer together, all of the yards are paved."""
+    step = 14.0 + gap
+    slabs = np.array([shapely.box(x, y, x + 14, y + 60) for x in step * np.arange(8) for y in (0, 70, 140)])
+    layers = paved_fabric(slabs)
+    found = shapely.union_all(layers.polygon)
+    assert found.contains(shapely.Point(3 * step + 17.0, 100.0))
+    assert found.contains(shapely.Point(3 * step + 14.0 + gap / 2, 100.0)) == paved
+    assert set(layers.source) == {"assumed-built-up"}
