@@ -166,7 +166,7 @@ def main(
             sys.stdout.flush()
     except CycloptsError as error:
         flag = next((word for word in sys.argv[1:] if word in removed), "")
-        message = f"{flag} is removed: {removed[flag]}" if flag else str(error).rstrip(".")
+        message = f"{flag} is removed: {removed[flag]}" if flag else _in_plain_words(str(error).rstrip("."))
         _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
         sys.exit(USAGE)
     except roots as error:
@@ -190,6 +190,19 @@ def main(
         _print_error(app, f"{name}: {error.strerror or error}{hint}")
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
+
+
+_WANTED = {"float": "give a number", "int": "give a whole number", "bool": "give true or false"}
+"""What is allowed where the parser names a type of Python."""
+
+
+def _in_plain_words(message: str) -> str:
+    """A message of the parser without names of Python's types."""
+    return re.sub(
+        rf'unable to convert "(.*)" into ({"|".join(_WANTED)})\b',
+        lambda found: f'"{found[1]}": {_WANTED[found[2]]}',
+        message,
+    )
 
 
 def _open_streams() -> None:
