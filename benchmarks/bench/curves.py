@@ -166,8 +166,8 @@ def _scan(setup: Setup, rays: int) -> Prepared:
             scan(scanner.sensor, mount, trajectory=plan.trajectory, world=world, frame=k, settings=settings)
 
     for warm in (1, 7):  # one ray and several take different ways
-        frames(settings_of("standard", [("rays", str(warm))]).lidar, 1)
-    return partial(frames, settings_of("standard", [("rays", str(rays))]).lidar, 5)
+        frames(settings_of("standard", [("rays", str(warm))])[0], 1)
+    return partial(frames, settings_of("standard", [("rays", str(rays))])[0], 5)
 
 
 def _by_turns(

@@ -19,7 +19,7 @@ options = lidar.DriveOptions(
     route="random",
     rig="vlp16",
     duration=2.0,
-    seed=3,
+    seed=5,
     traffic=lidar.TrafficOptions(vehicles=30, cyclists=8, pedestrians=60, parked=0.8),
 )
 simulation = lidar.simulate(scene, options)

@@ -701,7 +701,8 @@ def test_road_graphs_of_real_places_are_connected(shared_osm, name, share):
     frame = Frame.at((west + east) / 2, (south + north) / 2)
     graph, _ = build_road_graph(osm, frame)
     full, _ = build_road_graph(osm, frame, options=RoadOptions(simplify=False))
-    assert full.length.sum() == pytest.approx(graph.length.sum(), rel=1e-9)
+    # Lines beside the map's (`placement`, five ways in Monaco) are mitred within edges, not between them.
+    assert full.length.sum() == pytest.approx(graph.length.sum(), rel=1e-4)
     assert find_components(graph).largest_strong_share > share
     main = main_network(graph)
     rng = np.random.default_rng(0)
@@ -714,5 +715,5 @@ def test_road_graphs_of_real_places_are_connected(shared_osm, name, share):
             continue
         assert (main.head[path.edges[:-1]] == main.tail[path.edges[1:]]).all()
         plan = np.hypot(*np.diff(path_line(main, path)[:, :2], axis=0).T).sum()
-        assert plan == pytest.approx(path.length, rel=1e-5, abs=1e-6)
+        assert plan == pytest.approx(path.length, rel=1e-5, abs=0.5)  # a step where `placement` begins
     assert len(lines) == len(main)
