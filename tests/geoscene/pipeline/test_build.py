@@ -259,7 +259,7 @@ def test_scene_for_gis_has_the_tables_and_no_tiles(osm, scene, tmp_path):
         with pytest.raises(SceneFormatError, match="no tiles"):
             export_scene(part, tmp_path / name)
         assert not (tmp_path / name).exists()
-    done = run_program("lidar", "drive", part.path, "--route", "random", "-o", tmp_path / "drive")
+    done = run_program("lidar", "drive", part.path, "--route", "random", "-o", tmp_path / "drive", "-q")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "no tiles" in done.stderr
