@@ -15,7 +15,14 @@ from scipy.sparse import csr_array, diags_array
 from geoscene.geometry.frames import Frame
 from geoscene.ground.terrain import open_terrain
 from geoscene.pipeline.build import road_metres
-from geoscene.roadgraph import ProfileOptions, build_road_graph, find_obstacles, graded_ground, profile
+from geoscene.roadgraph import (
+    ProfileOptions,
+    build_road_graph,
+    find_obstacles,
+    graded_ground,
+    profile,
+    quadratic,
+)
 from geoscene.roadgraph.quadratic import Bounds, interior_point
 from geoscene.roadgraph.stations import find_crossings, place_stations
 from geoscene.sources import read_osm
@@ -363,6 +370,13 @@ def test_interior_point_solver_finds_the_constrained_minimum(seed, n, k):
     slope = cost @ z - pull + a.T @ (weight * np.minimum(a @ z - b, 0))
     scale = 1 + np.abs(pull).max() + np.abs(a.T * weight).max()
     assert np.abs(slope).max() < 1e-3 * scale
+
+
+def test_heights_that_are_not_settled_are_said(caplog, monkeypatch):
+    monkeypatch.setattr(quadratic, "_ROUNDS", 2)
+    bounds = Bounds(csr_array([[1.0]]), np.array([50.0]), np.array([1e4]))
+    interior_point(csr_array([[1.0]]), np.zeros(1), bounds=bounds, start=np.zeros(1))
+    assert "heights of streets are not settled after 2 iterations" in caplog.text
 
 
 @pytest.mark.shared
