@@ -90,7 +90,7 @@ from geoscene.roadgraph.tags import find_unused_inclines
 from geoscene.roadgraph.walls import HEADROOM, Walls
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
-from geoscene.sources import AROUND_BOUNDS, OsmData
+from geoscene.sources import OsmData
 from geoscene.structures import (
     Passages,
     StructureOptions,
@@ -230,14 +230,14 @@ def make_plan(
     terrain = Terrain(frame)
     if options.dem:
         gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
-        terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps, around=AROUND_BOUNDS)
+        terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps)
         problems += terrain.problems
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
     if "roads" in options.only:
-        osm = _collect(problems, _with_clear_ends(osm, frame))
-    passages = _collect(problems, find_passages(_only_roads(osm, options), buildings, frame=frame))
+        osm = _collect(problems, lengthen_structures(osm, frame))
+    passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
     solid = _on_ground(buildings, passages, free=HEADROOM)
     some = np.flatnonzero([shape is not None for shape in solid])
     names = np.array(buildings.osm_id[some], np.str_)
@@ -369,7 +369,7 @@ def _checked_centre(osm: OsmData) -> tuple[float, float]:
 class _Roads:
     """Roads of a map and the ground graded to them.
 
-    graph  : of the whole map and the streets around it, with heights
+    graph  : of the whole map, with heights
     drivable : the part of it within the extent
     height : z of the graded ground, None if it is 0 everywhere
     uneven : the ground or a road has heights other than 0
@@ -382,25 +382,6 @@ class _Roads:
     side_source: str
     height: Height | None
     uneven: bool
-
-
-def _with_clear_ends(osm: OsmData, frame: Frame) -> tuple[OsmData, list[Problem]]:
-    """The map with bridges and tunnels that end clear of streets, also beyond its bounds."""
-    whole, problems = lengthen_structures(_with_around(osm), frame)
-    count = len(osm.ways)
-    found = replace(osm, ways=whole.ways[:count], around=whole.ways[count:])
-    return found, _within(osm, problems)
-
-
-def _with_around(osm: OsmData) -> OsmData:
-    """The map with the ways beyond its bounds, after its own."""
-    return replace(osm, ways=[*osm.ways, *osm.around])
-
-
-def _within(osm: OsmData, problems: list[Problem]) -> list[Problem]:
-    """The problems but those of ways beyond the bounds."""
-    beyond = {way.osm_id for way in osm.around}
-    return [problem for problem in problems if problem.osm_id not in beyond]
 
 
 def _plan_roads(
@@ -419,14 +400,12 @@ def _plan_roads(
     if options.driving_side:
         side, source = cast("Side", options.driving_side), "option"
     road_options = RoadOptions(left_hand=side == "left")
-    whole = _with_around(mapped)
-    graph, found = build_road_graph(whole, frame, options=road_options, walls=walls)
-    problems += _within(mapped, found)
+    graph = _collect(problems, build_road_graph(mapped, frame, options=road_options, walls=walls))
     problems += find_odd_layers(mapped.ways)
     if not terrain.grids:
         problems += find_unused_inclines(mapped.ways)
     surveyed = 0.0 < terrain.spacing <= _SURVEYED
-    obstacles = find_obstacles(whole, frame)
+    obstacles = find_obstacles(osm, frame)
     graph = profile(graph, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = None
@@ -441,8 +420,7 @@ def _plan_roads(
 
 def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:
     """The map that roads are read from: without features if the scene has none."""
-    none = replace(osm, areas=[], ways=[], relations=[], points=[], around=[])
-    return osm if "roads" in options.only else none
+    return osm if "roads" in options.only else replace(osm, areas=[], ways=[], relations=[], points=[])
 
 
 @dataclass(frozen=True, slots=True)

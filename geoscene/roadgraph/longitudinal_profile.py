@@ -25,7 +25,6 @@ class ProfileOptions:
     deck      : thickness of bridge decks
     cover     : thickness of the ground over a tunnel
     slope     : maximum gradient of ramps, bridges and tunnels (exceeded only where the ground is steeper)
-    steepest  : maximum gradient of roads where the ground is steeper (Baldwin Street in Dunedin has 0.35)
     step      : maximum change of gradient from one station to the next, in addition to the ground's own
     smooth    : length over which the ground is smoothed
     spacing   : distance between stations
@@ -37,7 +36,6 @@ class ProfileOptions:
     deck: float = 0.8
     cover: float = 1.0
     slope: float = 0.08
-    steepest: float = 0.35
     step: float = 0.02
     smooth: float = 12.0
     spacing: float = 10.0
@@ -60,9 +58,6 @@ class Obstacles:
 # more firmly than a ramp does, and those that no ramp leads to do not give way; violated bounds cost more.
 _FIXED, _FIRM, _RAMP, _LOOSE = 1e4, 100.0, 1.0, 1e-6
 _RAMP_REACH = 150.0
-_THROUGH = 1e5
-"""Of streets beyond the junctions at which ramps end: where a ramp is too short, it is steep, rather than
-that these streets sink or rise with it."""
 # Over more than this length (metres) a bridge or tunnel behaves as a taut string rather than as a beam.
 _TAUT = 30.0
 _AROUND = 400.0
@@ -138,15 +133,9 @@ def _weights(graph: RoadGraph, stations: Stations) -> Float:
     count = len(stations.xy)
     ends = np.zeros(count, np.bool_)
     ends[a[structure]] = ends[b[structure]] = True
-    links = a[~structure], b[~structure], metres[~structure]
-    far = _distance(count, links, start=ends, limit=_RAMP_REACH)
+    far = _distance(count, (a[~structure], b[~structure], metres[~structure]), start=ends, limit=_RAMP_REACH)
     per_metre = _RAMP + (_FIRM - _RAMP) * (far / _RAMP_REACH) ** 2
     per_metre[far >= _RAMP_REACH] = _FIXED
-    junction = np.bincount(np.concatenate([a, b]), minlength=count) > 2
-    inner = ~junction[links[0]] & ~junction[links[1]]
-    on_ramp = links[0][inner], links[1][inner], links[2][inner]
-    ramp = _distance(count, on_ramp, start=ends & ~junction, limit=_RAMP_REACH)
-    per_metre[(ramp >= _RAMP_REACH) & (far < _RAMP_REACH)] = _THROUGH
     share = np.where(structure, 0.0, metres / 2)
     held = np.bincount(a, share, count) + np.bincount(b, share, count)
     return np.maximum(held * per_metre, _LOOSE)
@@ -188,7 +177,7 @@ def _bounds(
     a, b, metres, edge = stations.segments
     structure = graph.bridge[edge] | graph.tunnel[edge]
 
-    own = np.minimum(np.abs(terrain[b] - terrain[a]), options.steepest * metres)
+    own = np.abs(terrain[b] - terrain[a])
     most = np.where(structure, options.slope * metres, np.maximum(options.slope * metres, own))
     rows.add([(b, 1.0), (a, -1.0)], -most, weight=_HARD)
     rows.add([(a, 1.0), (b, -1.0)], -most, weight=_HARD)

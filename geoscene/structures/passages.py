@@ -131,22 +131,21 @@ def _may_be_passage(tags: Tags) -> bool:
     return source not in ("layer", "level") or layer == 0
 
 
-def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[Passages, list[Problem]]:
-    """The passages of a map, in the order of its ways, and those that are not mapped.
+def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passages:
+    """The passages of a map, in the order of its ways.
 
     A way on the ground has one in each building that its line runs through if it is tagged
-    ``tunnel=building_passage`` or ``covered``, or if it is a street: a building that stands on the ground
-    across one is open there, too. It is as wide as the way, extended through the wall at which
+    ``tunnel=building_passage`` or ``covered``. It is as wide as the way, extended through the wall at which
     the way ends, and as high as ``height``, ``maxheight:physical`` or ``maxheight`` of the way, else 4.5 m
     over roads, 2.5 m over paths, and the free height of the kind of track. Thin walls that would be left
     beside it are left out; an arcade is open to the side.
     """
     drawn = np.flatnonzero(buildings.drawn)
-    ways, lines = way_lines([w for w in osm.ways if _is_passage(w.tags) or _is_street(w.tags)], frame)
+    ways, lines = way_lines([way for way in osm.ways if _is_passage(way.tags)], frame)
     tree = shapely.STRtree(buildings.footprint[drawn])
     way, found = tree.query(lines, predicate="intersects")
     owner = buildings.outline[drawn[found]]
-    rows, problems = [], []
+    rows = []
     for k, building in np.unique(np.column_stack([way, owner]), axis=0).tolist():
         mine = drawn[buildings.outline[drawn] == building]
         body = shapely.union_all(buildings.footprint[mine])
@@ -157,7 +156,6 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
         polygon, beyond = _opening(lines[k], body, half=width / 2 + _BESIDE, tags=ways[k].tags)
         if polygon.area < _TINY:
             continue
-        mapped = _is_passage(ways[k].tags)
         top, source = _free_height(ways[k].tags)
         low, plan = buildings.min_height[mine], buildings.footprint[mine]
         grounded = shapely.union_all(plan[low < _LOW])
@@ -166,11 +164,6 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
         into = grounded.intersection(polygon).area > _TINY
         cut = areal(beyond.difference(free), least=_TINY) if into else shapely.MultiPolygon()
         guessed = source == "default"
-        if not (mapped or into):
-            continue
-        if not mapped:
-            detail = f"runs through {buildings.osm_id[building]} without a passage; opened"
-            problems.append(Problem(ways[k].osm_id, "road", "repaired", "street-in-building", detail))
         underside = np.where(low < _LOW, _eaves(buildings, mine) if guessed else np.inf, low)
         own = np.where(low < _LOW, plan, shapely.difference(plan, grounded))
         over = (shapely.area(shapely.intersection(own, polygon)) > _TINY) & (underside >= _LOW)
@@ -178,7 +171,7 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
         source = source if height == top else "building"
         rows.append((polygon, cut, building, width, top, guessed, height, source, ways[k].osm_id))
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 9
-    passages = Passages(
+    return Passages(
         np.fromiter(columns[0], object),
         np.fromiter(columns[1], object),
         np.array(columns[2], np.int64),
@@ -189,7 +182,6 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
         np.array(columns[7], np.str_),
         np.array(columns[8], np.str_),
     )
-    return passages, problems
 
 
 def _eaves(buildings: Buildings, row: Ints) -> Float:
@@ -204,12 +196,6 @@ def _is_passage(tags: Tags) -> bool:
     inside = tags.get("tunnel") in _COVERED or tags.get("covered", "no") != "no"
     on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
     return inside and on_ground and _width(tags) > 0 and tags.get("indoor", "no") == "no"
-
-
-def _is_street(tags: Tags) -> bool:
-    """Whether a way outside buildings, on the ground, is one that cars drive on."""
-    on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
-    return drivable(tags, private=False) and on_ground and tags.get("indoor", "no") == "no"
 
 
 def _is_arcade(tags: Tags) -> bool:

@@ -150,23 +150,6 @@ def test_streets_that_cross_on_terrain_without_a_node_have_one_height(bench, tmp
     assert not faults(bench, scene)
 
 
-def test_a_ramp_has_its_height_also_where_the_bridge_is_beyond_the_bounds(tmp_path):
-    places = {n: (x + 80, y) for n, (x, y) in CROSSING.items()}
-    path = write_map(tmp_path / "map.osm", places, crossing({"bridge": "yes"}, {}))
-    terrain = (write_terrain(tmp_path / "dem.tif", SLOPE),)
-    found = []
-    for reach in (250.0, 30.0):
-        (west, east), (south, north) = FRAME.to_geographic(np.array([-250.0, reach]), np.array([-99.0, 99.0]))
-        osm = read_osm(path, bounds=(west, south, east, north))
-        scene = build(osm, tmp_path / str(reach), options=BuildOptions(dem=terrain, use="map"))
-        graph = scene.road_graph()
-        line = graph.geometry[np.flatnonzero(graph.osm_id == "way/100")[0]]
-        x, _ = FRAME.from_geographic(*scene.frame.to_geographic(line[:, 0], line[:, 1]))
-        found.append(np.interp([-20.0, 0.0, 10.0, 25.0], x, line[:, 2]))
-    np.testing.assert_allclose(*found, atol=0.001)
-    assert found[0][-1] > SLOPE(25.0, 0.0) + 2.0
-
-
 def HILLS(x, y):  # noqa: N802 - a constant
     return 300.0 + 12.0 * np.sin(x / 40.0) * np.cos(y / 55.0) + 0.1 * x
 
@@ -251,13 +234,6 @@ def test_railings_and_walls_of_footways_do_not_stand_in_streets(path, tags, benc
     assert not faults(bench, built(tmp_path, places, ways))
     (tmp_path / "steep").mkdir()
     assert not faults(bench, built(tmp_path / "steep", places, ways, terrain=SLOPE))
-
-
-def test_a_footbridge_passes_over_a_road_bridge_wherever_its_stations_lie(bench, tmp_path):
-    places = CROSSING | {1: (-200, 0), 4: (200, 0), 5: (0, -160), 6: (0, -60), 7: (0, 60), 8: (0, 160)}
-    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4])]
-    ways += [(FOOT, [5, 6]), (FOOT | {"bridge": "yes", "layer": "2"}, [6, 7]), (FOOT, [7, 8])]
-    assert not faults(bench, built(tmp_path, places, ways))
 
 
 @pytest.mark.parametrize("level", ["1", "-1", "2", "0"])

@@ -213,34 +213,6 @@ def test_on_the_ground_a_road_follows_the_terrain():
     assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
 
 
-def test_a_street_does_not_sink_where_the_ramp_of_a_tunnel_is_too_short():
-    places = {
-        1: (0, -300),
-        2: (0, 0),
-        3: (0, 300),
-        4: (25, 0),
-        5: (90, 0),
-        6: (300, 0),
-        7: (40, -300),
-        8: (40, 300),
-    }
-    ways = [(ROAD, [1, 2, 3]), (ROAD, [2, 4]), (TUNNEL, [4, 5]), (ROAD, [5, 6]), (ROAD, [7, 8])]
-    graph = profile(graph_of(places, ways), flat)
-    assert clearances(graph).min() >= HIGH - 0.05
-    street = [line for line, name in zip(graph.geometry, graph.osm_id, strict=True) if name == "way/100"]
-    assert np.abs(np.concatenate(street)[:, 2]).max() < 1.0
-
-
-def test_no_road_is_steeper_than_the_steepest_streets_there_are():
-    graph = profile(
-        graph_of({1: (-300, 0), 2: (300, 0)}, [(ROAD, [1, 2])]),
-        lambda x, _: np.clip(60 - 0.6 * abs(x), 0, 60),
-    )
-    along, _, height = graph.geometry[0].T
-    assert np.abs(np.diff(height) / np.diff(along)).max() <= 0.36
-    assert height.max() > 30.0
-
-
 def test_steep_metres_are_counted():
     def cliff(x, y):
         return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y

@@ -172,7 +172,10 @@ def test_ways_have_passages_of_their_kind(tags, width, free):
 @pytest.mark.parametrize(
     ("tags", "why"),
     [
+        ({}, "no tag"),
         ({"tunnel": "yes", "layer": "-1"}, "underground"),
+        ({"tunnel": "culvert"}, "water"),
+        ({"covered": "no"}, "no roof"),
         ({"covered": "yes", "level": "1"}, "upper storey"),
         ({"covered": "yes", "bridge": "yes", "layer": "1"}, "bridge"),
     ],
@@ -180,13 +183,6 @@ def test_ways_have_passages_of_their_kind(tags, width, free):
 def test_other_ways_have_none(tags, why):
     plan, _, _ = built([house()], street(*STREET, inside=tags))
     assert "passages" not in {layer.name for layer in plan.layers}, why
-
-
-@pytest.mark.parametrize("tags", [{}, {"tunnel": "culvert"}, {"covered": "no"}])
-def test_a_building_across_a_street_is_open_there_and_listed(tags):
-    plan, _, problems = built([house()], street(*STREET, inside=tags))
-    assert "passages" in {layer.name for layer in plan.layers}
-    assert [(p.osm_id, p.reason) for p in problems if p.kind == "road"] == [("way/2", "street-in-building")]
 
 
 def test_a_long_tunnel_below_a_house_stays_a_tunnel():
