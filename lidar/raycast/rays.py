@@ -25,7 +25,7 @@ EXACTLY = (0.0, 0.0)
 
 
 _NO_OFFSETS, _NO_MATRICES = np.empty((0, 3)), np.empty((0, 3, 3))
-_NO_OFFSETS.flags.writeable = False  # as all directions and offsets; else kernels would be compiled again
+_NO_OFFSETS.flags.writeable = False  # as of `_rows`
 _NONE, _NO_TIMES = np.empty(0, np.int64), np.empty(0, np.float32)
 _ENDLESS = np.array([np.inf])
 
@@ -61,7 +61,7 @@ def posed_rays(
     if not _numbers(index, count):
         raise InputError(f"a ray has a pose number beyond the {count} poses")
     matrix = poses.rotation if _level(poses.scale) else poses.scale[:, :, None] * poses.rotation
-    return _plain(d, o, index, np.ascontiguousarray(poses.position, np.float64), np.ascontiguousarray(matrix))
+    return _plain(d, o, index, _rows(poses.position, "positions"), np.ascontiguousarray(matrix))
 
 
 def _plain(d: Float, o: Float, pose: NDArray[np.int64], position: Float, matrix: Float) -> RayColumns:

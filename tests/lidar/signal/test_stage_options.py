@@ -46,8 +46,8 @@ def test_weather_loses_weak_echoes_unless_the_user_says_otherwise():
         ("snow=2mm/h,snow_cover=0,wetness=0", 1, 0, 0),
         ("spray=0.6mm", 1, 0.5, 0),
         ("fog=50m", 1, 0, 0),
-        ("clear,wetness=0.4,snow_cover=0.2", 0, 0.4, 0.2),
-        ("rain=3mm/h,model=lisa", 0, 0, 0),
+        ("clear,wetness=0.4,snow_cover=0.2", 0.3, 0.4, 0.2),
+        ("rain=3mm/h,model=lisa", 0.3, 0, 0),
     ],
 )
 def test_weather_wets_the_ground_and_covers_the_sky_by_its_kind(text, cloud, wetness, snow):
