@@ -11,7 +11,6 @@ from cyclopts import Parameter
 from geoscene.errors import need
 from geoscene.support.console import Report, command_line, note_new_folder
 from geoscene.support.progress import progress_bar
-from geoscene.support.storage import url_of
 from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
 from lidar.options import OUTPUT, EvaluateOptions
@@ -123,7 +122,7 @@ def detect(
     out
         Folder to make: NNNNNN.txt of each frame, or results.json.
     """
-    from lidar.dataset.layout import Paths  # noqa: PLC0415
+    from lidar.dataset.layout import is_dataset  # noqa: PLC0415
     from lidar.tools.detection.learned import read_detector  # noqa: PLC0415
     from lidar.tools.evaluation.detect import LAYOUTS  # noqa: PLC0415
     from lidar.tools.evaluation.detect import detect as detected  # noqa: PLC0415
@@ -141,6 +140,6 @@ def detect(
             progress=progress,
         )
     text = f"{out}: {counts['boxes']:,} boxes in {counts['frames']:,} frames"
-    if url_of(dataset) or Paths(dataset).manifest.exists():
+    if is_dataset(dataset):
         text += f"; next: {command_line('lidar', 'evaluate', out, '--against', dataset)}"
     return show({"path": str(out), **counts}, text, json=report.json)

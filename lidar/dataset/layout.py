@@ -268,6 +268,20 @@ DatasetLike = str | os.PathLike[str]
 """Directory or URL of a dataset, or an opened one."""
 
 
+def is_dataset(path: DatasetLike) -> bool:
+    """Whether a place is to be opened as a dataset: a URL, or a folder with a manifest.
+
+    Raises InputError for what is no place.
+    """
+    _check_place(path)
+    return bool(url_of(path)) or Paths(Path(path)).manifest.exists()
+
+
+def _check_place(path: DatasetLike) -> None:
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"`dataset` {brief(path)}: give the directory or URL of a dataset, or an opened one")
+
+
 def open_dataset(path: DatasetLike) -> Dataset:
     """Open a dataset directory, finished or not, or one at a URL; opened ones pass.
 
@@ -278,8 +292,7 @@ def open_dataset(path: DatasetLike) -> Dataset:
     """
     if isinstance(path, Dataset):
         return path
-    if not isinstance(path, str | os.PathLike):
-        raise InputError(f"`dataset` {brief(path)}: give the directory or URL of a dataset, or an opened one")
+    _check_place(path)
     folder, stored = Path(path), None
     if url := url_of(path):
         stored, folder = StoredFolder(url), cache_folder() / "datasets" / digest(url.encode())

@@ -17,14 +17,22 @@ from geoscene.classes import Class
 from geoscene.errors import reason_of
 from geoscene.scene.layout import SceneFiles
 from geoscene.support.progress import Progress, displayed, shows_progress
-from geoscene.support.storage import shown, url_of
+from geoscene.support.storage import shown
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
 from lidar.dataset.derived import read_folder_provenance
 from lidar.dataset.foreign import foreign_clouds, read_foreign_stages
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.journal import read_journal
-from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, opened_rows, reading_file
+from lidar.dataset.layout import (
+    Dataset,
+    DatasetLike,
+    Paths,
+    is_dataset,
+    open_dataset,
+    opened_rows,
+    reading_file,
+)
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import OPTICAL, euler_from_quat, quat_from_matrix
 from lidar.signal.registry import ATTACKS
@@ -75,7 +83,7 @@ def describe(path: DatasetLike, *, full: bool = False, progress: Progress = disp
     Raises DatasetError for another directory, with the command that describes it, and for damaged metadata.
     """
     folder = Path(path)
-    if url_of(path) or Paths(folder).manifest.exists():
+    if is_dataset(path):
         return _dataset(open_dataset(path), shown(folder), full=full, progress=progress)
     if not folder.is_dir():
         what = "is a file; give the directory of a dataset" if folder.exists() else "is not there"

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, displayed, shows_progress
-from geoscene.support.storage import url_of
 from geoscene.typing import Float
 from lidar.dataset.foreign import KITTI, NUSCENES, foreign_clouds
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.table import Table
 from lidar.dataset.kitti_folder import CameraView, camera_view
-from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike, is_dataset, open_dataset
 from lidar.dataset.layouts.kitti import CORNERS, OBJECTS, outline
 from lidar.dataset.layouts.kitti_drive import looking_ahead, read_drive
 from lidar.dataset.layouts.nuscenes import streams_of, table_frame
@@ -87,16 +86,12 @@ def detect(
     detector = read_detector(detector) if isinstance(detector, str) else detector
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
-    foreign = [] if _is_dataset(dataset) else foreign_clouds(Path(dataset))
+    foreign = [] if is_dataset(dataset) else foreign_clouds(Path(dataset))
     if layout == "kitti":
         images = _images_of_folder(Path(dataset), foreign) if foreign else _images(open_dataset(dataset))
         return _write_kitti(images, out, detector=detector, progress=progress)
     samples = _samples_of_folder(Path(dataset), foreign) if foreign else _samples(open_dataset(dataset))
     return _write_nuscenes(samples, out, detector=detector, progress=progress)
-
-
-def _is_dataset(dataset: DatasetLike) -> bool:
-    return isinstance(dataset, Dataset) or bool(url_of(dataset)) or Paths(Path(dataset)).manifest.exists()
 
 
 @dataclass(frozen=True, slots=True)

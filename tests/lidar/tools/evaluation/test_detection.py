@@ -536,3 +536,8 @@ def test_clouds_without_calibration_or_tables_are_searched_in_their_own_frame(tm
     assert results["n"][0]["translation"] == pytest.approx([30.0, 0.0, -1.0])
     with pytest.raises(InputError, match="holds clouds of kitti; give kitti"):
         detect(tmp_path / "k", tmp_path / "no", layout="nuscenes")
+
+
+def test_what_is_no_place_is_named(tmp_path):
+    with pytest.raises(InputError, match="`dataset` 5: give the directory or URL of a dataset"):
+        detect(5, tmp_path / "out", layout="kitti")
