@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from datetime import datetime, timedelta
 
@@ -147,11 +146,11 @@ def clouds_during(recording: Recording, time_ns: int) -> tuple[float, float]:
     """
     settings = recording.settings
     east, north = generator(settings.seed, "clouds").uniform(-_SKY, _SKY, 2).tolist()
-    stages = [named.stage for named in settings.stages.stages]
-    for weather in (stage for stage in stages if isinstance(stage, WeatherSetting) and stage.wind):
-        blown, bearing = weather.wind * time_ns * 1e-9, math.radians(weather.wind_from)
-        return east - blown * math.sin(bearing), north - blown * math.cos(bearing)
-    return east, north
+    stages = (named.stage for named in settings.stages.stages)
+    windy = (stage for stage in stages if isinstance(stage, WeatherSetting) and stage.wind)
+    weather = next(windy, None)
+    blown = (0.0, 0.0) if weather is None else weather.drift(time_ns * 1e-9)
+    return east + blown[0], north + blown[1]
 
 
 def sun_during(recording: Recording, time_ns: int) -> Float:

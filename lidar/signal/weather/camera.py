@@ -108,7 +108,7 @@ def _through_air(
         share=None if field is None else partial(_share_at, field, pose=pose),
         exposure=(camera.exposure_ns or EXPOSURE_NS) / 1e9,
         down=-pose.rotation[0, 2],
-        air=(_wind(setting) - _velocity(at)) @ pose.rotation[0],
+        air=(np.array([*setting.drift(1.0), 0.0]) - _velocity(at)) @ pose.rotation[0],
         distance=distance,
         rng=rng,
     )[..., None]
@@ -181,12 +181,6 @@ def _share_at(field: Field, position: Float, *, pose: Poses) -> Float:
     """The share (n,) of a medium at places (n, 3), camera frame."""
     rays = WeatherBeams(np.broadcast_to(pose.position, position.shape), pose.directions(position))
     return amounts(field, rays, pulse=np.arange(len(position)), distance=np.ones(len(position)))[0]
-
-
-def _wind(setting: WeatherSetting) -> Float:
-    """Velocity (3,) of the air, scene axes, m/s."""
-    towards = math.radians(setting.wind_from) + math.pi
-    return setting.wind * np.array([math.sin(towards), math.cos(towards), 0.0])
 
 
 def _velocity(at: Situation) -> Float:

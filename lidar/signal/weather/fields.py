@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
-from math import inf, pi, radians
+from math import inf, pi
 from typing import Any
 
 import numpy as np
@@ -166,9 +166,7 @@ def plume_pattern(
     length = _PLUME_SIZES[0] * (_PLUME_SIZES[1] / _PLUME_SIZES[0]) ** rng.random(_PLUME_WAVES)
     angle, phase = rng.uniform(0, 2 * pi, (2, _PLUME_WAVES))
     wave = 2 * pi / length * np.array([np.cos(angle), np.sin(angle)])
-    bearing = radians(setting.wind_from)
-    drift = -setting.wind * seconds * np.array([np.sin(bearing), np.cos(bearing)])
-    x, y = (c + _STEP * np.arange(count) - d for c, d in zip(corner, drift, strict=True))
+    x, y = (c + _STEP * np.arange(count) - d for c, d in zip(corner, setting.drift(seconds), strict=True))
     # The sum over waves of cos(kx x + ky y + phase), by the cosine of sums.
     along, across = np.outer(x, wave[0]), np.outer(y, wave[1]) + phase
     height = np.cos(across) @ np.cos(along).T - np.sin(across) @ np.sin(along).T

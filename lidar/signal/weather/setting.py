@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import cos, inf, isfinite, radians, sin
 from typing import Any
 
 from geoscene.support.registry import unknown_name
@@ -122,6 +122,11 @@ class WeatherSetting(Stage):
             object.__setattr__(self, "medium", published or kind.media[0])
         if faults := _faults(self, kind):
             raise InputError("; ".join(faults))
+
+    def drift(self, seconds: float) -> tuple[float, float]:
+        """Metres east and north that the wind carries the air in a time."""
+        bearing, away = radians(self.wind_from), -self.wind * seconds
+        return away * sin(bearing), away * cos(bearing)
 
     @property
     def settings(self) -> tuple[tuple[str, str], ...]:
