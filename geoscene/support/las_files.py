@@ -61,9 +61,14 @@ def open_las(path: Path, *, parallel: bool = False) -> Iterator[Any]:
     except (LookupError, AttributeError, TypeError, struct.error) as error:  # of records that laspy parses
         raise _damaged(path, f"{type(error).__name__}: {error}") from error
     except BaseException as error:
-        if type(error).__name__ != "PanicException":  # of the decompressor; no Exception, and not importable
+        if not _is_panic(error):
             raise
         raise _damaged(path, "the decompressor failed") from error
+
+
+def _is_panic(error: BaseException) -> bool:
+    """Whether the decompressor panicked: its error is no Exception, and cannot be imported."""
+    return type(error).__name__ == "PanicException"
 
 
 def point_count(path: Path) -> int:
@@ -189,7 +194,7 @@ def _holds_more(chunk: bytes, laz: Any, *, record: bytes, points: int) -> bool:
     try:
         reader.decompress_many(np.empty((points + few) * laz.item_size(), np.uint8))
     except BaseException as error:
-        if isinstance(error, lazrs.LazrsError) or type(error).__name__ == "PanicException":
+        if isinstance(error, lazrs.LazrsError) or _is_panic(error):
             return False
         raise
     return True
