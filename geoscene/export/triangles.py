@@ -110,7 +110,8 @@ def estimate_obj(
 ) -> tuple[int, int]:
     """Bytes that `write_obj` would write, to a few percent, and the number of copies of shapes."""
     shapes = list(scene.shapes().values())
-    corners, triangles = (np.array([count(s) for s in shapes], np.int64) for count in (_corners, len))
+    corners = np.array([len(shape.vertices) for shape in shapes], np.int64)
+    triangles = np.array([len(shape) for shape in shapes], np.int64)
     size = first = copies = 0
     for part in parts(scene, layers, stage="OBJ: size", progress=progress):
         mesh, shape = part.mesh, part.instances.shape
@@ -127,10 +128,6 @@ def estimate_obj(
 
 _LOOK_BYTES = 60
 """Bytes of the lines ``o`` and ``usemtl`` of an object, or of a part of it with another material."""
-
-
-def _corners(mesh: Mesh) -> int:
-    return len(mesh.vertices)
 
 
 def _vertex_bytes(points: Float) -> Ints:
