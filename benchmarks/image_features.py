@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from geoscene.classes import Class
 from geoscene.scene import open_scene
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Camera
 from lidar.simulation.frame_loop import chunks
 from lidar.simulation.plan import plan_drive

@@ -18,7 +18,7 @@ from geoscene.options import RELIEFS
 from geoscene.scene import open_scene
 from lidar.geometry.attitude import OPTICAL, Mount
 from lidar.geometry.poses import Poses
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.camera.light import sun_direction
 from lidar.sensors.camera.render import render
 from lidar.sensors.camera.settings import CameraSettings

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from geoscene.scene import open_scene
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.laser.scan import cast, measure
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.devices import Scanner

@@ -25,7 +25,8 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.png import counts_to_depth, read_png, write_png
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import DriveOptions, MapOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.maps import MapOptions
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive
 from lidar.tools.maps.aggregate import aggregate

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from lidar.dataset.formats import read_cloud as read_cloud
     from lidar.dataset.layout import Dataset as Dataset
     from lidar.dataset.layout import open_dataset as open_dataset
-    from lidar.options import DriveOptions as DriveOptions
-    from lidar.options import MapOptions as MapOptions
+    from lidar.options.drive import DriveOptions as DriveOptions
+    from lidar.options.maps import MapOptions as MapOptions
     from lidar.sensors.rig.scanner import load_sensor as load_sensor
     from lidar.sensors.rig.specs import load_rig as load_rig
     from lidar.signal.registry import read_attacks as read_attacks
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "Dataset": "dataset.layout",
     "DriveFrame": "simulation.frames",
-    "DriveOptions": "options",
-    "MapOptions": "options",
+    "DriveOptions": "options.drive",
+    "MapOptions": "options.maps",
     "Simulation": "simulation.frames",
     "TrafficOptions": "traffic.options",
     "TrainingData": "tools.training_data",

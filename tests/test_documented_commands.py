@@ -44,7 +44,7 @@ from geoscene.sources import demo_path, read_osm
 from lidar.dataset.layout import open_dataset
 from lidar.motion.random_route import public_streets
 from lidar.motion.road_drive import road_surface
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.tools.tradeoff.bench import coarse
 from lidar.traffic.options import TrafficOptions
 

@@ -4,7 +4,7 @@ import pytest
 
 import geoscene
 import lidar
-from lidar.options import ApplyOptions
+from lidar.options.data import ApplyOptions
 from lidar.signal.registry import read_stages
 from lidar.tools.apply import apply_stages
 

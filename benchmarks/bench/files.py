@@ -18,7 +18,7 @@ from lidar.dataset.formats.las import SCALE, LasInfo
 from lidar.dataset.formats.pcd import pcd_header
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import open_dataset
-from lidar.options import MapOptions
+from lidar.options.maps import MapOptions
 from lidar.simulation.drive import drive
 from lidar.tools.maps.aggregate import aggregate
 

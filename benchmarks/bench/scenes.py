@@ -14,7 +14,7 @@ from geoscene.pipeline.build import build
 from geoscene.scene import Scene, open_scene
 from geoscene.sources import demo_path, read_osm
 from geoscene.typing import Float, Ints
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.plan import DrivePlan, plan_drive
 
 QUICK_BOX = (24.9425, 60.1665, 24.9445, 60.1680)

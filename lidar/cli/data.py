@@ -13,7 +13,10 @@ from geoscene.support.console import Report, note_new_folder, print_json
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, print_effects, show
 from lidar.dataset.formats import map_suffixes
-from lidar.options import OUTPUT, ApplyOptions, ConvertOptions, DenoiseOptions, MapOptions, OdometryOptions
+from lidar.options.data import ApplyOptions, ConvertOptions, DenoiseOptions
+from lidar.options.maps import MapOptions
+from lidar.options.shared import OUTPUT
+from lidar.options.trajectories import OdometryOptions
 
 
 def map_(

@@ -25,7 +25,10 @@ from geoscene.support.console import (
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, print_effects
 from lidar.errors import InputError, LidarError
-from lidar.options import MAP, OUTPUT, AccuracyOptions, DriveOptions, PlaceOptions, TradeoffOptions
+from lidar.options.accuracy import AccuracyOptions, TradeoffOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.place import MAP, PlaceOptions
+from lidar.options.shared import OUTPUT
 
 if TYPE_CHECKING:
     from lidar.simulation.drive import Live

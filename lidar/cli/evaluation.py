@@ -13,7 +13,8 @@ from geoscene.support.console import Report, command_line, note_new_folder
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import Out, Reporting, show
 from lidar.errors import InputError
-from lidar.options import OUTPUT, EvaluateOptions
+from lidar.options.shared import OUTPUT
+from lidar.options.trajectories import EvaluateOptions
 
 
 def evaluate(

@@ -13,7 +13,8 @@ from geoscene.support.console import Report, note_new_folder, with_flags
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app, show
 from lidar.errors import InputError
-from lidar.options import OUTPUT, FilmOptions, PlaybackOptions, PlotOptions
+from lidar.options.look import FilmOptions, PlaybackOptions, PlotOptions
+from lidar.options.shared import OUTPUT
 from lidar.tools.plots import FIGURES
 
 _FIGURES = "; ".join(f"{row.name} ({row.meaning})" for row in FIGURES.values()) + "."

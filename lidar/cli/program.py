@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 
 from geoscene import __version__
 from geoscene.support.console import DEFAULTS, Report, print_json
-from lidar.options import OUTPUT
+from lidar.options.shared import OUTPUT
 
 if TYPE_CHECKING:
     from lidar.signal.situation import Counts

@@ -18,7 +18,8 @@ from geoscene.support.console import (
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, show
 from lidar.errors import InputError
-from lidar.options import OUTPUT, DefendOptions, SignOptions
+from lidar.options.security import DefendOptions, SignOptions
+from lidar.options.shared import OUTPUT
 
 
 def defend(

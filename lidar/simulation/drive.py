@@ -27,7 +27,7 @@ from lidar.dataset.journal import Journal, frame_digest, read_journal
 from lidar.dataset.layout import Paths, finished, own_files, prepare, remove_dataset
 from lidar.errors import InputError, LidarError
 from lidar.geometry.trajectory_files import write_trajectory
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Scanner
 from lidar.signal.situation import Counts
 from lidar.simulation.boxes import merge_box_files, merge_signal_files

@@ -33,7 +33,7 @@ from lidar.motion.road_drive import ROUTE_MARGIN_S, graph_on_tiles
 from lidar.motion.route import Route, RouteOptions, plan_route
 from lidar.motion.vehicle import Vehicle
 from lidar.motion.waypoints import read_track
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.camera_model import unproject
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings

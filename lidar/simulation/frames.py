@@ -18,7 +18,7 @@ from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
 from lidar.errors import InputError
 from lidar.geometry.poses import Poses
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.navigation.imu import observe_imu

@@ -26,7 +26,7 @@ from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import check_duration, check_start
 from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
 from lidar.motion.vehicle import Vehicle, load_vehicle, vehicle_on
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.raycast.device import check_device
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.specs import Rig, load_rig

@@ -47,7 +47,8 @@ from lidar.errors import InputError, LidarError
 from lidar.motion.replay import read_replay
 from lidar.motion.road_drive import road_course, road_map
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import DriveOptions, PlaceOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.place import PlaceOptions
 from lidar.raycast.device import check_device
 from lidar.sensors.navigation.satellite_visibility import BLOCK_M, REACH
 from lidar.sensors.rig.devices import Camera

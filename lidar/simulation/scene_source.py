@@ -12,7 +12,8 @@ from geoscene.scene import Scene, SceneLike, open_scene
 from geoscene.support.progress import Progress, silent
 from geoscene.support.storage import url_of
 from lidar.errors import InputError
-from lidar.options import DriveOptions, PlaceOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.place import PlaceOptions
 
 if TYPE_CHECKING:
     from geoscene.sources import Servers

@@ -38,7 +38,8 @@ from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, read
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.errors import DatasetError, InputError
-from lidar.options import ApplyOptions, with_stage_settings
+from lidar.options.data import ApplyOptions
+from lidar.options.stages import with_stage_settings
 from lidar.sensors.camera.render import CameraImage as Image
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.scanner import Sensor, load_sensor

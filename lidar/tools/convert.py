@@ -25,7 +25,7 @@ from lidar.dataset.layouts import EXPORTERS, ExportSummary
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.time_scales import drive_ns
-from lidar.options import CONVERTED_FORMATS
+from lidar.options.data import CONVERTED_FORMATS
 from lidar.parameters import split_items
 from lidar.sensors.rig.devices import Scanner, scanners
 from lidar.sensors.rig.specs import rig_of

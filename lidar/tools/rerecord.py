@@ -20,7 +20,7 @@ from lidar.dataset.layout import Dataset, Paths, read_rows, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference, export_crs
-from lidar.options import with_stage_settings
+from lidar.options.stages import with_stage_settings
 from lidar.sensors.laser.cloud import Cloud
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import Sensor

@@ -9,7 +9,7 @@ from geoscene.geometry.frames import Frame, utm_crs
 from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.sources import read_osm
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.plan import plan_drive
 from lidar.tools.selftest.places import CASES, write_elevation, write_hamlet
 from lidar.tools.selftest.run import outcome

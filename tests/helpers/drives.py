@@ -2,7 +2,7 @@
 
 from helpers import ROOT
 from helpers.programs import run_program
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 
 PLAIN = DriveOptions(rig="vlp16", duration=1.0, seed=3, formats=("pcd", "laz"))
 ATTACK = ROOT / "examples" / "attacks" / "injected_car.toml"

@@ -12,7 +12,9 @@ from geoscene.errors import InputError as SceneInputError
 from geoscene.export import export_scene
 from geoscene.sources import demo_path
 from lidar.errors import InputError
-from lidar.options import ApplyOptions, OdometryOptions, PlaybackOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.look import PlaybackOptions
+from lidar.options.trajectories import OdometryOptions
 from lidar.tools.convert import convert
 from lidar.tools.defences.defend import defend
 from lidar.tools.info import describe

@@ -12,7 +12,8 @@ import numpy as np
 from geoscene.support.progress import Progress, displayed, shows_progress
 from lidar.dataset.layout import Dataset
 from lidar.errors import InputError
-from lidar.options import EvaluateOptions, MapOptions
+from lidar.options.maps import MapOptions
+from lidar.options.trajectories import EvaluateOptions
 from lidar.tools.evaluation.pose_errors import (
     KITTI_LENGTHS,
     KITTI_STEP,

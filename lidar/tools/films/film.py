@@ -22,7 +22,7 @@ from lidar.dataset.recorded import Images, Stream, frames_within, images_of, sca
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.motion.vehicle import Vehicle, load_vehicle
-from lidar.options import FilmOptions
+from lidar.options.look import FilmOptions
 from lidar.tools.films.panes import TEXT, CameraPane, MapPane, Pane, Pixels, SweepPane, Sweeps
 from lidar.tools.maps.picture import BACKGROUND
 

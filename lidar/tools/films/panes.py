@@ -20,7 +20,7 @@ from lidar.errors import InputError
 from lidar.geometry.attitude import matrix_from_quat
 from lidar.geometry.poses import Trajectory
 from lidar.motion.vehicle import Vehicle
-from lidar.options import FilmOptions
+from lidar.options.look import FilmOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.tools.maps.colors import distinct, ramp
 from lidar.tools.maps.picture import (

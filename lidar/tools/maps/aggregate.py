@@ -22,7 +22,7 @@ from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.formats.table import Table, rows
 from lidar.dataset.layout import Dataset, DatasetLike, open_dataset, own_files
 from lidar.errors import InputError
-from lidar.options import MapOptions
+from lidar.options.maps import MapOptions
 from lidar.tools.maps.colors import ImageColors, distinct, ramp
 from lidar.tools.maps.compare import SurfaceComparison, SurfaceDistances, far_reasons
 from lidar.tools.maps.rasters import Rasters

@@ -38,7 +38,7 @@ class _Block:
 class Rasters:
     """Rasters that grow with the tables of a map; memory is that of the blocks with points.
 
-    kinds      : of `lidar.options.RASTERS`
+    kinds      : of `lidar.options.maps.RASTERS`
     resolution : side of a cell in metres; borders of cells are multiples of it
     """
 

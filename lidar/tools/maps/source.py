@@ -27,7 +27,7 @@ from lidar.geometry.georeference import Georeference
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import gps_seconds, posix_ns
 from lidar.geometry.trajectory_files import read_tum, write_tum
-from lidar.options import MapOptions, classes_of
+from lidar.options.maps import MapOptions, classes_of
 from lidar.sensors.physics.origin import Origin
 from lidar.sensors.rig.patterns.beams import frame_ns
 from lidar.tools.maps.colors import ImageColors

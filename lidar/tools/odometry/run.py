@@ -19,7 +19,7 @@ from geoscene.typing import Ints
 from lidar.dataset.derived import check_target
 from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import OdometryOptions
+from lidar.options.trajectories import OdometryOptions
 from lidar.sensors.rig.imu_grades import PRESETS, Noise
 from lidar.sensors.rig.specs import ImuSpec, rig_of
 from lidar.tools.odometry.estimate import OWN_FILES, MotionEstimate, begun_at, write_estimate

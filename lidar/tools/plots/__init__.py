@@ -11,7 +11,7 @@ from geoscene.support.files import write_atomically
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import Registry, load
 from lidar.errors import InputError
-from lidar.options import PlotOptions
+from lidar.options.look import PlotOptions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Chart

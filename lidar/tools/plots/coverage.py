@@ -16,7 +16,7 @@ from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import cloud_points, frames_within, scanner_clouds
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.poses import Trajectory
-from lidar.options import PlotOptions
+from lidar.options.look import PlotOptions
 from lidar.tools.plots import Drawn
 
 Counts = NDArray[np.unsignedinteger[Any]]

@@ -12,7 +12,7 @@ from geoscene.typing import Float
 from lidar.dataset.layout import Dataset
 from lidar.dataset.navigation_files import read_fixes
 from lidar.errors import DatasetError, InputError
-from lidar.options import PlotOptions
+from lidar.options.look import PlotOptions
 from lidar.sensors.navigation.measurements import Fixes, fix_variances
 from lidar.tools.plots import WIDE, Drawn
 

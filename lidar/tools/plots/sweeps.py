@@ -20,7 +20,7 @@ from lidar.dataset.layout import Dataset
 from lidar.dataset.recorded import Stream, cloud_points, frames_within, scanner_clouds
 from lidar.errors import DatasetError
 from lidar.geometry.attitude import Mount
-from lidar.options import PlotOptions
+from lidar.options.look import PlotOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.tools.plots import WIDE, Drawn
 

@@ -30,7 +30,8 @@ from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError, LidarError
 from lidar.geometry.time_scales import check_start
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import AccuracyOptions, DriveOptions
+from lidar.options.accuracy import AccuracyOptions
+from lidar.options.drive import DriveOptions
 from lidar.parameters import item_of, item_text, value_text
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.plan import sensors_of

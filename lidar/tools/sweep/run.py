@@ -26,7 +26,7 @@ from geoscene.support.progress import Progress, displayed, shows_progress, silen
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError, LidarError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.tools.sweep.grid import GridDrive, read_grid
 from lidar.tools.tradeoff.accuracy import driven, pick_settings
 

@@ -10,7 +10,8 @@ from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
+from lidar.options.accuracy import AccuracyOptions, read_accuracy, read_budget
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation import drive as pipeline

@@ -13,7 +13,8 @@ from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
-from lidar.options import DriveOptions, TradeoffOptions
+from lidar.options.accuracy import TradeoffOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.scanner import firings
 from lidar.simulation.plan import DrivePlan, plan_drive, schedule

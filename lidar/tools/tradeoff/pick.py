@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from geoscene.drawing.report import levels, metres, share
-from lidar.options import AccuracyTarget, DriveOptions
+from lidar.options.accuracy import AccuracyTarget
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan
 from lidar.tools.tradeoff.errors import LOST, ErrorEstimate

@@ -16,7 +16,7 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Float, Ints
 from lidar.dataset.png import counts_to_depth, depth_to_counts
 from lidar.errors import InputError
-from lidar.options import PERCENTS
+from lidar.options.accuracy import PERCENTS
 from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.physics.settings import MOST_RAYS, ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner

@@ -17,7 +17,8 @@ from geoscene.drawing.report import levels, metres
 from geoscene.scene import Scene
 from geoscene.support.progress import Progress
 from lidar.errors import InputError
-from lidar.options import AccuracyOptions, AccuracyTarget, DriveOptions, read_accuracy, read_budget
+from lidar.options.accuracy import AccuracyOptions, AccuracyTarget, read_accuracy, read_budget
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.frame_loop import chunks, record_frame
 from lidar.simulation.plan import DrivePlan, plan_drive

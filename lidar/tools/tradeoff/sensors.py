@@ -18,7 +18,7 @@ from geoscene.support.progress import Progress
 from geoscene.typing import Ints
 from lidar.dataset.formats.table import cloud_table, records
 from lidar.dataset.png import depth_to_counts, encode_png, feature_to_image
-from lidar.options import TradeoffOptions
+from lidar.options.accuracy import TradeoffOptions
 from lidar.sensors.camera.render import CameraImage
 from lidar.sensors.laser.scan import report
 from lidar.sensors.rig.devices import Camera, Scanner

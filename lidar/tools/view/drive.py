@@ -23,7 +23,7 @@ from lidar.dataset.recorded import Stream, cloud_points, frames_within, mount_of
 from lidar.errors import InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.poses import Trajectory
-from lidar.options import PlaybackOptions
+from lidar.options.look import PlaybackOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.tools.maps.colors import distinct, ramp
 from lidar.tools.view.sweeps import (

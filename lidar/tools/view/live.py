@@ -20,7 +20,7 @@ from lidar.dataset.layout import open_dataset, reading_file
 from lidar.dataset.recorded import cloud_points, still_points
 from lidar.errors import InputError, LidarError
 from lidar.geometry.poses import Trajectory
-from lidar.options import PlaybackOptions
+from lidar.options.look import PlaybackOptions
 from lidar.sensors.rig.devices import Camera
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.simulation.drive import Live

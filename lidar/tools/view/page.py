@@ -20,7 +20,7 @@ from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.view.assembly import check_page, write_blob, write_page
 from lidar.dataset.layout import Dataset, DatasetLike, open_dataset
 from lidar.errors import InputError, LidarError
-from lidar.options import PlaybackOptions
+from lidar.options.look import PlaybackOptions
 from lidar.tools.view.drive import Drive
 from lidar.tools.view.sweeps import pack_slots
 

@@ -27,7 +27,7 @@ from geoscene.sources import Way, read_osm
 from geoscene.support.progress import silent
 from geoscene.view import view_scene
 from lidar.errors import RouteError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.simulation.plan import plan_drive
 from lidar.traffic.options import TrafficOptions

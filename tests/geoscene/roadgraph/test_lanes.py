@@ -31,7 +31,7 @@ from geoscene.roadgraph.lanes import (
 from geoscene.roadgraph.markings import _offsets, painted_stretches
 from geoscene.sources.data import OsmData, Way
 from lidar.motion.route import lane_route
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.traffic.lanes import lane_shift, lanes_of
 
 PLACES = {

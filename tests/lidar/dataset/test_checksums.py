@@ -21,7 +21,8 @@ from lidar.dataset.checksums import (
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import DatasetError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

@@ -15,7 +15,7 @@ from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.layouts import EXPORTERS
 from lidar.errors import DatasetError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.info import describe

@@ -28,7 +28,7 @@ from lidar.dataset.layouts.kitti_drive import read_drive
 from lidar.dataset.layouts.waymo_components import RangeImageGrid, pixels
 from lidar.dataset.recorded import Stream, labelled_clouds, still_points
 from lidar.errors import DatasetError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.traffic.options import TrafficOptions
 

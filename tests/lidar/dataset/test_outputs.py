@@ -31,7 +31,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import Mount
 from lidar.geometry.georeference import Georeference
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.laser.scan import scan
 from lidar.sensors.rig.scanner import load_sensor
 from lidar.settings import RecordingSettings

@@ -30,7 +30,7 @@ from lidar.dataset.layouts.ros_topics import RosDrive, RosOptions, ros_name, top
 from lidar.dataset.navigation_files import FixHeights, read_fixes
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png
 from lidar.errors import DatasetError, FormatError, InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.navigation.measurements import fix_variances
 from lidar.sensors.rig.camera_model import project
 from lidar.sensors.rig.patterns.repeating import Scan2d

@@ -22,7 +22,7 @@ from lidar.errors import FormatError, InputError, RouteError
 from lidar.geometry.trajectory_files import read_trajectory
 from lidar.motion.replay import read_replay
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import cameras, scanners
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import drive

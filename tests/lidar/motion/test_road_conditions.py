@@ -7,7 +7,7 @@ import pytest
 
 from lidar.errors import InputError
 from lidar.motion.vehicle import DRY, ROADS, RoadConditions, load_vehicle, vehicle_on
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.weather.setting import read_weather
 from lidar.traffic.trips import DRIVERS, driver_on
 

@@ -9,7 +9,7 @@ from geoscene.errors import MissingExtraError
 from lidar import drive
 from lidar.dataset.formats import read_cloud
 from lidar.errors import BackendError, InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.raycast import device
 from lidar.traffic.options import TrafficOptions
 from lidar.world.settings import WorldSettings

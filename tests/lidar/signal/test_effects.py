@@ -8,7 +8,8 @@ from helpers.programs import run_program
 
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive

@@ -8,7 +8,8 @@ import pytest
 from lidar.dataset.layout import Paths, open_dataset, read_rows
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.errors import InputError, LidarError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.parameters import parameter
 from lidar.sensors.navigation.nmea import height_note, nmea
 from lidar.signal.registry import NamedStage

@@ -14,7 +14,8 @@ from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.png import read_png
 from lidar.errors import DatasetError, InputError, LidarError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.parameters import parameter
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import NamedStage, number_stages, read_stages

@@ -4,7 +4,8 @@ import pytest
 from helpers.programs import run_program
 
 from lidar.errors import InputError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.attacks.inject import Inject
 from lidar.signal.registry import NamedStage, read_attacks, read_stages
 from lidar.signal.weather.setting import read_weather

@@ -12,7 +12,8 @@ from helpers.programs import run_program
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.registry import read_stages
 from lidar.signal.weather.setting import read_weather

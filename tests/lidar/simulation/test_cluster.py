@@ -16,7 +16,7 @@ from helpers.scenes import same_files
 import geoscene.support.cluster
 from geoscene.errors import InputError, MissingExtraError
 from geoscene.support.cluster import connect
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.sweep import sweep
 from lidar.traffic.options import TrafficOptions

@@ -17,7 +17,7 @@ from geoscene.support.files import exclusive
 from lidar.dataset.derived import copy_folder
 from lidar.dataset.layout import open_dataset, remove_dataset
 from lidar.errors import LidarError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation import drive as pipeline
 from lidar.simulation.drive import drive
 from lidar.tools.integrity.keys import read_signer

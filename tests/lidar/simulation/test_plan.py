@@ -13,7 +13,7 @@ from lidar.errors import InputError, RouteError
 from lidar.geometry import time_scales
 from lidar.motion.road_drive import plan_route_and_path
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.rig.devices import scanners
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import trim_memory

@@ -22,7 +22,8 @@ from geoscene.scene.layout import changed_files
 from geoscene.sources import Servers, read_osm
 from lidar.dataset.layout import open_dataset
 from lidar.errors import InputError, RouteError
-from lidar.options import DriveOptions, PlaceOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.place import PlaceOptions
 from lidar.simulation import scene_cache
 from lidar.simulation.drive import drive
 from lidar.simulation.scene_cache import _stretches

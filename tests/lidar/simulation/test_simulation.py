@@ -18,7 +18,7 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.png import depth_to_counts, encode_png, flow_to_image, image_to_feature, read_png
 from lidar.errors import InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.registry import read_attacks, read_stages
 from lidar.simulation.drive import drive
 from lidar.traffic.options import TrafficOptions

@@ -11,7 +11,7 @@ from geoscene.options import BuildOptions
 from geoscene.pipeline.build import build
 from geoscene.scene.validate import check_scene
 from geoscene.sources import demo_path, read_osm
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.traffic.options import TrafficOptions
 

@@ -11,7 +11,8 @@ from helpers.programs import run_program
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import CONVERTED_FORMATS, DriveOptions
+from lidar.options.data import CONVERTED_FORMATS
+from lidar.options.drive import DriveOptions
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.convert import convert

@@ -20,7 +20,8 @@ from lidar.dataset.recorded import cloud_points, scanner_clouds, still_points
 from lidar.dataset.seen_points import motions_of, returns_of, views_of
 from lidar.errors import DatasetError
 from lidar.geometry.georeference import Georeference
-from lidar.options import DriveOptions, MapOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.maps import MapOptions
 from lidar.tools.evaluation.objects import evaluate_objects
 from lidar.tools.maps.aggregate import aggregate
 from lidar.traffic.options import TrafficOptions

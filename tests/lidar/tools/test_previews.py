@@ -8,7 +8,8 @@ from PIL import Image
 
 import lidar
 from geoscene.classes import Class, class_codes
-from lidar.options import DriveOptions, MapOptions
+from lidar.options.drive import DriveOptions
+from lidar.options.maps import MapOptions
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import lidar
 from geoscene.classes import Class
 from lidar.dataset.png import counts_to_depth, read_png
 from lidar.errors import DatasetError, InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.traffic.options import TrafficOptions
 

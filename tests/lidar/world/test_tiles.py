@@ -15,7 +15,7 @@ from geoscene.sources import demo_path, read_osm
 from geoscene.sources.data import OsmData, TaggedNode, Way
 from geoscene.uses import RELIEFS
 from lidar.errors import InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.plan import plan_drive
 from lidar.world.settings import WorldSettings
 from lidar.world.tiles import SharedTiles, selected_tile

@@ -9,7 +9,7 @@ from lidar.dataset.layout import open_dataset, read_rows
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import InputError
 from lidar.geometry.poses import Trajectory
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.attacks.placed_object import PlacedObject, with_objects
 from lidar.signal.registry import read_attacks, read_stage, stages_of
 from lidar.simulation.drive import drive

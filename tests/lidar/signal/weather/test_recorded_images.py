@@ -7,7 +7,8 @@ import pytest
 
 from lidar.dataset.png import read_png
 from lidar.errors import InputError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

@@ -11,7 +11,8 @@ from helpers.programs import run_program
 from lidar.dataset.formats import read_cloud
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError, LidarError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.signal.weather.setting import read_weather
 from lidar.simulation.drive import drive

@@ -19,7 +19,7 @@ from sklearn.ensemble import RandomForestClassifier
 import geoscene.errors
 from geoscene.scene import Scene
 from lidar.errors import DatasetError, FormatError, InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.detection.forest import forest_of, read_forest
 from lidar.tools.detection.learned import (

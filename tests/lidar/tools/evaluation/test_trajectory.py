@@ -19,7 +19,7 @@ from lidar.dataset.layouts.kitti_drive import write_poses
 from lidar.errors import FormatError, InputError
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.time_scales import posix_ns
-from lidar.options import EvaluateOptions
+from lidar.options.trajectories import EvaluateOptions
 from lidar.tools.evaluation.pose_errors import (
     absolute,
     by_axis,

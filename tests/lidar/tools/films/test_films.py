@@ -16,7 +16,7 @@ from geoscene.classes import Class, class_codes
 from lidar.dataset.layout import open_dataset
 from lidar.dataset.recorded import images_of, scanner_clouds
 from lidar.motion.vehicle import load_vehicle
-from lidar.options import FilmOptions
+from lidar.options.look import FilmOptions
 from lidar.tools.films.film import film, write_film
 from lidar.tools.films.panes import CameraPane, MapPane, SweepPane, Sweeps
 

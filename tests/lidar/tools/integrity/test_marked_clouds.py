@@ -9,7 +9,8 @@ from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.las import LasInfo
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import ApplyOptions, DriveOptions
+from lidar.options.data import ApplyOptions
+from lidar.options.drive import DriveOptions
 from lidar.signal.registry import read_stages
 from lidar.simulation.drive import drive
 from lidar.tools.apply import apply_stages

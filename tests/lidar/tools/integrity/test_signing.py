@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lidar.dataset.checksums import CHECKSUMS
 from lidar.dataset.formats import FORMATS, read_cloud
 from lidar.errors import DatasetError, InputError
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.tools.integrity.digests import block_digests, merkle_root
 from lidar.tools.integrity.keys import Hmac, read_secret, read_signer

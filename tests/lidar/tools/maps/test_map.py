@@ -20,7 +20,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.georeference import Georeference
 from lidar.geometry.time_scales import gps_seconds
 from lidar.geometry.trajectory_files import read_trajectory, write_trajectory
-from lidar.options import ORIGINS, MapOptions
+from lidar.options.maps import ORIGINS, MapOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.tools.maps.aggregate import aggregate
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from lidar.errors import FormatError, InputError
 from lidar.geometry.time_scales import posix_ns
 from lidar.geometry.trajectory_files import read_tum, write_tum
-from lidar.options import MapOptions
+from lidar.options.maps import MapOptions
 from lidar.tools.maps.aggregate import aggregate
 
 numbers = st.floats(-1e6, 1e6)

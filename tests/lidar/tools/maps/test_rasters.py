@@ -9,7 +9,7 @@ from pyproj import CRS
 
 from geoscene.classes import Class
 from lidar.errors import InputError
-from lidar.options import RASTERS, MapOptions
+from lidar.options.maps import RASTERS, MapOptions
 from lidar.tools.maps.rasters import Rasters
 
 UTM = CRS.from_epsg(32635)

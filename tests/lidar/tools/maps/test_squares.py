@@ -18,7 +18,7 @@ from lidar.dataset.formats import format_of
 from lidar.dataset.formats.las import LasInfo
 from lidar.errors import InputError
 from lidar.geometry.georeference import Georeference
-from lidar.options import MapOptions
+from lidar.options.maps import MapOptions
 from lidar.tools.maps import squares
 from lidar.tools.maps.aggregate import aggregate
 from lidar.tools.maps.squares import INDEX, Outliers, open_tiles

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from geoscene.geometry.frames import Frame
 from lidar.errors import DatasetError, InputError
-from lidar.options import OdometryOptions
+from lidar.options.trajectories import OdometryOptions
 from lidar.sensors.navigation.measurements import NAMES, Fixes, Inertial
 from lidar.sensors.rig.imu_grades import PRESETS
 from lidar.tools.odometry.fusion import Fixed, Unit, fixes_of, fuse_measurements

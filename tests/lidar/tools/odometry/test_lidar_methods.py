@@ -14,7 +14,7 @@ from geoscene.support.progress import silent
 from lidar.errors import DatasetError, InputError
 from lidar.geometry.trajectory_files import read_tum
 from lidar.motion.replay import read_replay
-from lidar.options import OdometryOptions
+from lidar.options.trajectories import OdometryOptions
 from lidar.tools.odometry.estimate import propagate
 from lidar.tools.odometry.lidar_methods import LIDAR_METHODS, lidar_odometry
 from lidar.tools.odometry.run import estimate_motion

@@ -11,7 +11,7 @@ from lidar.errors import DatasetError, InputError
 from lidar.geometry.attitude import quat_from_matrix
 from lidar.geometry.time_scales import posix_ns
 from lidar.geometry.trajectory_files import write_tum
-from lidar.options import OdometryOptions
+from lidar.options.trajectories import OdometryOptions
 from lidar.tools.odometry.lidar_methods import first_motion
 from lidar.tools.odometry.run import estimate_motion
 from lidar.tools.odometry.scans import scans_of

@@ -24,7 +24,7 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.layout import open_dataset
 from lidar.geometry.attitude import Mount
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.tools.plots import FIGURES, plot
 from lidar.tools.plots.coverage import _coarser
 from lidar.tools.plots.sweeps import _image_sides

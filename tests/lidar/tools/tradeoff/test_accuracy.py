@@ -15,7 +15,8 @@ from helpers.scenes import same_files
 from geoscene.support.progress import silent
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
-from lidar.options import AccuracyOptions, DriveOptions, read_accuracy, read_budget
+from lidar.options.accuracy import AccuracyOptions, read_accuracy, read_budget
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import DriveSummary, drive
 from lidar.simulation.plan import plan_drive
 from lidar.tools.sweep import sweep

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidar.options import DriveOptions, TradeoffOptions
+from lidar.options.accuracy import TradeoffOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.camera.settings import PLAIN
 from lidar.simulation.plan import plan_drive
 from lidar.tools.tradeoff.bench import FAST, Pixels, bench_of, blocks_of_frame, image, image_error, pixels

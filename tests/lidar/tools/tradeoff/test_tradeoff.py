@@ -11,7 +11,8 @@ from helpers.pages import text_of
 from geoscene.drawing.report import levels, metres
 from geoscene.support.progress import silent
 from lidar.errors import InputError
-from lidar.options import DriveOptions, TradeoffOptions
+from lidar.options.accuracy import TradeoffOptions
+from lidar.options.drive import DriveOptions
 from lidar.sensors.physics.settings import LEVELS, PLAIN
 from lidar.simulation.plan import plan_drive
 from lidar.tools.tradeoff.bench import bench_of, chosen_pulses, spread_frames

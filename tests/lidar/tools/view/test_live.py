@@ -17,7 +17,7 @@ from PIL import Image
 
 from lidar.dataset.layout import open_dataset, read_rows
 from lidar.dataset.recorded import scanner_clouds, still_points
-from lidar.options import DriveOptions
+from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 
 WORDS = ("--route", "random", "--duration", 0.3, "--seed", 3, "--rig", "seed", "--format", "pcd", "-q")

@@ -23,7 +23,7 @@ from geoscene.errors import MissingExtraError
 from lidar.dataset.formats import read_table
 from lidar.dataset.layout import open_dataset
 from lidar.errors import DatasetError, InputError
-from lidar.options import PlaybackOptions
+from lidar.options.look import PlaybackOptions
 from lidar.tools.view import view_drive
 from lidar.tools.view.live import colored_points, show_window
 from lidar.tools.view.page import DriveServer

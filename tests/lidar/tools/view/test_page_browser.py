@@ -12,7 +12,7 @@ from lidar.dataset.formats import read_table
 from lidar.dataset.formats.table import placed_returns
 from lidar.dataset.ground_truth import read_boxes, read_truth
 from lidar.dataset.layout import open_dataset
-from lidar.options import PlaybackOptions
+from lidar.options.look import PlaybackOptions
 from lidar.sensors.physics.origin import Origin
 from lidar.tools.view import view_drive
 from lidar.tools.view.page import DriveServer
