@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,7 @@ class Lanes:
     traffic_weight : (m,) relative density of traffic
     open   : (m,) bool, `leads_on` of the first state of each edge
     exit, entry : (m,) bool, the edge ends, or begins, at the map's edge
+    leading : lanes of an edge that lead into each that follows, by arrows, as `lanes_into` numbers them
     """
 
     graph: RoadGraph
@@ -60,6 +62,7 @@ class Lanes:
     open: NDArray[np.bool_]
     exit: NDArray[np.bool_]
     entry: NDArray[np.bool_]
+    leading: Callable[[int], Mapping[int, Sequence[int]]]
 
 
 def lanes_of(
@@ -108,6 +111,7 @@ def lanes_of(
         leads_on[: len(graph)],
         leads_out,
         leads_in,
+        cache(partial(lanes_into, graph, left_hand=side == "left")),
     )
 
 
@@ -226,7 +230,7 @@ def random_lanes(
         weight = weight * np.where(lanes.leads_on[states], 1.0, 1e-9)
         here = open_lanes(lanes, edge, any_kind=any_kind)
         if len(here) > 1 and lanes.graph.lane_turns[edge] and not any_kind:
-            into = lanes_into(lanes.graph, edge, left_hand=lanes.side < 0)
+            into = lanes.leading(edge)
             leads = np.array([lane in into.get(int(way), ()) for way in ways])
             weight = np.where(leads, weight, 1e-6 * weight)
         elif len(here) > 1:

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import fields, replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lidar.motion.motion import drive_path
 from lidar.motion.path import plan_path
 from lidar.motion.route import RouteOptions, plan_route
 from lidar.motion.vehicle import DRY, ROADS
+from lidar.traffic import lanes as traffic_lanes
 from lidar.traffic import simulation
 from lidar.traffic.ego import ego_motion, ego_trip, green_windows
 from lidar.traffic.junctions import AMBER, is_green, junction_plan, signal_group, zone_at
@@ -75,7 +77,9 @@ def test_traffic_takes_no_turn_that_is_forbidden_via_a_way():
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_traffic_goes_where_the_arrows_of_its_lane_point(side):
+def test_traffic_goes_where_the_arrows_of_its_lane_point(side, monkeypatch):
+    read = Mock(side_effect=traffic_lanes.lanes_into)
+    monkeypatch.setattr(traffic_lanes, "lanes_into", read)
     nodes = [(-100, 0), (0, 0), (0, 100), (100, 0), (0, -100)]
     arrows = np.array(["left|left|through;right", *[""] * 7])
     graph = road_graph(nodes, [(0, 1), (1, 2), (1, 3), (1, 4)], lanes=3.0, width=21.0, lane_turns=arrows)
@@ -101,6 +105,7 @@ def test_traffic_goes_where_the_arrows_of_its_lane_point(side):
 
     assert taken(0) == taken(1) == {north}
     assert taken(2) == {east, south}
+    assert read.call_count == 1  # for the only edge with arrows, whatever the number of drives
 
 
 def overlaps(boxes):
