@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from geoscene.roadgraph.graph import RoadGraph
-from geoscene.roadgraph.tags import CLASSES, LOOP_LANE, read_diameter
+from geoscene.roadgraph.tags import CLASSES, island_radius
 from geoscene.sources.data import TaggedNode, Tags, Way
 from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Float, Ints
@@ -145,9 +145,12 @@ def _islands(graph: RoadGraph, points: Iterable[TaggedNode]) -> Float:
         for point in points
         if point.tags.get("highway") == "turning_loop"
     }
+    ranks = {name: k for k, name in enumerate(CLASSES)}
     island = np.zeros(len(graph.node_id))
     for k in np.flatnonzero(np.isin(graph.node_id, list(loops))).tolist():
-        island[k] = max(read_diameter(loops[int(graph.node_id[k])], []) / 2 - LOOP_LANE, 0.0)
+        roads = np.flatnonzero((graph.tail == k) | (graph.head == k)).tolist()
+        main = min(roads, key=lambda road: ranks.get(str(graph.highway[road]), len(CLASSES)))
+        island[k] = island_radius(loops[int(graph.node_id[k])], float(graph.width[main]))
     return island
 
 

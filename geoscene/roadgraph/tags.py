@@ -51,8 +51,10 @@ _ABOVE_GROUND = _NO | {"building_passage", "avalanche_protector", "covered", "cu
 # mini-roundabouts are 13 to 20 m wide.
 TURNING = {"turning_circle": 12.0, "turning_loop": 16.0, "mini_roundabout": 14.0}
 """Values of ``highway`` of nodes where roads widen for turning, and metres of those of unknown diameter."""
-LOOP_LANE = 5.0
+_LOOP_LANE = 5.0
 """Metres from the island of a turning loop to its outer kerb. Assumed."""
+_SMALLEST_ISLAND = 0.3
+"""Metres of the radius of an island: a smaller one is all kerb."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +168,12 @@ def read_diameter(tags: Tags, remarks: Remarks) -> float:
             return metres
         remark_unreadable(remarks, "diameter", text=text)
     return TURNING[tags["highway"]]
+
+
+def island_radius(tags: Tags, road_width: float) -> float:
+    """Metres of the radius of the island of a turning loop in a road of a width; 0 without an island."""
+    radius = max(read_diameter(tags, []), road_width) / 2 - _LOOP_LANE
+    return radius if tags["highway"] == "turning_loop" and radius > _SMALLEST_ISLAND else 0.0
 
 
 def find_odd_diameters(points: Sequence[TaggedNode]) -> list[Problem]:

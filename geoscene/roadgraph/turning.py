@@ -10,7 +10,7 @@ from geoscene.classes import Class
 from geoscene.ground.layers import KERBS, SIDEWALKS
 from geoscene.roadgraph.carriageways import KERB, Carriageways
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roadgraph.tags import LOOP_LANE, TURNING, read_diameter
+from geoscene.roadgraph.tags import TURNING, island_radius, read_diameter
 from geoscene.sources.data import OsmData, TaggedNode
 
 _NEAR = 3.0
@@ -83,8 +83,7 @@ def _rows_at(
             found.append(
                 SurfaceRows.of(disc(metres), klass=klass, material=material, priority=high, **common)
             )
-    island = radius - LOOP_LANE
-    if kind == "turning_loop" and island > 2 * KERB:
+    if island := island_radius(point.tags, float(roads.width[main])):
         for klass, more, material, metres in (
             (Class.KERB, 0.0, "concrete", island),
             (Class.GRASS, 0.05, "grass", island - KERB),

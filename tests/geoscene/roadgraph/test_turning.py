@@ -86,6 +86,18 @@ def test_the_road_graph_keeps_the_size_of_the_island(tmp_path):
     assert not circle.node_island.any()
 
 
+@pytest.mark.parametrize(
+    ("diameter", "street", "radius"),
+    [("10.4", {}, 0.0), ("11", {}, 0.5), ("10", {"width": "13"}, 1.5)],
+)
+def test_the_road_graph_counts_the_islands_that_are_drawn(diameter, street, radius):
+    tags, street = {"highway": "turning_loop", "diameter": diameter}, {"sidewalk": "no"} | street
+    graph, _ = build_road_graph(streets_with(tags, street=street), FRAME)
+    assert graph.node_island[graph.node_id == 2] == radius
+    found, _ = classes_beside(tags, metres=[0.05], street=street)
+    assert found == [Class.GRASS if radius else Class.ROAD]
+
+
 def test_a_mini_roundabout_is_road_with_a_painted_middle():
     tags = {"highway": "mini_roundabout", "diameter": "24"}
     found, _ = classes_beside(tags, CROSS, metres=[1.0, 2.0, 11.9, 12.1], street={"sidewalk": "no"})
