@@ -27,8 +27,6 @@ UNITS = 10_000_000
 UNKNOWN = 2**31 - 1
 """Value of a missing coordinate."""
 
-"""How to open a file by the suffix of its compression."""
-
 LONGEST_TAG = 1024
 """Bytes of the longest key or value that is read, as libosmium's; OpenStreetMap allows 255 characters."""
 

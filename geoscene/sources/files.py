@@ -7,9 +7,10 @@ import json
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,12 @@ from numpy.typing import NDArray
 from geoscene.errors import InputError, SourceNotFoundError, reason_of
 from geoscene.sources.assemble import features
 from geoscene.sources.data import Bounds, OsmData, Progress, Tags
-from geoscene.sources.elements import Collector, collect_answer, collect_xml
+from geoscene.sources.elements import LONGEST_TAG, Collector, collect_answer, collect_xml
 from geoscene.sources.extent import checked_bounds
+from geoscene.sources.pbf import rewrite_texts
 from geoscene.support.untrusted import TooLargeError, open_unpacked
+
+_AS_THEY_ARE: Mapping[str, str] = MappingProxyType({})
 
 _HELP = "give an OpenStreetMap extract (.osm, .osm.gz, .osm.bz2, .osm.pbf) or Overpass JSON"
 
@@ -68,8 +72,18 @@ def _node_places(file: Any) -> NDArray[Any] | None:
     return nodes if (np.diff(nodes["id"], prepend=np.uint64(0)).astype(np.int64) > 0).all() else None
 
 
-def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, progress: Progress) -> None:
-    """Add the objects that libosmium reads to ``collector``; of ``nodes`` with known places only the tags."""
+def _stream(
+    file: Any,
+    collector: Collector,
+    *,
+    nodes: NDArray[Any] | None,
+    progress: Progress,
+    texts: Mapping[str, str] = _AS_THEY_ARE,
+) -> None:
+    """Add the objects that libosmium reads to ``collector``; of ``nodes`` with known places only the tags.
+
+    texts : keys, values and roles by what the file has instead of them
+    """
     import osmium  # noqa: PLC0415 - heavy
 
     stream = osmium.FileProcessor(file)
@@ -86,7 +100,7 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
             collector.delete(kinds[item.type_str()], item.id)
             continue
         if item.is_node():
-            tags = _tags(item) if item.tags else None
+            tags = _tags(item, texts) if item.tags else None
             if nodes is None:
                 place = item.location
                 collector.node(item.id, place.x, y=place.y, tags=tags)
@@ -95,10 +109,10 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
             if tags is None:
                 continue
         elif item.is_way():
-            collector.way(item.id, [node.ref for node in item.nodes], tags=_tags(item))
+            collector.way(item.id, [node.ref for node in item.nodes], tags=_tags(item, texts))
         elif item.is_relation():
-            members = tuple((kinds[m.type], m.ref, m.role) for m in item.members)
-            collector.relation(item.id, _tags(item), members=members)
+            members = tuple((kinds[m.type], m.ref, texts.get(m.role, m.role)) for m in item.members)
+            collector.relation(item.id, _tags(item, texts), members=members)
         else:
             continue
         if not stated:
@@ -106,8 +120,10 @@ def _stream(file: Any, collector: Collector, *, nodes: NDArray[Any] | None, prog
     collector.timestamp = stated or (newest.strftime("%Y-%m-%dT%H:%M:%SZ") if newest.timestamp() > 0 else "")
 
 
-def _tags(item: Any) -> Tags:
+def _tags(item: Any, texts: Mapping[str, str]) -> Tags:
     """The tags of an object; equal texts are one object, as most tags of a map are the same few."""
+    if texts:
+        return {texts.get(tag.k, tag.k): texts.get(tag.v, tag.v) for tag in item.tags}
     return {sys.intern(tag.k): sys.intern(tag.v) for tag in item.tags}
 
 
@@ -129,18 +145,55 @@ def _collect(path: Path, progress: Progress) -> Collector:
     if file_format.startswith("osm") and _has_deletions(path, file_format):
         return _collected_without_libosmium(path, file_format, bounds=collector.bounds, progress=progress)
     try:
-        nodes = _node_places(file) if file_format == "pbf" else None
-        _stream(file, collector, nodes=nodes, progress=progress)
-        if nodes is not None and collector.has_drawn_nodes():  # which libosmium's index leaves out
-            collector = Collector(bounds=collector.bounds)
-            _stream(file, collector, nodes=None, progress=progress)
-    except (osmium.InvalidLocationError, ValueError) as error:
+        return _collected(file, bounds=collector.bounds, by_places=file_format == "pbf", progress=progress)
+    except (osmium.InvalidLocationError, RuntimeError, ValueError) as error:
+        if file_format == "pbf" and "overlong" in str(error):
+            return _collected_without_long_texts(path, bounds=collector.bounds, progress=progress)
         # the position of a node is not a number, or a tag is too long for libosmium
         unread = isinstance(error, osmium.InvalidLocationError) or "too long" in str(error)
         if not (unread and file_format.startswith("osm")):
             raise
         return _collected_without_libosmium(path, file_format, bounds=collector.bounds, progress=progress)
+
+
+def _collected(
+    file: Any,
+    *,
+    bounds: Bounds | None,
+    by_places: bool,
+    progress: Progress,
+    texts: Mapping[str, str] = _AS_THEY_ARE,
+) -> Collector:
+    """The objects of a file as libosmium reads it; ``texts`` as for `_stream`.
+
+    by_places : read the places of nodes at once, if their ids are positive and ascending
+    """
+    nodes = _node_places(file) if by_places else None
+    collector = Collector(bounds=bounds)
+    _stream(file, collector, nodes=nodes, progress=progress, texts=texts)
+    if nodes is not None and collector.has_drawn_nodes():  # which libosmium's index leaves out
+        return _collected(file, bounds=bounds, by_places=False, progress=progress, texts=texts)
     return collector
+
+
+def _collected_without_long_texts(path: Path, *, bounds: Bounds | None, progress: Progress) -> Collector:
+    """The objects of a PBF file with texts that libosmium refuses, of a copy with short ones instead."""
+    import osmium  # noqa: PLC0415 - heavy
+
+    texts: dict[str, str] = {}
+
+    def shortened(text: bytes) -> bytes:
+        if len(text) <= LONGEST_TAG:
+            return text
+        short = f"\x01{len(texts)}"  # a character that texts of maps do not have
+        texts[short] = text.decode()
+        return short.encode()
+
+    with TemporaryDirectory() as folder:
+        copy = Path(folder) / "short.osm.pbf"
+        rewrite_texts(path, copy, changed=shortened)
+        file = osmium.io.File(str(copy), "pbf")
+        return _collected(file, bounds=bounds, by_places=True, progress=progress, texts=texts)
 
 
 def _has_deletions(path: Path, file_format: str) -> bool:

@@ -18,6 +18,7 @@ from geoscene.errors import InputError, SourceNotFoundError
 from geoscene.sources import OsmData, demo_path, read_osm
 from geoscene.sources.areas import is_multipolygon
 from geoscene.sources.data import is_building
+from geoscene.sources.pbf import rewrite_texts
 from geoscene.support.problems import Problem
 
 ALL = [
@@ -555,6 +556,29 @@ def test_a_tag_that_is_too_long_is_left_out_alone(tmp_path, form):
     assert data.areas[0].tags == {"building": "yes", "name": "y" * 1024}
     detail = "tag note of 100,000 bytes left out, maximum is 1,024"
     assert data.problems == [Problem(f"way/{house}", "way", "repaired", "overlong-tag", detail)]
+
+
+def test_a_tag_of_a_pbf_file_that_is_too_long_is_left_out_alone(tmp_path):
+    town = Map()
+    house = town.ring(square(0, 0), {"building": "yes", "note": "short", "name": "y" * 1024})
+    town.node(5, 5, {"natural": "tree", "short": "oak"})
+    (tmp_path / "map.osm").write_text(town.xml())
+    with osmium.SimpleWriter(str(tmp_path / "map.osm.pbf")) as writer:
+        for item in osmium.FileProcessor(str(tmp_path / "map.osm")):
+            writer.add(item)
+    before = read_osm(tmp_path / "map.osm.pbf")
+    long = {b"short": b"x" * 100_000}
+    rewrite_texts(tmp_path / "map.osm.pbf", tmp_path / "long.pbf", changed=lambda text: long.get(text, text))
+    data = read_osm(tmp_path / "long.pbf")
+    assert data.areas[0].tags == {"building": "yes", "name": "y" * 1024}
+    assert data.points[0].tags == {"natural": "tree"}
+    assert shapely.equals(data.areas[0].geometry, before.areas[0].geometry)
+    details = [f"tag {key} of 100,000 bytes left out, maximum is 1,024" for key in ("x" * 40, "note")]
+    tree = data.points[0].osm_id
+    assert data.problems == [
+        Problem(f"way/{house}", "way", "repaired", "overlong-tag", details[1]),
+        Problem(tree, "node", "repaired", "overlong-tag", details[0]),
+    ]
 
 
 # --- what does not exist
