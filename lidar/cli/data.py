@@ -182,7 +182,7 @@ def apply(
     Parameters
     ----------
     dataset
-        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+        Directory or URL of a dataset, or directory of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
     out
         Directory to write to.
     """
@@ -222,7 +222,7 @@ def denoise(
     Parameters
     ----------
     dataset
-        Directory of a dataset, or of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
+        Directory or URL of a dataset, or directory of velodyne*/*.bin (KITTI) or *.pcd.bin (nuScenes) files.
     out
         Directory to write the clouds to that the only method leaves.
     """

@@ -255,6 +255,11 @@ class Dataset(Previewed):
         for frame in frame_numbers(self.frame_file(form.path(folder, 0)).parent, form.suffix).tolist():
             yield frame, form.path(folder, frame)
 
+    def fetch(self, progress: Progress) -> None:
+        """Fetch all files of a dataset in storage; of others nothing."""
+        if self.stored is not None:
+            self.stored.mirror(self.path, progress=progress)
+
     def frame_file(self, path: Path) -> Path:
         """The path of a file of a frame; of a dataset in storage, its folder is fetched first."""
         folder = path.parent

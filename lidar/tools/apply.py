@@ -25,16 +25,17 @@ from lidar.dataset.derived import (
 )
 from lidar.dataset.foreign import (
     KITTI,
-    foreign_clouds,
+    ForeignFolder,
     foreign_labels,
     foreign_truth,
+    open_recorded,
     read_foreign_stages,
     write_foreign_stages,
 )
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.formats.table import cloud_table
 from lidar.dataset.ground_truth import read_truth
-from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, reading_file
 from lidar.dataset.navigation_files import read_fixes, read_samples
 from lidar.dataset.png import counts_to_depth, image_to_feature, read_png, write_png
 from lidar.errors import DatasetError, InputError
@@ -113,21 +114,17 @@ def apply_stages(
 
     Raises InputError for stages that cannot act on the data, and DatasetError for data that cannot be read.
     """
-    source, out = Path(source), Path(out)
-    check_target(out, source=source, overwrite=overwrite)
-    is_dataset = Paths(source).manifest.exists()
-    clouds = [] if is_dataset else foreign_clouds(source)
-    if not is_dataset and not clouds:
-        raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
-    if is_dataset and options.sensor:
+    found, out = open_recorded(source), Path(out)
+    check_target(out, source=found.path, overwrite=overwrite)
+    if isinstance(found, Dataset) and options.sensor:
         raise InputError("`sensor`: a dataset has its own sensors; leave it out")
     with complete_folder(out) as part:
-        if is_dataset:
-            dataset = open_dataset(source)
-            done = _apply_to_dataset(dataset, part, stages=options.all_stages, progress=progress)
+        if isinstance(found, Dataset):
+            found.fetch(progress)
+            done = _apply_to_dataset(found, part, stages=options.all_stages, progress=progress)
         else:
-            done = _apply_to_clouds(clouds, source, out=part, options=options, progress=progress)
-            write_folder_provenance(source, part, by="apply")
+            done = _apply_to_clouds(found, out=part, options=options, progress=progress)
+            write_folder_provenance(found.path, part, by="apply")
         write_checksums(part)
     return replace(done, path=out)
 
@@ -335,13 +332,9 @@ _IMAGES = {"depth", "semantic", "instance"}
 
 
 def _apply_to_clouds(
-    clouds: Sequence[tuple[Path, Format]],
-    source: Path,
-    *,
-    out: Path,
-    options: ApplyOptions,
-    progress: Progress,
+    folder: ForeignFolder, *, out: Path, options: ApplyOptions, progress: Progress
 ) -> ApplySummary:
+    source, clouds = folder.path, folder.clouds
     devices: dict[tuple[str, str], Sensor] = {}
     for path, form in clouds:
         key = path.parent.name, form.name

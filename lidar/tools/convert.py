@@ -91,8 +91,7 @@ def _with_clouds_as(
         log.warning("points have the digits of %s files, not all that a drive would write", source.name)
     with reading_file(dataset.paths.manifest):
         devices = scanners(rig_of(dataset.manifest["recipe"]["rig"]))
-    if dataset.stored is not None:
-        dataset.stored.mirror(dataset.path, progress=progress)
+    dataset.fetch(progress)
     if not any(True for device in devices for _ in dataset.files(device.name, source)):
         raise DatasetError(f"{dataset.path}: has no {source.name} clouds to convert; drive with a scanner")
     with complete_folder(out) as part:

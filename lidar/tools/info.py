@@ -15,21 +15,18 @@ import numpy as np
 
 from geoscene.classes import Class
 from geoscene.errors import reason_of
-from geoscene.scene.layout import SceneFiles
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.support.storage import shown
 from geoscene.typing import Ints
 from lidar.dataset.checksums import CHECKSUMS, files_in, read_checksums
 from lidar.dataset.derived import read_folder_provenance
-from lidar.dataset.foreign import foreign_clouds, read_foreign_stages
+from lidar.dataset.foreign import ForeignFolder, open_recorded, read_foreign_stages
 from lidar.dataset.formats import FORMATS, Format
 from lidar.dataset.journal import read_journal
 from lidar.dataset.layout import (
     Dataset,
     DatasetLike,
     Paths,
-    is_dataset,
-    open_dataset,
     opened_rows,
     reading_file,
 )
@@ -82,20 +79,10 @@ def describe(path: DatasetLike, *, full: bool = False, progress: Progress = disp
 
     Raises DatasetError for another directory, with the command that describes it, and for damaged metadata.
     """
-    folder = Path(path)
-    if is_dataset(path):
-        return _dataset(open_dataset(path), shown(folder), full=full, progress=progress)
-    if not folder.is_dir():
-        what = "is a file; give the directory of a dataset" if folder.exists() else "is not there"
-        raise DatasetError(f"{folder}: {what}")
-    if SceneFiles(folder).manifest.is_file():
-        raise DatasetError(f"{folder}: is a scene; geoscene info describes it")
-    if (folder / "sweep.json").is_file():
-        raise DatasetError(f"{folder}: holds the drives of a sweep; give one of its directories")
-    clouds = foreign_clouds(folder)
-    if not clouds:
-        raise DatasetError(f"{folder}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
-    return _foreign(folder, clouds)
+    found = open_recorded(path)
+    if isinstance(found, ForeignFolder):
+        return _foreign(found.path, found.clouds)
+    return _dataset(found, shown(path), full=full, progress=progress)
 
 
 def _dataset(dataset: Dataset, name: str, *, full: bool, progress: Progress) -> dict[str, Any]:

@@ -24,15 +24,16 @@ from lidar.dataset.derived import (
     write_folder_provenance,
 )
 from lidar.dataset.foreign import (
-    foreign_clouds,
+    ForeignFolder,
     foreign_labels,
     foreign_truth,
+    open_recorded,
     read_foreign_stages,
     write_foreign_stages,
 )
 from lidar.dataset.formats import Format, read_table
 from lidar.dataset.ground_truth import read_truth
-from lidar.dataset.layout import Dataset, DatasetLike, Paths, open_dataset, reading_file
+from lidar.dataset.layout import Dataset, DatasetLike, Paths, reading_file
 from lidar.dataset.recorded import cloud_points
 from lidar.errors import DatasetError, InputError
 from lidar.sensors.physics.origin import Origin
@@ -168,34 +169,33 @@ def denoise(
 
     Raises InputError for several filters with ``out``, and DatasetError for data that cannot be read.
     """
-    source = Path(source)
+    found = open_recorded(source)
     methods = read_methods([methods]) if isinstance(methods, str) else methods
     if out is None:
-        return Denoised(source, None, _scores(source, methods, out=None, progress=progress))
+        return Denoised(found.path, None, _scores(found, methods, out=None, progress=progress))
     out = Path(out)
-    check_target(out, source=source, overwrite=overwrite)
+    check_target(out, source=found.path, overwrite=overwrite)
     if len(methods) > 1:
         raise InputError(f"`out` takes the clouds of one method, not of {len(methods)}")
     with complete_folder(out) as part:
-        scores = _scores(source, methods, out=part, progress=progress)
+        scores = _scores(found, methods, out=part, progress=progress)
         write_checksums(part)
-    return Denoised(source, out, scores)
+    return Denoised(found.path, out, scores)
 
 
 def _scores(
-    source: Path, methods: Mapping[str, Filter], *, out: Path | None, progress: Progress
+    found: Dataset | ForeignFolder, methods: Mapping[str, Filter], *, out: Path | None, progress: Progress
 ) -> dict[str, dict[str, FilterTally]]:
     """Scores by filter and scanner; with ``out`` the clouds are written."""
     frames: Iterator[_Frame]
-    if Paths(source).manifest.exists():
-        job = _DatasetJob(open_dataset(source), out)
+    source = found.path
+    if isinstance(found, Dataset):
+        found.fetch(progress)
+        job = _DatasetJob(found, out)
         count, frames = len(job.jobs), job.frames()
     else:
-        clouds = foreign_clouds(source)
-        if not clouds:
-            raise DatasetError(f"{source}: no dataset.json, no velodyne*/*.bin and no *.pcd.bin in it")
-        job, count = None, len(clouds)
-        frames = (_ForeignFrame(path, form, source=source, out=out) for path, form in clouds)
+        job, count = None, len(found.clouds)
+        frames = (_ForeignFrame(path, form, source=source, out=out) for path, form in found.clouds)
     scores: dict[str, dict[str, FilterTally]] = {text: {} for text in methods}
     for done, frame in enumerate(frames):
         progress("frames", done, total=count)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from geoscene.support.files import atomic_folder, write_atomically, write_json
 from geoscene.support.progress import Progress, displayed, shows_progress
 from geoscene.typing import Float
-from lidar.dataset.foreign import KITTI, NUSCENES, foreign_clouds
+from lidar.dataset.foreign import KITTI, NUSCENES, ForeignFolder, open_recorded
 from lidar.dataset.formats import Format
 from lidar.dataset.formats.table import Table
 from lidar.dataset.kitti_folder import CameraView, camera_view
-from lidar.dataset.layout import Dataset, DatasetLike, is_dataset, open_dataset
+from lidar.dataset.layout import Dataset, DatasetLike
 from lidar.dataset.layouts.kitti import CORNERS, OBJECTS, outline
 from lidar.dataset.layouts.kitti_drive import looking_ahead, read_drive
 from lidar.dataset.layouts.nuscenes import streams_of, table_frame
@@ -86,11 +86,11 @@ def detect(
     detector = read_detector(detector) if isinstance(detector, str) else detector
     if out.exists() and not overwrite:
         raise InputError(f"{out}: exists already; set `overwrite` to replace it")
-    foreign = [] if is_dataset(dataset) else foreign_clouds(Path(dataset))
+    found = open_recorded(dataset)
     if layout == "kitti":
-        images = _images_of_folder(Path(dataset), foreign) if foreign else _images(open_dataset(dataset))
+        images = _images_of_folder(found) if isinstance(found, ForeignFolder) else _images(found)
         return _write_kitti(images, out, detector=detector, progress=progress)
-    samples = _samples_of_folder(Path(dataset), foreign) if foreign else _samples(open_dataset(dataset))
+    samples = _samples_of_folder(found) if isinstance(found, ForeignFolder) else _samples(found)
     return _write_nuscenes(samples, out, detector=detector, progress=progress)
 
 
@@ -148,8 +148,8 @@ def _images(dataset: Dataset) -> _Clouds[_Image]:
     return _Clouds(names, read)
 
 
-def _images_of_folder(source: Path, found: Sequence[tuple[Path, Format]]) -> _Clouds[_Image]:
-    paths = _of_format(source, found, form=KITTI)
+def _images_of_folder(found: ForeignFolder) -> _Clouds[_Image]:
+    source, paths = found.path, _of_format(found, form=KITTI)
     if len(folders := list(dict.fromkeys(path.parent for path in paths))) > 1:
         names = ", ".join(str(folder.relative_to(source)) for folder in folders[:3])
         raise InputError(f"{source}: has clouds in {len(folders)} folders ({names}, ...); give one of them")
@@ -169,12 +169,12 @@ _AHEAD = CameraView(np.asarray(np.linalg.inv(looking_ahead(Mount()).matrix), flo
 """The camera of clouds without a calibration."""
 
 
-def _of_format(source: Path, found: Sequence[tuple[Path, Format]], *, form: Format) -> list[Path]:
+def _of_format(found: ForeignFolder, *, form: Format) -> list[Path]:
     """Clouds of a folder in a format; raises InputError if all are in another."""
-    paths = [path for path, own in found if own is form]
+    paths = [path for path, own in found.clouds if own is form]
     if not paths:
-        other = found[0][1].name
-        raise InputError(f"`to` {form.name}: {source} holds clouds of {other}; give {other}")
+        other = found.clouds[0][1].name
+        raise InputError(f"`to` {form.name}: {found.path} holds clouds of {other}; give {other}")
     return paths
 
 
@@ -193,8 +193,8 @@ def _samples(dataset: Dataset) -> _Clouds[_Sample]:
     return _Clouds(samples.token, read)
 
 
-def _samples_of_folder(source: Path, found: Sequence[tuple[Path, Format]]) -> _Clouds[_Sample]:
-    paths = _of_format(source, found, form=NUSCENES)
+def _samples_of_folder(found: ForeignFolder) -> _Clouds[_Sample]:
+    source, paths = found.path, _of_format(found, form=NUSCENES)
     clouds = key_clouds(source)
     if not clouds:
         log.warning("%s: has no tables; tokens are names of clouds, boxes in the scanner's frame", source)

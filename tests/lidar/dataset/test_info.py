@@ -165,19 +165,29 @@ def test_text_and_json_say_the_same(driven):
         assert words in text
 
 
-def test_other_folders_are_named_with_the_command_for_them(scene, tmp_path):
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info",),
+        ("apply", "--stage", "dropped_packets", "-o", "x"),
+        ("denoise", "--method", "dror", "-o", "x"),
+        ("detect", "--to", "kitti", "-o", "x"),
+    ],
+)
+def test_other_folders_are_named_with_the_command_for_them(scene, tmp_path, words):
+    command, *options = words
     (tmp_path / "drives").mkdir()
     (tmp_path / "drives/sweep.json").write_text("{}")
-    for folder, words in (
+    for folder, message in (
         (scene.path, "is a scene; geoscene info describes it"),
         (tmp_path / "drives", "holds the drives of a sweep"),
         (tmp_path / "none", "is not there"),
         (scene.path / "scene.json", "is a file"),
         (tmp_path, "no dataset.json"),
     ):
-        done = run_program("lidar", "info", folder)
+        done = run_program("lidar", command, folder, *options, cwd=tmp_path)
         assert (done.returncode, done.stdout) == (2, "")
-        assert words in done.stderr
+        assert message in done.stderr
         assert done.stderr.count("\n") == 1
 
 

@@ -140,6 +140,10 @@ def test_commands_fetch_the_frames_that_they_read(stored, tmp_path):
     lidar("convert", url, "--to", "las", "-o", tmp_path / "stored_las")
     lidar("convert", local, "--to", "las", "-o", tmp_path / "local_las")
     same_files(tmp_path / "stored_las", tmp_path / "local_las")
+    for words in (("apply", "--stage", "dropped_packets"), ("denoise", "--method", "dror")):
+        lidar(*words, url, "-o", tmp_path / f"stored_{words[0]}")
+        lidar(*words, local, "-o", tmp_path / f"local_{words[0]}")
+        same_files(tmp_path / f"stored_{words[0]}", tmp_path / f"local_{words[0]}")
 
 
 def test_frames_that_changed_in_storage_are_fetched_again(s3, stored, tmp_path):
