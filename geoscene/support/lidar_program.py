@@ -1,7 +1,8 @@
 """Entry point of the installed program ``lidar``: checks that the module `lidar` is that of this package.
 
 An unrelated package on the public index (lake and depression mapping) installs a module of the same name,
-which overwrites files of this package or is found first on the module path. As a module, the program is run by ``python -m lidar``, not by this one.
+which overwrites files of this package or is found first on the module path. As a module,
+the program is run by ``python -m lidar``, not by this one.
 """
 
 from __future__ import annotations
