@@ -25,6 +25,7 @@ class ProfileOptions:
     deck      : thickness of bridge decks
     cover     : thickness of the ground over a tunnel
     slope     : maximum gradient of ramps, bridges and tunnels (exceeded only where the ground is steeper)
+    steepest  : maximum gradient of roads where the ground is steeper (Baldwin Street in Dunedin has 0.35)
     step      : maximum change of gradient from one station to the next, in addition to the ground's own
     smooth    : length over which the ground is smoothed
     spacing   : distance between stations
@@ -36,6 +37,7 @@ class ProfileOptions:
     deck: float = 0.8
     cover: float = 1.0
     slope: float = 0.08
+    steepest: float = 0.35
     step: float = 0.02
     smooth: float = 12.0
     spacing: float = 10.0
@@ -177,7 +179,7 @@ def _bounds(
     a, b, metres, edge = stations.segments
     structure = graph.bridge[edge] | graph.tunnel[edge]
 
-    own = np.abs(terrain[b] - terrain[a])
+    own = np.minimum(np.abs(terrain[b] - terrain[a]), options.steepest * metres)
     most = np.where(structure, options.slope * metres, np.maximum(options.slope * metres, own))
     rows.add([(b, 1.0), (a, -1.0)], -most, weight=_HARD)
     rows.add([(a, 1.0), (b, -1.0)], -most, weight=_HARD)

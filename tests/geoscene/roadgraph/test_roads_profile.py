@@ -213,6 +213,16 @@ def test_on_the_ground_a_road_follows_the_terrain():
     assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
 
 
+def test_no_road_is_steeper_than_the_steepest_streets_there_are():
+    def ridge(x, y):
+        return np.maximum(60 - 0.6 * np.abs(x), 0.0) + 0 * y
+
+    graph = profile(graph_of({1: (-300, 0), 2: (300, 0)}, [(ROAD, [1, 2])]), ridge)
+    along, _, height = graph.geometry[0].T
+    assert np.abs(np.diff(height) / np.diff(along)).max() <= OPTIONS.steepest + 0.01
+    assert height.max() > 30.0
+
+
 def test_steep_metres_are_counted():
     def cliff(x, y):
         return np.where(x > 0, 0.3 * x, 0.1 * x) + 0 * y
