@@ -36,9 +36,6 @@ _COVER = 0.3
 _SPARE = 0.6
 """Metres of cover and roof that a path over a tunnel may take away."""
 
-_JOINED = 0.05
-"""Metres within which a way and a road share a node."""
-
 _SLOPE = 0.12
 """Maximum gradient of ramps; one in eight is a steep ramp. Assumed."""
 
@@ -61,6 +58,7 @@ class _Net:
     a, b   : (s,) neighbouring stations
     metres : (s,) between them
     slope  : (s,) float64, maximum gradient between them
+    node   : (v,) int64, the map's node at each station, 0 where there is none
     """
 
     xy: Float
@@ -69,6 +67,7 @@ class _Net:
     b: Ints
     metres: Float
     slope: Float
+    node: Ints
 
 
 @dataclass(frozen=True, slots=True)
@@ -217,9 +216,13 @@ def _network(lines: NDArray[np.object_], nodes: list[Ints], *, slope: Float) -> 
         metres.append(np.maximum(np.hypot(*np.diff(xy, axis=0).T), 1e-3))
     if not rows:
         none = np.empty(0, np.int64)
-        return _Net(np.empty((0, 2)), [], none, none, np.empty(0), np.empty(0))
+        return _Net(np.empty((0, 2)), [], none, none, np.empty(0), np.empty(0), none)
     steep = np.repeat(slope, [len(part) for part in a])
-    return _Net(np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep)
+    node_at = np.zeros(count, np.int64)
+    node_at[list(number.values())] = list(number)
+    return _Net(
+        np.array(places), rows, np.concatenate(a), np.concatenate(b), np.concatenate(metres), steep, node_at
+    )
 
 
 def _is_below_ground(osm: OsmData, ways: list[Way]) -> Bools:
@@ -283,7 +286,7 @@ def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _C
         return np.empty(0)
     ground = _ground(net.xy, crossed.height)
     fixed = np.where(ends, ground, np.nan)
-    on_road = _on_road_bridges(net, paths, graph=crossed.graph)
+    on_road = _on_road_bridges(net, paths, graph=crossed.graph, osm=crossed.osm)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground=ground)
     least, most = _height_limits(net, paths, crossed=crossed)
@@ -296,13 +299,14 @@ def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _C
     return np.where(np.isnan(on_road), z, on_road)
 
 
-def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
-    """Height (v,) of the nearest road bridge or tunnel of the same layer; NaN without one."""
+def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph, osm: OsmData) -> Float:
+    """Height (v,) of the nearest road bridge or tunnel of the same layer or with a common node, else NaN."""
     z, nearest = np.full(len(net.xy), np.nan), np.full(len(net.xy), np.inf)
     edges = np.flatnonzero(graph.bridge | graph.tunnel)
     if not len(edges):
         return z
     tree = shapely.STRtree(edge_lines(graph)[edges])
+    nodes = _nodes_of(osm, graph, edges=edges)
     for rows, below, layer in zip(net.rows, paths.tunnel.tolist(), paths.level.tolist(), strict=True):
         point, found = tree.query(shapely.points(net.xy[rows]), predicate="dwithin", distance=20.0)
         edge = edges[found]
@@ -310,11 +314,22 @@ def _on_road_bridges(net: _Net, paths: _Paths, *, graph: RoadGraph) -> Float:
         for e in np.unique(edge[alike]).tolist():
             at = rows[np.unique(point[alike & (edge == e)])]
             high, away, beside = nearest_on_line(graph.geometry[e], net.xy[at])
-            # In another layer the way joins the road only at a common node.
-            within = graph.width[e] / 2 + _BESIDE if graph.layer[e] == layer else 0.0
-            near = ((beside & (away < within)) | (away < _JOINED)) & (away < nearest[at])
+            near = np.isin(net.node[at], list(nodes[e]))
+            if graph.layer[e] == layer:
+                near |= beside & (away < graph.width[e] / 2 + _BESIDE)
+            near &= away < nearest[at]
             z[at[near]], nearest[at[near]] = high[near], away[near]
     return z
+
+
+def _nodes_of(osm: OsmData, graph: RoadGraph, *, edges: Ints) -> dict[int, set[int]]:
+    """The map's nodes on the ways of some edges."""
+    ways = {edge: graph.osm_id[edge].split(";") for edge in edges.tolist()}
+    nodes: dict[str, set[int]] = {name: set() for names in ways.values() for name in names}
+    for way in osm.ways:
+        if way.osm_id in nodes:
+            nodes[way.osm_id].update(way.nodes.tolist())
+    return {edge: set().union(*(nodes[name] for name in names)) for edge, names in ways.items()}
 
 
 def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:

@@ -236,6 +236,13 @@ def test_railings_and_walls_of_footways_do_not_stand_in_streets(path, tags, benc
     assert not faults(bench, built(tmp_path / "steep", places, ways, terrain=SLOPE))
 
 
+def test_a_footbridge_passes_over_a_road_bridge_wherever_its_stations_lie(bench, tmp_path):
+    places = CROSSING | {1: (-200, 0), 4: (200, 0), 5: (0, -160), 6: (0, -60), 7: (0, 60), 8: (0, 160)}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4])]
+    ways += [(FOOT, [5, 6]), (FOOT | {"bridge": "yes", "layer": "2"}, [6, 7]), (FOOT, [7, 8])]
+    assert not faults(bench, built(tmp_path, places, ways))
+
+
 @pytest.mark.parametrize("level", ["1", "-1", "2", "0"])
 def test_footways_with_a_level_alone_are_no_structures(level, bench, tmp_path):
     places = {1: (-150, 0), 2: (150, 0), 3: (0, -80), 4: (0, 80)}
