@@ -237,7 +237,7 @@ def make_plan(
     progress("roads", 0, total=0)
     if "roads" in options.only:
         osm = _collect(problems, lengthen_structures(osm, frame))
-    passages = find_passages(_only_roads(osm, options), buildings, frame=frame)
+    passages = _collect(problems, find_passages(_only_roads(osm, options), buildings, frame=frame))
     solid = _on_ground(buildings, passages, free=HEADROOM)
     some = np.flatnonzero([shape is not None for shape in solid])
     names = np.array(buildings.osm_id[some], np.str_)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from geoscene.ground.kinds import storey_tag
 from geoscene.roadgraph.grading import required_clearance
 from geoscene.roadgraph.paths import path_width, way_lines
 from geoscene.roadgraph.tags import drivable, is_tunnel, place_and_layer, read_layer, read_street
-from geoscene.sources.data import OsmData, Tags, is_building
+from geoscene.sources.data import OsmData, Tags, Way, is_building
 from geoscene.structures.sheets import areal
 from geoscene.support.columns import Columns
 from geoscene.support.problems import Problem
@@ -131,26 +132,31 @@ def _may_be_passage(tags: Tags) -> bool:
     return source not in ("layer", "level") or layer == 0
 
 
-def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passages:
-    """The passages of a map, in the order of its ways.
+def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[Passages, list[Problem]]:
+    """The passages of a map, in the order of its ways, and those that are not mapped as such.
 
     A way on the ground has one in each building that its line runs through if it is tagged
-    ``tunnel=building_passage`` or ``covered``. It is as wide as the way, extended through the wall at which
+    ``tunnel=building_passage`` or ``covered``; a public street also without these tags in a building that
+    stands on the ground, unless it ends there. It is as wide as the way, extended through the wall at which
     the way ends, and as high as ``height``, ``maxheight:physical`` or ``maxheight`` of the way, else 4.5 m
     over roads, 2.5 m over paths, and the free height of the kind of track. Thin walls that would be left
     beside it are left out; an arcade is open to the side.
     """
     drawn = np.flatnonzero(buildings.drawn)
-    ways, lines = way_lines([way for way in osm.ways if _is_passage(way.tags)], frame)
+    ways, lines = way_lines([w for w in osm.ways if _is_passage(w.tags) or _is_street(w.tags)], frame)
+    loose = _loose_ends(ways, lines, others=osm.ways)
     tree = shapely.STRtree(buildings.footprint[drawn])
     way, found = tree.query(lines, predicate="intersects")
     owner = buildings.outline[drawn[found]]
-    rows = []
+    rows, problems = [], []
     for k, building in np.unique(np.column_stack([way, owner]), axis=0).tolist():
         mine = drawn[buildings.outline[drawn] == building]
         body = shapely.union_all(buildings.footprint[mine])
         inside = body if _is_arcade(ways[k].tags) else body.buffer(-_INTO, join_style="mitre")
         if shapely.length(shapely.intersection(lines[k], inside)) < _ENTERED:
+            continue
+        mapped = _is_passage(ways[k].tags)
+        if not mapped and shapely.intersects(loose[k], inside):
             continue
         width = _width(ways[k].tags)
         polygon, beyond = _opening(lines[k], body, half=width / 2 + _BESIDE, tags=ways[k].tags)
@@ -162,6 +168,11 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passag
         hanging = shapely.union_all(plan[(low >= _LOW) & (low < top)])
         free = hanging.difference(grounded).buffer(-_INTO, join_style="mitre")
         into = grounded.intersection(polygon).area > _TINY
+        if not (mapped or into):
+            continue
+        if not mapped:
+            detail = f"runs through {buildings.osm_id[building]}, which has no passage; opened"
+            problems.append(Problem(ways[k].osm_id, "road", "repaired", "street-in-building", detail))
         cut = areal(beyond.difference(free), least=_TINY) if into else shapely.MultiPolygon()
         guessed = source == "default"
         underside = np.where(low < _LOW, _eaves(buildings, mine) if guessed else np.inf, low)
@@ -171,7 +182,7 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passag
         source = source if height == top else "building"
         rows.append((polygon, cut, building, width, top, guessed, height, source, ways[k].osm_id))
     columns: list[Any] = list(zip(*rows, strict=True)) if rows else [()] * 9
-    return Passages(
+    passages = Passages(
         np.fromiter(columns[0], object),
         np.fromiter(columns[1], object),
         np.array(columns[2], np.int64),
@@ -182,6 +193,16 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> Passag
         np.array(columns[7], np.str_),
         np.array(columns[8], np.str_),
     )
+    return passages, problems
+
+
+def _loose_ends(ways: list[Way], lines: NDArray[np.object_], *, others: list[Way]) -> NDArray[np.object_]:
+    """Ends of ways (n,) at which none of the others leads on, as MultiPoints."""
+    used = Counter(node for way in others if _leads_on(way.tags) for node in way.nodes.tolist())
+    ends = shapely.get_point(lines[:, None], [0, -1])
+    loose = np.array([[used[node] < 2 for node in way.nodes[[0, -1]].tolist()] for way in ways], np.bool_)
+    found: NDArray[np.object_] = shapely.multipoints(np.where(loose.reshape(-1, 2), ends, None))
+    return found
 
 
 def _eaves(buildings: Buildings, row: Ints) -> Float:
@@ -196,6 +217,17 @@ def _is_passage(tags: Tags) -> bool:
     inside = tags.get("tunnel") in _COVERED or tags.get("covered", "no") != "no"
     on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
     return inside and on_ground and _width(tags) > 0 and tags.get("indoor", "no") == "no"
+
+
+def _is_street(tags: Tags) -> bool:
+    """Whether a way is a public street on the ground that leads through the buildings on it."""
+    on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
+    return drivable(tags) and _leads_on(tags) and on_ground and tags.get("indoor", "no") == "no"
+
+
+def _leads_on(tags: Tags) -> bool:
+    """Whether a way is a street, but not in a parking lot or garage."""
+    return drivable(tags, private=True) and tags.get("service") != "parking_aisle"
 
 
 def _is_arcade(tags: Tags) -> bool:

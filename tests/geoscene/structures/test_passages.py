@@ -172,17 +172,34 @@ def test_ways_have_passages_of_their_kind(tags, width, free):
 @pytest.mark.parametrize(
     ("tags", "why"),
     [
-        ({}, "no tag"),
         ({"tunnel": "yes", "layer": "-1"}, "underground"),
-        ({"tunnel": "culvert"}, "water"),
-        ({"covered": "no"}, "no roof"),
         ({"covered": "yes", "level": "1"}, "upper storey"),
         ({"covered": "yes", "bridge": "yes", "layer": "1"}, "bridge"),
+        ({"highway": "footway"}, "corridor"),
+        ({"access": "private"}, "private"),
+        ({"highway": "service", "service": "parking_aisle"}, "garage"),
     ],
 )
 def test_other_ways_have_none(tags, why):
     plan, _, _ = built([house()], street(*STREET, inside=tags))
     assert "passages" not in {layer.name for layer in plan.layers}, why
+
+
+@pytest.mark.parametrize("tags", [{}, {"tunnel": "culvert"}, {"covered": "no"}])
+def test_a_house_across_a_street_is_open_there_and_listed(tags):
+    _, mesh, problems = built([house()], street(*STREET, inside=tags))
+    assert heights(mesh, 0.7, 0.9) == [4.5, 12]
+    assert heights(mesh, 0.7, 5) == [0, 12]
+    assert [(p.osm_id, p.reason) for p in problems] == [("way/2", "street-in-building")]
+
+
+def test_a_house_is_open_to_streets_that_go_on_in_it_and_closed_where_one_ends():
+    one, two, *_ = street((-60, 0), (0, 0), (60, 0), inside={})
+    _, mesh, _ = built([house()], [one, two])
+    assert heights(mesh, -3, 0.9) == heights(mesh, 3, 0.9) == [4.5, 12]
+    _, mesh, problems = built([house()], [one])
+    assert heights(mesh, -3, 0.9) == [0, 12]
+    assert "street-in-building" not in {p.reason for p in problems}
 
 
 def test_a_long_tunnel_below_a_house_stays_a_tunnel():
