@@ -29,10 +29,21 @@ from geoscene.buildings.table import BuildingOptions, Buildings
 from geoscene.geometry.frames import Frame
 from geoscene.sources.data import Area, OsmData, Tags
 from geoscene.support.problems import Problem, describe_unexpected, described, make_without_failures
-from geoscene.tags import first_value
+from geoscene.tags import first_value, parse_number
 from geoscene.typing import Ints
 
 _NEGATIVE = ("no", "none", "false", "")
+
+_ABOVE = (
+    "location",
+    "height",
+    "building:height",
+    "building:levels",
+    "min_height",
+    "min_level",
+    "building:min_level",
+)
+"""Keys that say where a building stands, whatever its layer."""
 
 
 def is_building(tags: Tags) -> bool:
@@ -43,6 +54,24 @@ def is_building(tags: Tags) -> bool:
 def is_building_part(tags: Tags) -> bool:
     """Whether an area is a part of a building and not an outline."""
     return tags.get("building:part", "no") not in _NEGATIVE and not is_building(tags)
+
+
+def is_underground(tags: Tags) -> bool:
+    """Whether a building or part is below the ground.
+
+    By ``location`` or ``parking``, else by a ``layer`` below 0 or storeys (``level``) below 0 alone, without
+    a height or storeys that count from the ground.
+    """
+    if "underground" in (tags.get("location"), tags.get("parking")):
+        return True
+    below = any(key in tags and _is_negative(tags[key]) for key in ("layer", "level"))
+    return below and not any(key in tags for key in _ABOVE)
+
+
+def _is_negative(numbers: str) -> bool:
+    """Whether all numbers of a list are below 0."""
+    values = [parse_number(text) for text in numbers.split(";")]
+    return all(value is not None and value < 0 for value in values)
 
 
 def read_buildings(
@@ -81,7 +110,7 @@ def _read_rows(
     for area in areas:
         if not (is_building_part if parts else is_building)(area.tags):
             continue
-        if "underground" in (area.tags.get("location"), area.tags.get("parking")):
+        if is_underground(area.tags):
             problems.append(Problem(area.osm_id, "building", "dropped", "underground"))
         else:
             chosen.append(area)

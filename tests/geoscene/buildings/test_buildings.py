@@ -522,6 +522,27 @@ def test_neighbours_keep_their_common_wall():
     assert len(corners[0] & corners[1]) == 3
 
 
+@pytest.mark.parametrize(
+    ("tags", "below"),
+    [
+        ({"layer": "-2"}, True),
+        ({"level": "-1"}, True),
+        ({"level": "-1;-2"}, True),
+        ({"parking": "underground"}, True),
+        ({"level": "-1;0"}, False),
+        ({"layer": "-1", "height": "9"}, False),
+        ({"layer": "-1", "building:levels": "3"}, False),
+        ({"layer": "-1", "location": "surface"}, False),
+        ({"layer": "-1", "min_height": "0"}, False),
+        ({"layer": "1"}, False),
+    ],
+)
+def test_a_building_is_below_the_ground_if_its_layer_or_storeys_are_and_no_height_is_mapped(tags, below):
+    table, problems = read_buildings(osm(house(1, box(0, 0, 10, 10), **tags)), FRAME)
+    assert len(table) == (not below)
+    assert reasons(problems) == ({("way/1", "dropped", "underground")} if below else set())
+
+
 def test_a_canopy_is_open_below_and_an_underground_building_is_dropped():
     table, _, verdict, problems = built(
         house(1, box(0, 0, 10, 10), building="roof", height="5"),
