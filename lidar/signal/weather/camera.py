@@ -26,7 +26,7 @@ from lidar.signal.weather.fields import FARTHEST, Field, WeatherBeams, amounts, 
 from lidar.signal.weather.glass import drops_on, through_drops
 from lidar.signal.weather.media import CLEAR, Medium, medium_of
 from lidar.signal.weather.setting import WeatherSetting
-from lidar.signal.weather.streaks import FallingParticles, streak_cover
+from lidar.signal.weather.streaks import FallingParticles, drawn_depth, drawn_distances, streak_cover
 
 EXPOSURE_NS = 5_000_000
 """Exposure of streaks for cameras that take an image in an instant (``exposure_ns`` = 0); typical by day."""
@@ -95,25 +95,35 @@ def _through_air(
     added = _expose(at, lambda sources: sources.mean)
     path = np.where(np.isfinite(distance), distance, _to_sky(camera, pose, top=_TOP[setting.kind]))
     field = field_of(setting, FARTHEST, at=at)
-    if field is not None:
-        path = _path_through(field, path, camera=camera, pose=pose)
-    clear = np.exp(-air.extinction * path).astype(np.float32)[..., None]
-    light = light * clear + added * (1 - clear)
-    particles = falling(setting, air)
+    column = partial(_column, path, field=field, camera=camera, pose=pose)
+    depth = air.extinction * column(math.inf)
+    particles, exposure = falling(setting, air), (camera.exposure_ns or EXPOSURE_NS) / 1e9
     if particles is None:
-        return light
+        return _veiled(light, added=added, clear=np.exp(-depth))
+    far = drawn_distances(camera, particles, exposure=exposure)
+    depth -= drawn_depth(particles, far=far, column=column)
+    light = _veiled(light, added=added, clear=np.exp(-depth))
     cover = streak_cover(
         camera,
         particles,
+        far=far,
         share=None if field is None else partial(_share_at, field, pose=pose),
-        exposure=(camera.exposure_ns or EXPOSURE_NS) / 1e9,
+        exposure=exposure,
         down=-pose.rotation[0, 2],
         air=(np.array([*setting.drift(1.0), 0.0]) - _velocity(at)) @ pose.rotation[0],
         distance=distance,
         rng=rng,
-    )[..., None]
-    streaked: NDArray[np.float32] = light * (1 - cover) + added * cover
-    return streaked
+    )
+    return _veiled(light, added=added, clear=1 - cover)
+
+
+def _veiled(
+    light: NDArray[np.float32], *, added: NDArray[np.float32], clear: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Light (h, w, 3) of which the share ``clear`` (h, w) is left; the rest is the colour ``added`` (3,)."""
+    clear = clear.astype(np.float32)[..., None]
+    veiled: NDArray[np.float32] = light * clear + added * (1 - clear)
+    return veiled
 
 
 def _expose(at: Situation, of: Callable[[Light], Float]) -> NDArray[np.float32]:
@@ -144,12 +154,17 @@ def falling(setting: WeatherSetting, air: Medium) -> FallingParticles | None:
 
 def _distance(image: CameraImage, camera: CameraSpec) -> NDArray[np.float32]:
     """Distance (h, w) in metres along each pixel's ray to the visible surface; inf for sky."""
-    depth = image.depth
-    if camera.model == "pinhole":
-        depth = depth / pixel_rays(camera)[:, 2].astype(np.float32).reshape(depth.shape)
+    depth = image.depth / _depth_per_metre(camera)
     beyond = ~np.isfinite(depth) & ~np.isin(image.klass, (Class.SKY, Class.UNLABELED))
     distance: NDArray[np.float32] = np.where(beyond, np.float32(camera.far), depth)
     return distance
+
+
+def _depth_per_metre(camera: CameraSpec) -> NDArray[np.float32]:
+    """Depth (h, w) of the points at a distance of 1 m: 1 for a fisheye, whose depth is the distance."""
+    if camera.model == "fisheye":
+        return np.ones((camera.height, camera.width), np.float32)
+    return pixel_rays(camera)[:, 2].astype(np.float32).reshape(camera.height, camera.width)
 
 
 def _to_sky(camera: CameraSpec, pose: Poses, *, top: float) -> NDArray[np.float32]:
@@ -161,13 +176,17 @@ def _to_sky(camera: CameraSpec, pose: Poses, *, top: float) -> NDArray[np.float3
     return through
 
 
-def _path_through(
-    field: Field, path: NDArray[np.float32], *, camera: CameraSpec, pose: Poses
+def _column(
+    path: NDArray[np.float32], within: float, *, field: Field | None, camera: CameraSpec, pose: Poses
 ) -> NDArray[np.float32]:
     """Metres (h, w) through an even medium of the same optical depth.
 
-    path : (h, w) metres along each pixel's ray
+    path   : (h, w) metres along each pixel's ray
+    within : metres up to which it counts, along the optical axis of a pinhole, along the rays of a fisheye
     """
+    path = np.fmin(path, within / _depth_per_metre(camera))
+    if field is None:
+        return path
     direction = pose.directions(np.nan_to_num(pixel_rays(camera)))
     rays = WeatherBeams(np.broadcast_to(pose.position, direction.shape), direction)
     whole = path.ravel().astype(np.float64)

@@ -20,7 +20,7 @@ from lidar.signal.weather.camera import add_weather, falling, linear_of
 from lidar.signal.weather.glass import drops_on, through_drops
 from lidar.signal.weather.media import medium_of
 from lidar.signal.weather.setting import WeatherSetting
-from lidar.signal.weather.streaks import FallingParticles, streak_cover
+from lidar.signal.weather.streaks import FallingParticles, drawn_depth, drawn_distances, streak_cover
 
 CAMERA = CameraSpec("front", Mount(), 320, 180, 300.0, 300.0, 159.5, 89.5, exposure_ns=5_000_000)
 GEO = GeoFrame.at(7.1, 50.7)
@@ -144,15 +144,16 @@ def test_images_without_a_drive_are_refused_in_one_line():
         seen(picture(30.0), WeatherSetting("rain", 5.0), Situation("front", 0))
 
 
-def cover_of(particles, exposure, *, air=(0.0, 0.0, 0.0), distance=np.inf, seed=1, camera=CAMERA):
-    shape = camera.height, camera.width
+def cover_of(particles, exposure, *, air=(0.0, 0.0, 0.0), distance=np.inf, seed=1, camera=CAMERA, far=None):
+    far = drawn_distances(camera, particles, exposure=exposure) if far is None else far
     return streak_cover(
         camera,
         particles,
+        far=far,
         exposure=exposure,
         down=np.array([0.0, 1.0, 0.0]),
         air=np.array(air),
-        distance=np.full(shape, distance, np.float32),
+        distance=np.full((camera.height, camera.width), distance, np.float32),
         rng=np.random.default_rng(seed),
     )
 
@@ -216,6 +217,44 @@ def test_flakes_have_the_cross_section_of_the_medium():
     flakes = falling(setting, air)
     area = (flakes.density * np.pi / 4 * flakes.diameter**2).sum()
     assert 2 * area == pytest.approx(air.extinction, rel=0.01)  # but for those under 0.3 mm
+
+
+HEAVY = WeatherSetting("snow", 10.0)
+"""Snow with a visibility of 215 m."""
+
+FLAKES = medium_of("snow", 10.0, wavelength_nm=550.0, medium=HEAVY.medium)
+
+
+@pytest.mark.parametrize("depth", [4.0, pytest.param(25.0, marks=pytest.mark.full)])
+def test_snow_dims_a_wall_by_the_extinction_of_the_medium_flakes_that_are_drawn_included(depth):
+    white = linear_of()[seen(picture(np.inf), WeatherSetting("fog", 5.0)).rgb].mean()
+    walls = [linear_of()[seen(picture(depth), HEAVY, seed=seed).rgb].mean() for seed in range(4)]
+    # The wall faces the camera, so that the way of the light to a corner is longer.
+    ray = np.hypot(np.hypot(*(np.indices((180, 320)) - [[[89.5]], [[159.5]]])) / 300, 1.0)
+    expected = 1 - np.exp(-FLAKES.extinction * depth * ray).mean()
+    assert np.mean(walls) / white == pytest.approx(expected, rel=0.1)
+
+
+@pytest.mark.parametrize("depth", [4.0, pytest.param(25.0, marks=pytest.mark.full)])
+def test_flakes_that_are_not_drawn_would_change_the_deviation_of_an_image_by_a_few_percent(depth):
+    """They are a veil of the same mean, and have at most a tenth of the variance."""
+    flakes = falling(HEAVY, FLAKES)
+    far = drawn_distances(CAMERA, flakes, exposure=5e-3)
+    every = np.full_like(far, 1.3 * depth)
+
+    def mean_depth(far):
+        return drawn_depth(flakes, far=far, column=lambda end: np.full((1, 1), min(end, depth), np.float32))
+
+    veil = np.exp(mean_depth(far) - mean_depth(every))
+    drawn = [(cover_of(flakes, 5e-3, distance=depth, seed=s) * veil).std() for s in range(9)]
+    whole = [cover_of(flakes, 5e-3, distance=depth, seed=s, far=every).std() for s in range(9)]
+    assert np.median(drawn) == pytest.approx(np.median(whole), rel=0.1)
+
+
+def test_heavy_snow_is_drawn_with_a_small_part_of_its_flakes():
+    flakes = falling(HEAVY, FLAKES)
+    far = drawn_distances(CAMERA, flakes, exposure=5e-3)
+    assert (flakes.density * far**3).sum() < 0.1 * (flakes.density * 60.0**3).sum()
 
 
 def test_a_fisheye_sees_rain_as_dense_as_a_pinhole_does():
