@@ -18,7 +18,7 @@ from lidar.raycast.device import CPU
 from lidar.raycast.device import device as warp_device
 from lidar.raycast.embree import EmbreeScene
 from lidar.raycast.geometry import ALL, Geometry, MeshInstances, check_mesh, middle, split
-from lidar.raycast.hits import Hits, Refiner
+from lidar.raycast.hits import Hits, Refiner, own_faces
 from lidar.raycast.library import library
 from lidar.raycast.rays import EXACTLY, beyond, free_rays, limit_rays, posed_rays, taken
 from lidar.raycast.scene import Float64Scene
@@ -279,7 +279,17 @@ class Caster:
             blocked = hits.face >= 0
             row = np.flatnonzero(at < np.inf)
             part, at = (taken(rays, row), at[row]) if len(row) < len(at) else (rays, at)
-            blocked[row] = self._any_hit(beyond(part, np.maximum(at, rays.near)), None, threads=threads)
+            part = beyond(part, np.maximum(at, rays.near))
+            blocked[row] = self._any_hit(part, None, threads=threads)
+            held = np.flatnonzero(blocked[row] & (at > 0.0))
+            if len(held):
+                # Where faces meet in a hollow, a ray that has left one plane may be behind the next.
+                part, row = taken(part, held), row[held]
+                behind = self._behind(part, threads=threads)
+                again = np.flatnonzero(behind >= 0)
+                if len(again):
+                    part, behind = taken(part, again), behind[again]
+                    blocked[row[again]] = self._any_hit(part, behind, threads=threads)
             return blocked
         blocked = self.scene.occluded(rays, threads=threads)
         if self.refiners and np.isfinite(rays.far).any():
@@ -288,6 +298,11 @@ class Caster:
             part = taken(rays, row)
             blocked[row] = self._first_hits(part, None, normals=False, threads=threads).face >= 0
         return blocked
+
+    def _behind(self, rays: RayColumns, *, threads: int) -> NDArray[np.int32]:
+        """Faces (n,) of the own mesh that rays hit first, from behind; -1 for all other hits."""
+        hits = self.scene.cast(rays, normals=False, threads=threads)
+        return np.where(hits.cosine < 0.0, own_faces(hits), np.int32(-1))
 
     def _left(self, rays: RayColumns, on: NDArray[np.int32], *, normals: bool) -> tuple[Hits, Float]:
         """Hits of rays on the surface in which they start, and the ray parameter at which others leave it."""

@@ -264,6 +264,26 @@ def test_light_leaves_a_point_on_rough_ground_upwards_and_hits_the_surface_sidew
     assert np.abs(above(kind, place - down.range[:, None] * up)).max() < 1e-6
 
 
+@pytest.mark.parametrize("backend", ["float64", "embree"])
+def test_a_slope_throws_no_shadow_on_the_foot_below_its_plane(backend):
+    """Two planes of grass meet in a hollow: the ray to the sun leaves one plane behind the other."""
+    corner = np.array([[-9, -9, 0], [0, -9, 0], [0, 9, 0], [-9, 9, 0], [9, -9, 2.7], [9, 9, 2.7]], float)
+    mesh = Mesh.of(
+        corner,
+        [[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]],
+        klass=Class.GRASS,
+        material=materials()["grass"].code,
+    )
+    caster = Caster(mesh.vertices, mesh.faces, origin=np.zeros(3), backend=backend)
+    caster.refiners = [GroundRefiner(ground_tables(mesh, origin=np.zeros(3)))]
+    rng = np.random.default_rng(4)
+    start = np.column_stack([rng.uniform(-0.2, 0.0, 2000), rng.uniform(-5, 5, 2000), np.full(2000, 2.0)])
+    hits = caster.cast(start, np.tile([0.0, 0.0, -1.0], (2000, 1)), normals=True)
+    place = start - np.outer(hits.range, [0, 0, 1]) + 1e-3 * hits.normal
+    sun = np.tile([0.7, 0.1, 0.7], (2000, 1))
+    assert caster.occluded(place, sun, on=hits.face).mean() < 0.02
+
+
 @pytest.mark.parametrize("kind", ["asphalt", "paving", "sett"])
 def test_the_plane_throws_no_shadow_on_peaks_that_nearly_reach_it_far_from_the_origin(kind):
     start, way = looks(np.random.default_rng(9), 50_000, lowest_deg=30, highest_deg=80)
