@@ -151,3 +151,10 @@ def test_dirt_roads_differ_from_the_soil_beside_them_in_colour_and_reflectance()
 
 def path(**tags):
     return Way("way/1", tags, np.array([1, 2]), np.array([[9.0, 50.0], [9.001, 50.0]]))
+
+
+def test_dry_grass_has_the_hue_of_its_spectrum():
+    """Reflectances at 650, 550 and 450 nm, of dry grass of the JHU spectral library: straw, not yellow."""
+    wanted = np.array([0.402, 0.306, 0.206])
+    light = ((np.array(materials()["dry_grass"].color) / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(light / light[0], wanted / wanted[0], atol=0.04)
