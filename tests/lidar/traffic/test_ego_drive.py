@@ -82,16 +82,16 @@ def test_the_ego_enters_no_junction_on_red(seed, at_speed):
     assert (speed_of(ego)[500:-500] < 0.05).any()  # it had to wait
 
 
-@pytest.mark.parametrize("gap", [25.0, 26.0])
+@pytest.mark.parametrize("gap", [25.0, pytest.param(26.0, marks=pytest.mark.full)])
 def test_the_ego_waits_between_junctions_that_are_close_and_goes_on(gap):
     graph = grid(6, 6, gap, speed=13.9)
     graph = replace(graph, signals=np.full(len(graph.node_id), True))
-    path = path_on(graph, 1, 600.0)
-    ego = drive_with_signals(path, CAR, graph=graph, seed=1, duration=500.0)
-    check_enters_on_green(ego, graph, 1, until=500.0)
+    path = path_on(graph, 1, 300.0)
+    ego = drive_with_signals(path, CAR, graph=graph, seed=1, duration=250.0)
+    check_enters_on_green(ego, graph, 1, until=250.0)
     moving = np.flatnonzero(speed_of(ego) > 0.05)
     assert np.diff(moving).max() < 60_00  # a cycle of the signals, at 100 Hz
-    assert moving[-1] > 450_00
+    assert moving[-1] > 200_00
 
 
 def test_the_ego_stops_at_stop_signs_and_continues():
@@ -157,17 +157,19 @@ def test_the_ego_keeps_its_distance_from_a_slow_leader(seed):
     assert speed_of(ego)[4000:5000].mean() == pytest.approx(4.0, abs=1.0)
 
 
-@pytest.mark.parametrize(("seed", "signalised"), [(1, True), (2, False), (3, True)])
+@pytest.mark.parametrize(
+    ("seed", "signalised"), [(1, True), (2, False), pytest.param(3, True, marks=pytest.mark.full)]
+)
 def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, signalised):
     graph = city(signalised=signalised)
     lanes = lanes_of(graph, bounds=BOUNDS)
     plan = junction_plan(graph, lanes, seed=seed)
-    path = path_on(graph, seed, 60.0)
-    alone = drive_path(path, CAR, duration=60.0)
+    path = path_on(graph, seed, 40.0)
+    alone = drive_path(path, CAR, duration=40.0)
     trips = vehicle_trips(
         lanes, surroundings_of(lanes, alone, radius=300.0, scale=1.0), seed=seed, density=20.0
     )
-    travelled = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=60.0, radius=300.0)
+    travelled = simulate_ego(ego_trip(path, CAR), trips, graph=graph, plan=plan, seconds=40.0, radius=300.0)
     motion = motion_within(
         path, CAR, time_s=np.arange(len(travelled)) * STEP_S, max_distance=np.minimum(travelled, path.length)
     )
@@ -180,15 +182,15 @@ def test_in_traffic_the_ego_touches_no_road_user_and_none_is_removed(seed, signa
     for mine, moment in zip(own[::2], poses[::2], strict=True):
         if np.isfinite(moment).any():
             assert not shapely.intersects(mine, boxes_at(trips, moment)).any()
-    assert travelled[-1] > 80.0  # it makes progress
+    assert travelled[-1] > 50.0  # it makes progress
     assert STEP < travelled[-1] <= path.length + STEP
 
 
 @pytest.mark.parametrize("signalised", [False, True])
 def test_a_drive_without_a_duration_ends_a_second_after_its_arrival(signalised):
     graph = city(signalised=signalised)
-    for seed in (1, 2, 3):
-        path = path_on(graph, seed, 40.0)
+    for seed in (1, 2):
+        path = path_on(graph, seed, 30.0)
         ego = drive_with_signals(path, CAR, graph=graph, seed=seed)
         standing = np.flatnonzero(speed_of(ego) > 0.01)[-1]
         assert (ego.duration_ns - ego.time_ns[standing]) * 1e-9 == pytest.approx(1.0, abs=0.02)

@@ -43,8 +43,8 @@ def driving(graph, seed, seconds):
     return drive_path(plan_path(route, CAR, frame=Plane()), CAR).until(int(seconds * 1e9))
 
 
-def city(*, signalised, lanes=1.0, width=7.0):
-    graph = grid(4, 4, 90.0, lanes=lanes, width=width, speed=13.9)
+def city(*, signalised, lanes=1.0, width=7.0, streets=4):
+    graph = grid(streets, streets, 90.0, lanes=lanes, width=width, speed=13.9)
     return replace(graph, signals=np.full(len(graph.node_id), signalised))
 
 
@@ -108,6 +108,12 @@ def test_traffic_goes_where_the_arrows_of_its_lane_point(side, monkeypatch):
     assert read.call_count == 1  # for the only edge with arrows, whatever the number of drives
 
 
+@pytest.fixture(scope="module")
+def signalised():
+    """Trips, flow and junctions of 70 s of dense traffic in a town with signals; the ego stands outside."""
+    return flow_on(city(signalised=True), standing((400.0, 400.0), 70.0), seed=3, radius=600.0)
+
+
 def overlaps(boxes):
     a, b = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     return int((a < b).sum())
@@ -117,9 +123,9 @@ def overlaps(boxes):
 @given(seed=st.integers(0, 10_000), signalised=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
 def test_vehicles_do_not_collide_or_jump(seed, signalised, lanes):
     graph = city(signalised=signalised, lanes=lanes, width=7.0 * lanes)
-    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 65.0), seed=seed, density=12.0, radius=600.0)
+    trips, flow, _ = flow_on(graph, standing((400.0, 400.0), 40.0), seed=seed, density=12.0, radius=600.0)
     assert len(np.unique(flow.trip)) > 15
-    assert flow.step.max() * STEP_S > 60
+    assert flow.step.max() * STEP_S > 35
     poses = tracks(trips, flow)
     for moment in poses[::3]:
         assert overlaps(boxes_at(trips, moment)) == 0
@@ -130,9 +136,9 @@ def test_vehicles_do_not_collide_or_jump(seed, signalised, lanes):
 def test_reckless_drivers_do_not_collide():
     """A driver without gap and headway still stops within the cells it has reserved."""
     graph = city(signalised=False)
-    ego = standing((400.0, 400.0), 45.0)
+    ego = standing((400.0, 400.0), 30.0)
     lanes = lanes_of(graph, bounds=(-30.0, -30.0, 300.0, 300.0))
-    trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=30.0)
+    trips = vehicle_trips(lanes, surroundings_of(lanes, ego, radius=600.0, scale=1.0), seed=9, density=20.0)
     wild = [
         replace(
             with_speed(t, 0 * t.course.desired_speed + 16.0),
@@ -178,18 +184,17 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
     assert some < 0.7 * everyone
 
 
-def test_traffic_on_snow_is_slower_and_brakes_no_harder_than_the_grip_allows():
-    ego, graph = standing((400.0, 400.0), 40.0), city(signalised=True)
-    _, dry, _ = flow_on(graph, ego, seed=3, radius=600.0)
+def test_traffic_on_snow_is_slower_and_brakes_no_harder_than_the_grip_allows(signalised):
+    ego, graph, dry = standing((400.0, 400.0), 30.0), city(signalised=True), signalised[1]
     trips, snow, _ = flow_on(graph, ego, seed=3, radius=600.0, road=ROADS["snow"])
-    assert snow.speed.mean() < 0.8 * dry.speed.mean()
+    assert snow.speed.mean() < 0.8 * dry.speed[dry.step <= snow.step.max()].mean()
     hardest = min(np.diff(snow.speed[snow.trip == k]).min(initial=0.0) for k in np.unique(snow.trip)) / STEP_S
     assert -0.2 * 9.81 - 1e-6 <= hardest < 0
     assert {trip.driver.hard for trip in trips} == {0.2 * 9.81}
 
 
-def test_speed_changes_within_the_limits_of_the_vehicle():
-    trips, flow, _ = flow_on(city(signalised=True), standing((400.0, 400.0), 60.0), seed=3, radius=600.0)
+def test_speed_changes_within_the_limits_of_the_vehicle(signalised):
+    trips, flow, _ = signalised
     for k in np.unique(flow.trip):
         speed = flow.speed[flow.trip == k]
         change = np.diff(speed) / STEP_S
@@ -200,19 +205,19 @@ def test_speed_changes_within_the_limits_of_the_vehicle():
         assert (travelled >= -1e-9).all()
 
 
-def test_braking_is_mild_almost_always():
-    _, flow, _ = flow_on(city(signalised=True), standing((400.0, 400.0), 60.0), seed=5, radius=600.0)
+def test_braking_is_mild_almost_always(signalised):
+    _, flow, _ = signalised
     same = np.diff(flow.trip) == 0
     change = np.diff(flow.speed)[same] / STEP_S
     assert (change < -4.0).mean() < 0.01
     assert flow.speed.mean() > 2.0  # traffic still flows
 
 
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(seed=st.integers(0, 1000), signalised=st.booleans())
 def test_the_ego_is_never_touched(seed, signalised):
     graph = city(signalised=signalised)
-    ego = driving(graph, seed, 30.0)
+    ego = driving(graph, seed, 20.0)
     trips, flow, _ = flow_on(graph, ego, seed=seed, radius=300.0)
     poses = tracks(trips, flow)
     times = (np.arange(len(poses)) * STEP_S * 1e9).astype(np.int64)
@@ -253,8 +258,8 @@ def longest_rests(flow):
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.full) for seed in (1, 2))])
 def test_no_road_user_stands_for_good(seed):
-    """Cars, trucks and cyclists in a town of 16 junctions that none can leave, for five minutes."""
-    graph, ego = grid(4, 4, 90.0, lanes=1.0, width=7.0, speed=13.9), standing((135.0, 135.0), 300.0)
+    """Cars, trucks and cyclists in a town of 16 junctions that none can leave, for three minutes."""
+    graph, ego = grid(4, 4, 90.0, lanes=1.0, width=7.0, speed=13.9), standing((135.0, 135.0), 180.0)
     lanes = lanes_of(graph, bounds=(-500.0, -500.0, 800.0, 800.0))
     area = surroundings_of(lanes, ego, radius=400.0, scale=1.0)
     shares = {"sedan": 0.6, "cyclist": 0.3, "truck": 0.1}
@@ -286,9 +291,8 @@ def test_the_gap_to_a_leader_grows_with_speed():
     assert np.percentile(space[fast] / v[fast], 2) > 0.9
 
 
-def test_no_road_user_enters_a_junction_on_red():
-    graph = city(signalised=True)
-    trips, flow, plan = flow_on(graph, standing((400.0, 400.0), 70.0), seed=4, radius=600.0)
+def test_no_road_user_enters_a_junction_on_red(signalised):
+    trips, flow, plan = signalised
     poses = tracks(trips, flow)
     entered = 0
     for k in np.unique(flow.trip):
@@ -321,11 +325,11 @@ def test_both_groups_of_signals_have_green_but_never_together():
 
 
 def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
-    graph = city(signalised=False, lanes=2.0, width=14.0)
+    graph = city(signalised=False, lanes=2.0, width=14.0, streets=3)
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])
     for side, sign in (("right", 1), ("left", -1)):
         lanes = lanes_of(graph, side=side, bounds=(-30.0, -30.0, 300.0, 300.0))
-        area = surroundings_of(lanes, standing((400.0, 400.0), 30.0), radius=600.0, scale=1.0)
+        area = surroundings_of(lanes, standing((400.0, 400.0), 5.0), radius=600.0, scale=1.0)
         trips = vehicle_trips(lanes, area, seed=1, density=10.0, ground=road)
         assert len(trips) > 10
         for trip in trips:
@@ -345,8 +349,8 @@ def test_lanes_lie_side_by_side():
 
 def test_the_same_seed_gives_the_same_traffic():
     graph = city(signalised=True)
-    ego = driving(graph, 1, 20.0)
-    first, second, other = (flow_on(graph, ego, seed=s, radius=200.0)[1] for s in (7, 7, 8))
+    ego = driving(graph, 1, 8.0)
+    first, second, other = (flow_on(graph, ego, seed=s, density=8.0, radius=200.0)[1] for s in (7, 7, 8))
     for name in ("trip", "step", "travelled", "speed"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
     assert first.travelled.tobytes() != other.travelled.tobytes()
