@@ -20,6 +20,9 @@ FEWEST = 5
 _WINDOW = 5.0
 """Correlation times up to which correlations are summed (Sokal 1997)."""
 
+_AT_ONCE = 1_000_000
+"""Errors of series that are drawn at a time: 8 MB."""
+
 _ENDS = (2.5, 97.5)
 KITTI_LENGTHS = tuple(range(100, 900, 100))
 """Metres of the segments of KITTI's odometry benchmark."""
@@ -108,13 +111,15 @@ def statistics(errors: Float, *, least: int = 1, seed: int = 0) -> Statistics:
 def _resample(errors: Float, *, size: int, seed: int) -> Float:
     """Root mean square, mean and median (`RESAMPLES`, 3) of series of blocks drawn with replacement."""
     rng, n = generator(seed, "blocks", len(errors)), len(errors)
-    count = -(-n // size)
+    first = rng.integers(0, n - size + 1, (RESAMPLES, -(-n // size)))
     inside = np.arange(size)
     found = np.empty((RESAMPLES, 3))
-    for k in range(RESAMPLES):
-        first = rng.integers(0, n - size + 1, count)
-        series = errors[(first[:, None] + inside).ravel()[:n]]
-        found[k] = np.sqrt(np.mean(series**2)), series.mean(), np.median(series)
+    at_once = max(_AT_ONCE // n, 1)
+    for k in range(0, RESAMPLES, at_once):
+        rows = (first[k : k + at_once, :, None] + inside).reshape(-1, first.shape[1] * size)[:, :n]
+        series = errors[rows]
+        columns = np.sqrt(np.mean(series**2, axis=1)), series.mean(axis=1), np.median(series, axis=1)
+        found[k : k + at_once] = np.stack(columns, axis=1)
     return found
 
 
