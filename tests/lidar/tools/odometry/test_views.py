@@ -83,7 +83,7 @@ def difference(first, second):
     return Rotation.from_matrix(off[:3, :3]).magnitude(), np.linalg.norm(off[:3, 3])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(
     st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
     st.lists(st.floats(-2, 2), min_size=3, max_size=3),
@@ -114,10 +114,10 @@ def test_a_pure_turn_moves_nothing():
 
 
 def test_deviations_of_poses_are_those_of_noisy_bearings():
-    """Errors over their stated deviations have the mean square one."""
+    """Errors over their stated deviations have the mean square one; of 25 poses it scatters by 0.12."""
     rng, squares = np.random.default_rng(5), []
     true = pose([0.01, 0.05, 0.0], [0.3, 0.0, 0.8])
-    for _ in range(60):
+    for _ in range(25):
         points = points_ahead(rng, 80)
         bearing = seen(points, true) + rng.normal(0, 1e-3, (80, 3))
         bearing /= np.linalg.norm(bearing, axis=1, keepdims=True)
@@ -125,7 +125,7 @@ def test_deviations_of_poses_are_those_of_noisy_bearings():
         off = np.linalg.inv(found) @ true
         error = np.concatenate([Rotation.from_matrix(off[:3, :3]).as_rotvec(), off[:3, 3]])
         squares.append(error @ np.linalg.solve(covariance, error) / 6)
-    assert 0.6 < np.mean(squares) < 1.5
+    assert 0.6 < np.mean(squares) < 1.45
 
 
 def test_a_rolling_shutter_bends_what_moves_and_its_motion_straightens_it():
