@@ -174,10 +174,13 @@ class Tree:
         self.parent = {t.child_frame_id: (t.header.frame_id, matrix(t.transform)) for t in static.transforms}
 
     def vehicle(self, time_ns):
-        out = np.eye(4)
+        """Matrices (..., 4, 4) at times (...,)."""
         after = time_ns - BASE_NS
-        out[:3, 3] = [np.interp(after, self.time - BASE_NS, self.place[:, k]) for k in range(3)]
-        out[:3, :3] = self.turn(after).as_matrix()
+        out = np.zeros((*np.shape(after), 4, 4))
+        out[..., 3, 3] = 1.0
+        for k in range(3):
+            out[..., k, 3] = np.interp(after, self.time - BASE_NS, self.place[:, k])
+        out[..., :3, :3] = self.turn(after).as_matrix()
         return out
 
     def mount(self, frame):
@@ -412,7 +415,7 @@ def test_laser_returns_fall_on_the_pixels_of_what_they_hit(recorded, messages):
         rows = points(cloud)
         rows = rows[(np.abs(rows["y"]) < 0.5 * rows["x"]) & ~np.isin(rows["label"], moving)]
         eye = np.linalg.inv(tree.vehicle(ns(image.header)) @ tree.mount(image.header.frame_id))
-        turns = np.array([eye @ tree.vehicle(ns(cloud.header) + int(t)) for t in nanoseconds(rows)])
+        turns = eye @ tree.vehicle(ns(cloud.header) + nanoseconds(rows))
         xyz1 = np.column_stack([rows[k] for k in "xyz"] + [np.ones(len(rows))]) @ tree.mount("lidar_top").T
         seen = np.einsum("nij,nj->ni", turns, xyz1)[:, :3]
         u, v = np.rint(brown(info, seen)).astype(int).T

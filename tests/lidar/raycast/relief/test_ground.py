@@ -98,7 +98,7 @@ def test_rough_ground_lies_at_or_below_its_plane_within_its_depth_and_slope(kind
 def test_no_place_ahead_rises_faster_than_the_steepness_of_a_block(kind, towards, reach, level):
     rough, k = roughness(), list(KINDS).index(kind)
     rng = np.random.default_rng(4)
-    start = rng.uniform(0, 30, (100_000, 2))
+    start = rng.uniform(0, 30, (30_000, 2))
     sign = np.array([-1 if towards & 2 else 1, -1 if towards & 1 else 1])
     ahead = reach * rng.uniform(0, 1, start.shape) ** rng.integers(1, 4, (len(start), 1))
     rise = heights(kind, start + sign * ahead, level=level) - heights(kind, start, level=level)
@@ -131,7 +131,7 @@ def test_no_place_near_ahead_is_higher_than_the_top_of_a_block(kind, towards, le
 @pytest.mark.parametrize("kind", KIND_OF)
 @pytest.mark.parametrize("level", range(1, LEVELS))
 def test_levels_have_the_mean_height_of_the_surface(kind, level):
-    xy = np.random.default_rng(6).uniform(0, 12.8 * 25, (2_000_000, 2))
+    xy = np.random.default_rng(6).uniform(0, 12.8 * 25, (200_000, 2))
     exact = heights(kind, xy)
     assert heights(kind, xy, level=level).mean() == pytest.approx(exact.mean(), abs=0.01 * exact.std())
 
@@ -172,7 +172,9 @@ def test_rays_with_a_footprint_end_on_the_mean_and_pass_nothing_of_it_before(kin
 
     def over(share, level):
         points = start + (plane.range + share * (hits.range - plane.range))[:, None] * way
-        z = [heights(kind, points[[k], :2], level=int(level[k]))[0] for k in range(len(points))]
+        z = np.empty(len(points))
+        for one in np.unique(level):
+            z[level == one] = heights(kind, points[level == one, :2], level=int(one))
         return points[:, 2] - points[:, :2] @ SLOPE - z
 
     on_nearest = np.abs(over(1.0, nearest)) < 1e-6

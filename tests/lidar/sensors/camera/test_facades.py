@@ -32,7 +32,7 @@ def painted(relief):
     return seen.RenderedFacades(tables, True, color, material, GLASS), caster
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=16, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.1, 0.5, 2.0]), st.booleans())
 def test_shares_of_a_pixel_are_those_of_rays_through_it(seed, size, sills):
     rng = np.random.default_rng(seed)

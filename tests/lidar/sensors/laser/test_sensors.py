@@ -131,8 +131,8 @@ def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
         sensor = load_sensor(name)
         frames = [firings(sensor, k) for k in (0, 7)]
         for f in frames:
-            assert np.linalg.norm(f.direction, axis=1) == pytest.approx(1.0, abs=1e-12), name
-            assert sorted(f.order) == list(range(len(f))), name
+            np.testing.assert_allclose(np.linalg.norm(f.direction, axis=1), 1.0, atol=1e-12, err_msg=name)
+            np.testing.assert_array_equal(np.sort(f.order), np.arange(len(f)), name)
             assert (np.diff(f.column[f.channel == f.channel[0]]) > 0).all(), name
 
 
@@ -155,9 +155,9 @@ def test_pulses_are_fired_within_their_frame_and_none_is_lost_between_frames(nam
         if sensor.kind != "spinning":
             continue
         times = np.concatenate([f.time_ns for f in frames])
+        channels = np.concatenate([f.channel for f in frames])
         for channel in range(len(sensor.pattern.elevation)):
-            of_one = times[np.concatenate([f.channel for f in frames]) == channel]
-            assert np.ptp(np.diff(of_one)) <= 1
+            assert np.ptp(np.diff(times[channels == channel])) <= 1
 
 
 def test_pulses_of_frames_that_are_no_whole_nanoseconds_long_are_rounded_into_their_frame():
@@ -197,7 +197,7 @@ def test_pulses_of_frames_that_are_no_whole_nanoseconds_long_are_rounded_into_th
 def test_a_turn_has_the_published_number_of_points(name, points):
     """A revolution is no whole number of blocks, so the azimuths shift and sizes differ by up to a block."""
     sensor = load_sensor(name)
-    sizes = {len(firings(sensor, k)) for k in range(20)}
+    sizes = {len(firings(sensor, k)) for k in range(6)}
     lasers = int(firings(sensor, 0).channel.max()) + 1 if sensor.kind == "spinning" else 0
     assert {abs(size - points) <= lasers for size in sizes} == {True}
 

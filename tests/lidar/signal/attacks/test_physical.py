@@ -1,5 +1,6 @@
 """Physical attacks: budgets, published figures, line of sight, and what their returns look like."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -401,7 +402,7 @@ ATTACKS = (
 @pytest.mark.parametrize("on", ["drive", "recording", "rounded recording"])
 def test_no_column_gives_injected_returns_away(table, on):
     """Ranges and intensities have the steps of genuine ones, no value is repeated, rows are in order."""
-    sweep = swept("hdl64e_s3", settings=replace(LEVELS["standard"], quantise=on == "drive"))
+    sweep = sixty_four_lasers(quantise=on == "drive")
     earlier = recorded(sweep)
     stages = stages_of([table], seed=5)
     if on == "drive":
@@ -474,6 +475,11 @@ def test_a_device_that_is_never_in_sight_is_refused():
     far = stages_of([{"name": "inject", "place": f"{lat} {lon} 1.5"}], seed=5)
     with pytest.raises(InputError, match="in the line of sight of no scanner"):
         check_sight(far, [(situation(VLP), pytest.fail)])
+
+
+@functools.cache
+def sixty_four_lasers(*, quantise):
+    return swept("hdl64e_s3", settings=replace(LEVELS["standard"], quantise=quantise))
 
 
 EXAMPLES = sorted((ROOT / "examples" / "attacks").glob("*.toml"))

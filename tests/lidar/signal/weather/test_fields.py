@@ -1,5 +1,6 @@
 """Weather over time and place, plumes, spray, the cover glass and the sun."""
 
+import functools
 from dataclasses import replace
 from datetime import UTC, datetime
 from types import SimpleNamespace
@@ -179,13 +180,17 @@ def moving(speed, *, seed=0):
     return replace(SITUATION, world=SimpleNamespace(caster=caster, span_ns=(0, 10**8)), seed=seed)
 
 
-def spray_returns(kmh, *, seed):
-    """Positions (k, 3) of returns from spray of 1 mm of water behind a car, above the ground."""
-    sensor = load_sensor("hdl64e_s2")
-    sweep = cast(
-        sensor, Mount((0, 0, 1.9)), frame=0, seed=5, settings=LINK, world=BEHIND_A_CAR,
+@functools.cache
+def sweep_behind_a_car():
+    return cast(
+        load_sensor("hdl64e_s2"), Mount((0, 0, 1.9)), frame=0, seed=5, settings=LINK, world=BEHIND_A_CAR,
         trajectory=driven((0.0, 0.0, 0.0), start=(0, 0, 0)),
     )  # fmt: skip
+
+
+def spray_returns(kmh, *, seed):
+    """Positions (k, 3) of returns from spray of 1 mm of water behind a car, above the ground."""
+    sweep = sweep_behind_a_car()
     at = replace(moving(kmh / 3.6, seed=seed), sensor="hdl64e_s2")
     cloud = altered(read_weather("spray=1mm"), sweep=sweep, at=at).cloud
     return cloud.xyz[cloud.origin == Origin.WEATHER] + [0, 0, 1.9]

@@ -193,7 +193,7 @@ def test_flakes_cover_the_share_of_the_plane():
     assert np.median(distance) == pytest.approx(80 / np.sqrt(2), rel=0.02)
 
 
-def snowed(distance, intensity, *, rate=2.5, n=20_000, seed=0):
+def snowed(distance, intensity, *, rate=2.5, n=4000, seed=0):
     return hahner_snow(
         np.full(n, distance),
         np.full(n, intensity),
