@@ -40,6 +40,21 @@ preset = "vlp16"
 translation = [1.0, 0.0, 1.9]
 """
 
+SEEING_RIG = (
+    RIG
+    + """
+[[camera]]
+name = "front"
+translation = [1.5, 0.0, 1.4]
+width = 96
+height = 64
+fov_deg = 80.0
+rate_hz = 10.0
+
+[[gnss]]
+name = "gnss"
+"""
+)
 STEP = 0.0045  # degrees of latitude: 500 m
 WEST, SOUTH = 9.5, 47.1
 STREETS = 9  # from south to north: 4 km
@@ -83,11 +98,12 @@ def town(tmp_path_factory):
     folder = tmp_path_factory.mktemp("town")
     (folder / "town.osm").write_text(osm_of())
     (folder / "rig.toml").write_text(RIG)
+    (folder / "seeing.toml").write_text(SEEING_RIG)
     build(read_osm(folder / "town.osm"), folder / "whole", options=BuildOptions(name="town"))
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def south(town):
     return DriveOptions(
         route=[at(20), at(180)], rig=str(town / "rig.toml"), duration=0.5, formats=("pcd",), workers=1
@@ -96,6 +112,14 @@ def south(town):
 
 def opened(town, options, cache, **place):
     return open_scene_or_map(town / "town.osm", options, place=PlaceOptions(scene_cache=cache, **place))
+
+
+@pytest.fixture(scope="module")
+def cached(town, south, tmp_path_factory):
+    """A cache with the scene of the drive in the south."""
+    cache = tmp_path_factory.mktemp("cache")
+    opened(town, south, cache)
+    return cache
 
 
 def same_drives(a, b):
@@ -118,7 +142,7 @@ def test_drives_of_a_map_have_the_bytes_of_drives_in_its_whole_scene(kind, town,
         "waypoints": south,
         "random": replace(south, route="random", seed=5),
         "traffic": replace(south, traffic=TrafficOptions(vehicles=60, radius=100)),
-        "satellites and sun": replace(south, rig="seed"),
+        "satellites and sun": replace(south, rig=str(town / "seeing.toml")),
     }[kind]
     whole = open_scene(town / "whole")
     found = opened(town, options, tmp_path / "cache")
@@ -195,13 +219,14 @@ def test_a_scene_grows_by_the_tiles_that_another_drive_needs(town, south, tmp_pa
         lambda files: shutil.move(files.folder, files.folder.with_name("scene.new")),
     ],
 )
-def test_damaged_and_half_scenes_of_the_cache_are_built_again(harm, town, south, tmp_path):
-    first = opened(town, south, tmp_path / "cache")
-    shutil.copytree(first.scene.path, tmp_path / "good")
-    harm(first.scene.files)
-    assert opened(town, south, tmp_path / "cache").scene.path == first.scene.path
-    same_files(first.scene.path, tmp_path / "good")
-    assert sorted(p.name for p in first.scene.path.parent.iterdir()) == ["drives", "scene"]
+def test_damaged_and_half_scenes_of_the_cache_are_built_again(harm, town, south, cached, tmp_path):
+    shutil.copytree(cached, tmp_path / "cache")
+    (good,) = cached.glob("*/scene")
+    (copy,) = (tmp_path / "cache").glob("*/scene")
+    harm(open_scene(copy).files)
+    assert opened(town, south, tmp_path / "cache").scene.path == copy
+    same_files(copy, good)
+    assert sorted(p.name for p in copy.parent.iterdir()) == ["drives", "scene"]
 
 
 @pytest.mark.full

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import pytest
-from helpers import DEMO_BOX
 from helpers.programs import run_program
 
 from geoscene.errors import SceneFormatError
@@ -15,14 +14,15 @@ from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 from lidar.traffic.options import TrafficOptions
 
+BOX = (24.9405, 60.1655, 24.9440, 60.1675)
 BUSY = TrafficOptions(vehicles=25.0, cyclists=4.0, pedestrians=40.0, parked=0.7, radius=150.0)
 OPTIONS = DriveOptions(rig="vlp16", duration=0.3, seed=3, formats=("pcd",), traffic=BUSY)
 
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """Scenes of the middle of the demo map by their use."""
-    folder, osm = tmp_path_factory.mktemp("uses"), read_osm(demo_path(), bounds=DEMO_BOX)
+    """Scenes of some blocks of the demo map by their use."""
+    folder, osm = tmp_path_factory.mktemp("uses"), read_osm(demo_path(), bounds=BOX)
     return {
         use: build(osm, folder / use, options=BuildOptions(name="demo", use=use))
         for use in ("all", "lidar", "camera")
