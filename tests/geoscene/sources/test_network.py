@@ -17,7 +17,7 @@ from helpers.extracts import same
 from helpers.programs import run_program
 
 from geoscene.errors import InputError, NetworkError, SourceNotFoundError
-from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, read_osm
+from geoscene.sources import Servers, demo_path, fetch_bbox, fetch_place, fetch_point, network, read_osm
 from geoscene.sources.elements import RELATIONS
 from geoscene.sources.network import _parts, locate
 
@@ -182,6 +182,12 @@ class Handler(BaseHTTPRequestHandler):
 
     def log_message(self, *args: object) -> None:
         """Log nothing."""
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch) -> None:
+    """Ask without the pause that is due to the public server."""
+    monkeypatch.setattr(network, "_NOMINATIM_PAUSE", 0.0)
 
 
 @pytest.fixture(scope="module")
