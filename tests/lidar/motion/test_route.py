@@ -55,16 +55,16 @@ def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
     """Starts are uniform by length on all streets that lead on: also on the spur, from its end."""
     nodes = [(0, 0), (100, 0), (100, 100), (0, 100), (100, 200)]
     graph = road_graph(nodes, [(0, 1), (1, 2), (2, 3), (3, 0), (2, 4)])
-    drives = [random_edges(graph, seed=seed, metres=300.0) for seed in range(2000)]
+    drives = [random_edges(graph, seed=seed, metres=300.0) for seed in range(800)]
     first = np.array([edges[0] for edges, _ in drives])
     start, stop = np.array([ends for _, ends in drives]).T
     into_spur = (graph.tail == 2) & (graph.head == 4)  # without turning round it leads nowhere
     count = np.bincount(first, minlength=len(graph))
     assert count[into_spur].sum() == 0
-    expected = 2000 / np.count_nonzero(~into_spur)
+    expected = 800 / np.count_nonzero(~into_spur)
     assert ((count[~into_spur] - expected) ** 2 / expected).sum() < 30  # chi-square, 8 degrees: p = 0.0002
     quarters = np.histogram(start, bins=4, range=(0, 90))[0]
-    assert ((quarters - 500) ** 2 / 500).sum() < 20
+    assert ((quarters - 200) ** 2 / 200).sum() < 20
     assert stop.min() < 15
     assert stop.max() > 95
     for edges, (begin, end) in drives:
@@ -88,8 +88,8 @@ def test_seeds_that_follow_each_other_start_far_apart(seed):
 
 OTHERS = [
     {"highway": "service"},
-    {"highway": "track"},
-    {"highway": "living_street"},
+    pytest.param({"highway": "track"}, marks=pytest.mark.full),
+    pytest.param({"highway": "living_street"}, marks=pytest.mark.full),
     {"tunnel": True},
     {"width": 1.5},
 ]

@@ -34,12 +34,8 @@ def places(request, tmp_path_factory):
 
 def brute_force(points, corners):
     """Least distances (n,) from points to triangles by trimesh, of all pairs."""
-    best = np.full(len(points), np.inf)
-    for triangle in corners:
-        many = np.broadcast_to(triangle, (len(points), 3, 3))
-        near = trimesh.triangles.closest_point(many, points)
-        best = np.minimum(best, np.linalg.norm(near - points, axis=1))
-    return best
+    near = (trimesh.triangles.closest_point(corners, np.broadcast_to(p, (len(corners), 3))) for p in points)
+    return [np.linalg.norm(n - p, axis=1).min() for n, p in zip(near, points, strict=True)]
 
 
 @settings(deadline=None, max_examples=60)
