@@ -32,6 +32,7 @@ _PRIORITY = -2.0  # below the assumed yards of towns, and all that is mapped
 _SIDE = 110.0  # metres, mean side of a parcel
 _JITTER = 0.38  # of a side, by which the middle of a parcel is moved
 _SEEN = 160.0  # metres from roads and buildings within which there are parcels
+_TOWN = 800.0  # metres of roads within that distance from which on a parcel belongs to a town
 _GARDENS = 45.0  # metres around buildings that are gardens and yards
 _VERGE = 3.0  # metres beside a carriageway that no field reaches
 _BESIDE = 90.0  # metres from mapped land within which a parcel is as that land
@@ -89,6 +90,7 @@ def parcels(
     chosen[near] = True
     homes = shapely.STRtree(kept).query(shapely.points(middle), predicate="dwithin", distance=_GARDENS)[0]
     chosen[homes] = False
+    chosen[chosen] = ~_in_towns(middle[chosen], roads=roads)
     # Parcels on the rim, whose polygons are open to the outside, are further away than any that is seen.
     name = _materials(land, cell, middle=middle, cover=cover)
     rows = np.flatnonzero(chosen & (name != land.open))
@@ -118,6 +120,15 @@ def _cells(seen: NDArray[np.object_]) -> tuple[Ints, Float]:
     cell = np.unique(squares, axis=0)
     draw = uniform_at(cell[:, 0], cell[:, 1], count=2, seed=11)
     return cell, (cell + 0.5 + 2 * _JITTER * (draw.T - 0.5)) * _SIDE
+
+
+def _in_towns(middle: Float, *, roads: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Mask (n,) of places (n, 2) among so many roads as only towns have."""
+    around = shapely.buffer(shapely.points(middle), _SEEN, quad_segs=_ROUND)
+    place, road = shapely.STRtree(roads).query(around, predicate="intersects")
+    length = shapely.length(shapely.intersection(around[place], roads[road]))
+    town: NDArray[np.bool_] = np.bincount(place, length, minlength=len(middle)) > _TOWN
+    return town
 
 
 def _polygons(middle: Float) -> NDArray[np.object_]:

@@ -153,6 +153,17 @@ def path(**tags):
     return Way("way/1", tags, np.array([1, 2]), np.array([[9.0, 50.0], [9.001, 50.0]]))
 
 
+def test_no_fields_lie_among_the_streets_of_a_town_whose_houses_are_not_mapped():
+    grid = [
+        shapely.LineString([start, end])
+        for k in np.arange(0.0, 1001.0, 125.0)
+        for start, end in (((k, 0), (k, 1000)), ((0, k), (1000, k)))
+    ]
+    fields = made(roads=np.array(grid), width=np.full(len(grid), 6.0), houses=NOTHING)
+    inside = shapely.intersection(fields.polygon, shapely.box(200, 200, 800, 800))
+    assert shapely.area(inside).sum() < 0.01 * 600**2
+
+
 def test_dry_grass_has_the_hue_of_its_spectrum():
     """Reflectances at 650, 550 and 450 nm, of dry grass of the JHU spectral library: straw, not yellow."""
     wanted = np.array([0.402, 0.306, 0.206])
