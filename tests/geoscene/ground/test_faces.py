@@ -30,7 +30,7 @@ def of(lines: list[shapely.LineString]) -> GroundFaces:
 
 
 @given(st.lists(outline, max_size=12))
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_faces_are_those_of_the_polygonizer_in_its_order(outlines):
     lines = [shapely.LinearRing(RING), *map(shapely.LineString, outlines)]
     found = of(lines)

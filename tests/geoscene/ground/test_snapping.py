@@ -25,7 +25,7 @@ def pieces_of(pairs):
 
 
 @given(segments)
-@settings(max_examples=150)
+@settings(max_examples=60)
 def test_pieces_are_those_of_geos_where_no_corner_is_touched(pairs):
     # Where a segment touches a pixel's corner, GEOS decides by the rounding errors of its crossings.
     start, end = np.array(pairs).transpose(1, 0, 2)[:, :, None]

@@ -488,7 +488,19 @@ def test_invalid_requests_are_refused_before_they_are_sent(server):
 
 def test_the_program_builds_a_place_and_fetches_it_once(server, tmp_path):
     place = next(iter(name for name, found in PLACES.items() if found))
-    words = ["build", "--place", place, "--cache", tmp_path / "c", "--lod", "0", "--only", "buildings,roads"]
+    words = [
+        "build",
+        "--place",
+        place,
+        "--cache",
+        tmp_path / "c",
+        "--lod",
+        "0",
+        "--only",
+        "buildings,roads",
+        "--workers",
+        "1",
+    ]
     words += ["--nominatim", server.url, "--overpass", f"{server.url}/api", "--json"]
     done = run_program("geoscene", *words, "-o", tmp_path / "a")
     assert done.returncode == 0, done.stderr

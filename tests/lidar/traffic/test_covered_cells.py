@@ -3,7 +3,7 @@
 from collections import defaultdict
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar.traffic.lanes import STEP
@@ -36,6 +36,7 @@ def runs(stations):
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 25),
