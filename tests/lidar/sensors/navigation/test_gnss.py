@@ -120,7 +120,10 @@ def test_a_gauss_markov_process_has_its_variance_and_correlation_time():
     assert np.diff(u, axis=0).std() == pytest.approx(np.sqrt(2 * (1 - np.exp(-dt / tau))), rel=0.02)
 
 
-@pytest.mark.parametrize(("mode", "state"), [("single", "single"), ("sbas", "sbas"), ("rtk", "fixed")])
+@pytest.mark.parametrize(
+    ("mode", "state"),
+    [("single", "single"), pytest.param("sbas", "sbas", marks=pytest.mark.full), ("rtk", "fixed")],
+)
 def test_errors_have_the_deviations_of_the_table(mode, state):
     # one epoch in ten correlation times: practically independent
     table = STATES[state]
