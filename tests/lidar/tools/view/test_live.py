@@ -12,6 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from helpers.drives import small_seed
 from helpers.programs import run_program
 from PIL import Image
 
@@ -20,7 +21,6 @@ from lidar.dataset.recorded import scanner_clouds, still_points
 from lidar.options.drive import DriveOptions
 from lidar.simulation.drive import drive
 
-WORDS = ("--route", "random", "--duration", 0.3, "--seed", 3, "--rig", "seed", "--format", "pcd", "-q")
 ROAD_USERS = ("--traffic", "vehicles=60,parked=0.8,pedestrians=30,cyclists=5")
 
 
@@ -90,19 +90,26 @@ def same_files(one, other):
 
 
 @pytest.fixture(scope="module")
-def plain(scene, tmp_path_factory):
+def short(tmp_path_factory):
+    """Words of a drive of two sweeps of a scanner with small images."""
+    rig = small_seed(tmp_path_factory.mktemp("rig"))
+    return ("--route", "random", "--duration", 0.2, "--seed", 3, "--rig", rig, "--format", "pcd", "-q")
+
+
+@pytest.fixture(scope="module")
+def plain(scene, short, tmp_path_factory):
     """A drive that nobody watches."""
     out = tmp_path_factory.mktemp("plain") / "drive"
-    done = run_program("lidar", "drive", scene.path, *WORDS, *ROAD_USERS, "-o", out)
+    done = run_program("lidar", "drive", scene.path, *short, *ROAD_USERS, "-o", out)
     assert done.returncode == 0, done.stderr
     return out
 
 
 @pytest.mark.usefixtures("viewer")
-def test_what_is_shown_is_what_is_recorded(scene, plain, tmp_path):
+def test_what_is_shown_is_what_is_recorded(scene, short, plain, tmp_path):
     watched = tmp_path / "drive"
     done = run_program(
-        "lidar", "drive", scene.path, *WORDS, *ROAD_USERS, "-o", watched, "--live", tmp_path / "live.rrd"
+        "lidar", "drive", scene.path, *short, *ROAD_USERS, "-o", watched, "--live", tmp_path / "live.rrd"
     )
     assert done.returncode == 0, done.stderr
     assert same_files(watched, plain)
@@ -152,10 +159,10 @@ def test_what_is_shown_is_what_is_recorded(scene, plain, tmp_path):
         ((), "write a file instead"),
     ],
 )
-def test_what_cannot_be_shown_ends_with_a_line_before_the_drive(scene, tmp_path, words, told):
+def test_what_cannot_be_shown_ends_with_a_line_before_the_drive(scene, short, tmp_path, words, told):
     (tmp_path / "taken.rrd").write_bytes(b"")
     run = run_program(
-        "lidar", "drive", scene.path.resolve(), *WORDS, "-o", "out", "--live", *words, cwd=tmp_path
+        "lidar", "drive", scene.path.resolve(), *short, "-o", "out", "--live", *words, cwd=tmp_path
     )
     assert run.returncode in (1, 2)
     assert told in run.stderr
@@ -163,9 +170,9 @@ def test_what_cannot_be_shown_ends_with_a_line_before_the_drive(scene, tmp_path,
     assert [path.name for path in tmp_path.iterdir()] == ["taken.rrd"]
 
 
-def test_without_rerun_the_extra_is_named(scene, tmp_path, monkeypatch):
+def test_without_rerun_the_extra_is_named(scene, short, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    run = run_program("lidar", "drive", scene.path, *WORDS, "-o", tmp_path / "out", "--live")
+    run = run_program("lidar", "drive", scene.path, *short, "-o", tmp_path / "out", "--live")
     assert run.returncode == 2
     assert "geoscene[live]" in run.stderr
     assert not list(tmp_path.iterdir())
@@ -178,19 +185,19 @@ def test_frames_of_a_cluster_are_not_shown(scene, tmp_path):
 
 
 @pytest.mark.usefixtures("viewer")
-def test_a_failed_drive_leaves_no_file(scene, tmp_path, monkeypatch):
+def test_a_failed_drive_leaves_no_file(scene, short, tmp_path, monkeypatch):
     monkeypatch.setattr(Stream, "set_time", lambda *_, **__: (_ for _ in ()).throw(OSError("disk full")))
     run = run_program(
-        "lidar", "drive", scene.path, *WORDS, "-o", tmp_path / "out", "--live", tmp_path / "a.rrd"
+        "lidar", "drive", scene.path, *short, "-o", tmp_path / "out", "--live", tmp_path / "a.rrd"
     )
     assert run.returncode != 0
     assert not list(tmp_path.glob("*.rrd"))
 
 
-def test_rerun_reads_the_file(scene, plain, tmp_path):
+def test_rerun_reads_the_file(scene, short, plain, tmp_path):
     pytest.importorskip("rerun", reason="needs rerun-sdk (extra live), 500 MB")
     watched, file = tmp_path / "drive", tmp_path / "live.rrd"
-    done = run_program("lidar", "drive", scene.path, *WORDS, *ROAD_USERS, "-o", watched, "--live", file)
+    done = run_program("lidar", "drive", scene.path, *short, *ROAD_USERS, "-o", watched, "--live", file)
     assert done.returncode == 0, done.stderr
     assert same_files(watched, plain)
     rerun = [shutil.which("rerun") or sys.executable, *([] if shutil.which("rerun") else ["-m", "rerun_cli"])]
