@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -10,12 +9,14 @@ from cyclopts import Parameter
 
 from geoscene.errors import InputError
 from geoscene.support.console import SEVERAL, WORDS, degrees, whole
-from geoscene.support.option_values import take_values
-from geoscene.support.registry import unknown_name
+from geoscene.support.option_values import check_words, take_values
 from geoscene.uses import MESH, RELIEFS, USES
 
 KINDS = ("buildings", "roads", "landcover", "trees", "furniture", "barriers")
 """Kinds of features that a scene can have besides its ground."""
+
+_ROOFS = ("guess", "flat")
+"""What roofs of unknown shape are."""
 
 Degrees = tuple[float, float, float, float]
 
@@ -86,23 +87,21 @@ class BuildOptions:
         """Validate the options."""
         take_values(self, error=InputError)
         if self.lod not in (0, 1, 2):
-            raise InputError(f"`lod` {self.lod}: 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
-        if self.relief not in RELIEFS:
-            raise InputError(unknown_name("`relief`", self.relief, known=RELIEFS))
-        if self.roofs not in ("guess", "flat"):
-            raise InputError(f"`roofs` {self.roofs}: guess or flat")
-        if self.dem_gaps not in ("error", "nearest"):
-            raise InputError(f"`dem_gaps` {self.dem_gaps}: error or nearest")
+            raise InputError(f"`lod` {self.lod}: give 0 (blocks), 1 (parts, flat roofs) or 2 (roofs)")
+        check_words(
+            self,
+            error=InputError,
+            relief=RELIEFS,
+            roofs=_ROOFS,
+            dem_gaps=("error", "nearest"),
+            only=KINDS,
+            use=USES,
+            driving_side=("", "left", "right"),
+        )
         if self.dem_tolerance is not None and not 0 <= self.dem_tolerance <= 1000:
             raise InputError(f"`dem_tolerance` {self.dem_tolerance:g}: give metres from 0 to 1000")
         if self.dem_tolerance is not None and not self.dem:
             raise InputError("`dem_tolerance`: has no effect without `dem`; leave it out")
-        if unknown := sorted(set(self.only) - set(KINDS)):
-            raise InputError(unknown_name("`only`", unknown[0], known=KINDS))
-        if self.use not in USES:
-            raise InputError(unknown_name("`use`", self.use, known=USES))
-        if self.driving_side not in ("", "left", "right"):
-            raise InputError(f"`driving_side` {self.driving_side}: left or right")
         if not 0 < self.reach < 1e6:
             raise InputError(f"`reach` {self.reach:g}: give metres, more than 0 and less than a million")
         if not 50 <= self.tile_size <= 2000 or self.tile_size != int(self.tile_size):
@@ -141,8 +140,7 @@ class CloudOptions:
     def __post_init__(self) -> None:
         """Validate the options."""
         take_values(self, error=InputError)
-        if self.prefer not in ("cloud", "tags"):
-            raise InputError(f"`prefer` {self.prefer}: cloud or tags")
+        check_words(self, error=InputError, prefer=("cloud", "tags"))
         given = [name for name in _OF_CLOUDS if getattr(self, name)]
         if given and not self.cloud:
             raise InputError(f"`{given[0]}`: has no effect without `cloud`; leave it out")
@@ -194,7 +192,7 @@ class ViewOptions:
         """Validate the options."""
         take_values(self, error=InputError)
         if not self.max_mb > 0:
-            raise InputError(f"`max_mb` {self.max_mb:g}: must be more than 0")
+            raise InputError(f"`max_mb` {self.max_mb:g}: give megabytes above 0")
 
 
 @Parameter(name="*")
@@ -237,9 +235,6 @@ class ExportOptions:
     def __post_init__(self) -> None:
         """Validate the options."""
         take_values(self, error=InputError)
-        if self.size_limit is not None and not 0 < self.size_limit < math.inf:
+        if self.size_limit is not None and not self.size_limit > 0:
             raise InputError(f"`size_limit` {self.size_limit:g}: give megabytes above 0")
-        if self.roofs not in (None, "guess", "flat"):
-            raise InputError(f"`roofs` {self.roofs}: guess or flat")
-        if self.relief not in (None, MESH):
-            raise InputError(f"`relief` {self.relief}: give {MESH}, or leave it out for plane walls")
+        check_words(self, error=InputError, roofs=_ROOFS, relief=(MESH,))

@@ -21,6 +21,7 @@ from geoscene.support.console import (
     command_line,
     degrees,
     note_new_folder,
+    number,
     print_json,
     whole,
 )
@@ -50,7 +51,7 @@ class MapSource:
     point: Annotated[tuple[float, float] | None, degrees("LAT,LON")] = None
     """LAT,LON in degrees, with --radius; downloaded from Overpass."""
 
-    radius: float = 500.0
+    radius: Annotated[float, Parameter(converter=number)] = 500.0
     """Metres around --point."""
 
     demo: bool = False

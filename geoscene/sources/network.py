@@ -32,6 +32,7 @@ from geoscene.support.urls import without_secrets
 _SMALLEST = 400.0  # metres: smallest side of the box of a place
 _NOMINATIM_PAUSE = 1.0  # seconds before each request; the public server allows one per second
 _CACHE_VERSION = 1
+_WIDEST = 1e6  # metres around a point
 
 BUSY = frozenset({429, 502, 503, 504})
 """HTTP statuses of a server that may answer the same request later."""
@@ -74,7 +75,7 @@ def check_address(url: str) -> None:
     """Raise InputError for an address that is not of the web."""
     if not re.match(r"https?://[^/?#]", url, re.IGNORECASE):
         known = without_secrets(url.rpartition("@")[2])
-        raise InputError(f"address of a server {known!r}: give one that begins with https:// or http://")
+        raise InputError(f"{known}: give the address of a server, which begins with https:// or http://")
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,8 +356,8 @@ def fetch_point(
     """
     if not (math.isfinite(lat) and math.isfinite(lon) and abs(lat) < 90 and abs(lon) <= 180):
         raise InputError(f"point {lat:g},{lon:g}: give latitude, longitude in degrees, in this order")
-    if not (math.isfinite(radius) and radius > 0):
-        raise InputError(f"radius {radius:g}: give metres, more than 0")
+    if not 0 < radius < _WIDEST:
+        raise InputError(f"`radius` {radius:g}: give metres, more than 0 and less than {_WIDEST:g}")
     bounds = checked_bounds(_around(lon, lat, half_width=radius, half_height=radius))
     source = f"OpenStreetMap, {radius:g} m around {lat:g},{lon:g}"
     answers = Answers(cache_dir, refresh)

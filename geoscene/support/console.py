@@ -7,21 +7,32 @@ import errno
 import gc
 import json
 import logging
+import math
 import os
 import re
 import shlex
 import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, get_args, get_origin
 
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import (
+    App,
+    ArgumentCollection,
+    CoercionError,
+    CycloptsError,
+    Parameter,
+    RepeatArgumentError,
+    Token,
+)
 
 from geoscene.errors import DamagedFileError, InputError
+from geoscene.support.option_values import words_of
+from geoscene.support.registry import unknown_name
 from geoscene.support.storage import url_of
 from geoscene.support.urls import without_secrets
 
@@ -71,6 +82,15 @@ def guard_numbers(words: Sequence[str]) -> list[str]:
     return [f" {word}" if _NUMBERS.fullmatch(word) else word for word in words]
 
 
+def check_given(words: Sequence[str]) -> None:
+    """Raise InputError for an empty value, as of a variable of a script that is not set."""
+    for before, word in zip(("", *words), words, strict=False):
+        flag, equals, value = word.partition("=") if word.startswith("--") else (before, "=", word)
+        if equals and not value.strip():
+            name = f"{flag} " if flag.startswith("-") else ""
+            raise InputError(f"{name}{value!r}: is empty; give a value, or leave it out")
+
+
 SEVERAL = Parameter(consume_multiple=True)
 """Parameter of an option that takes all values up to the next option."""
 
@@ -102,7 +122,7 @@ class Report:
 
 
 def _words(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
-    return tuple(word for word in tokens[0].value.lower().split(",") if word)
+    return tuple(word for token in tokens for word in words_of(token.value))
 
 
 WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
@@ -111,20 +131,45 @@ WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
 
 def degrees(names: str) -> Parameter:
     """Parameter of an option that takes comma-separated degrees: LAT,LON, or W,S,E,N as they are given."""
+    count = names.count(",") + 1
+    read = numbers(count, f"{count} numbers in degrees as {names}")
 
-    def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
-        text, count = tokens[0].value.strip(), names.count(",") + 1
-        try:
-            values = tuple(float(v) for v in text.split(","))
-        except ValueError:
-            values = ()
-        if len(values) != count:
-            raise ValueError(f"{text}: give {count} numbers in degrees as {names}")
+    def convert(kind: object, tokens: Sequence[Token]) -> tuple[float, ...]:
+        values = read(kind, tokens)
         if names == "LAT,LON" and not (abs(values[0]) <= 90 and abs(values[1]) <= 180):
-            raise ValueError(f"{text}: not a latitude and longitude in degrees")
+            raise ValueError("give a latitude and a longitude in degrees")
         return values
 
     return Parameter(converter=convert, n_tokens=1, metavar=names)
+
+
+def numbers(count: int, wanted: str) -> Callable[[object, Sequence[Token]], tuple[float, ...]]:
+    """Converter of options that take finite numbers separated by commas.
+
+    wanted : what to give, for messages
+    """
+
+    def convert(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
+        values: tuple[float, ...] = ()
+        with suppress(ValueError):
+            values = tuple(float(word) for word in only_value(tokens).split(","))
+        if len(values) != count or not all(map(math.isfinite, values)):
+            raise ValueError(f"give {wanted}")
+        return values
+
+    return convert
+
+
+def number(kind: object, tokens: Sequence[Token]) -> float:
+    """Converter of options that take a finite number."""
+    return numbers(1, "a number")(kind, tokens)[0]
+
+
+def only_value(tokens: Sequence[Token]) -> str:
+    """The value of an option that is given once; raises ValueError if it is repeated."""
+    if len(tokens) > 1:
+        raise ValueError("is given twice; give it once")
+    return tokens[0].value
 
 
 def whole(_: object, tokens: Sequence[Token]) -> int:
@@ -161,16 +206,17 @@ def main(
     )  # it names the page with the progress
     try:
         with _ended_by_interruptions(app):
+            check_given(sys.argv[1:])
             words = guard_numbers(sys.argv[1:])
             code = app(words, result_action="return_value", exit_on_error=False, print_error=False)
             sys.stdout.flush()
     except CycloptsError as error:
         flag = next((word for word in sys.argv[1:] if word in removed), "")
-        message = f"{flag} is removed: {removed[flag]}" if flag else _in_plain_words(str(error).rstrip("."))
+        message = f"{flag} is removed: {removed[flag]}" if flag else _usage_text(error)
         _print_error(app, f"{message}; see {app.name[0]} {_command(app)}--help")
         sys.exit(USAGE)
     except roots as error:
-        _print_error(app, error)
+        _print_error(app, _with_option(app, with_flags(app, str(error))))
         failed = isinstance(error, DamagedFileError) or not isinstance(error, usage)
         sys.exit(FAILURE if failed else USAGE)
     except BrokenPipeError:  # the reader of standard output has ended, as in "| head"
@@ -187,22 +233,30 @@ def main(
         # Files are first written as <name>.<process>.part; the message names the final file.
         name = _TEMPORARY.sub("", str(error.filename or "the system"))
         hint = _HINTS.get(error.errno or 0, "")
-        _print_error(app, f"{name}: {error.strerror or error}{hint}")
+        _print_error(app, _with_option(app, f"{name}: {error.strerror or error}{hint}"))
         sys.exit(FAILURE)
     sys.exit(code if isinstance(code, int) else DONE)
 
 
-_WANTED = {"float": "give a number", "int": "give a whole number", "bool": "give true or false"}
-"""What is allowed where the parser names a type of Python."""
+_WANTED: dict[Any, str] = {float: "give a number", int: "give a whole number", bool: "give true or false"}
+"""What may be given for a type of Python."""
 
 
-def _in_plain_words(message: str) -> str:
-    """A message of the parser without names of Python's types."""
-    return re.sub(
-        rf'unable to convert "(.*)" into ({"|".join(_WANTED)})\b',
-        lambda found: f'"{found[1]}": {_WANTED[found[2]]}',
-        message,
-    )
+def _usage_text(error: CycloptsError) -> str:
+    """A message of the parser; of a value: the option, the value and what to give."""
+    if isinstance(error, RepeatArgumentError):
+        return f"{error.token.keyword} {error.token.value}: is given twice; give it once"
+    if not isinstance(error, CoercionError) or error.argument is None:
+        return str(error).rstrip(".")
+    tokens = [error.token] if error.token else error.argument.tokens
+    name = tokens[0].keyword or error.argument.name.lstrip("-").upper()
+    values = [token.value.strip() for token in tokens]
+    kind = error.target_type
+    if get_origin(kind) is Literal:
+        return unknown_name(name, values[0], known=get_args(kind))
+    why = str(error.msg or next(_WANTED[one] for one in (kind, *get_args(kind)) if one in _WANTED))
+    value = next((value for value in values if why.startswith(f"{value}: ")), " ".join(values))
+    return f"{name} {value}: {why.removeprefix(f'{value}: ')}"
 
 
 def _open_streams() -> None:
@@ -299,15 +353,45 @@ def with_flags(app: App, text: str) -> str:
 
     Parameters that the command does not have keep their name.
     """
-    flags = {}
-    if "`" in text and (words := app.parse_commands(sys.argv[1:])[0]):
-        command = app
-        for word in words:
-            command = command[word]
-        if command.default_command is not None:  # not a group of commands
-            arguments = command.assemble_argument_collection()
-            flags = {argument.field_info.name: argument.name for argument in arguments}
+    flags = {argument.field_info.name: argument.name for argument in _arguments(app)} if "`" in text else {}
     return re.sub(r"`(\w+)`", lambda found: flags.get(found[1], found[1]), text)
+
+
+def _with_option(app: App, text: str) -> str:
+    """A library message about the value of an option that does not name it, with the flag before it.
+
+    The value is at the beginning, as of a file, or in quotes. Outputs stay without: what is written is known.
+    """
+    takes = {
+        name: bool(argument.parameter.consume_multiple)
+        for argument in _arguments(app)
+        if argument.hint is not bool and "--out" not in argument.names
+        for name in argument.names
+    }
+    flag, subject = "", text.partition(": ")[0]
+    for word in sys.argv[1:]:
+        name, equals, value = word.partition("=")
+        if name in takes:
+            flag = name
+        elif word.startswith("-") and not _NUMBERS.fullmatch(word):
+            flag = ""
+        given = value if name in takes else word
+        parts = {given, *re.split("[=,]", given)}
+        if flag and subject in parts:
+            return f"{flag} {text}"
+        if flag and flag not in text and any(part and repr(part) in text for part in parts):
+            return f"{flag}: {text}"
+        if flag and (equals or name not in takes) and not takes[flag]:
+            flag = ""
+    return text
+
+
+def _arguments(app: App) -> ArgumentCollection | Sequence[Any]:
+    """Parameters of the command that the program is called with; none of a group of commands."""
+    words, command = app.parse_commands(sys.argv[1:])[0], app
+    for word in words:
+        command = command[word]
+    return command.assemble_argument_collection() if words and command.default_command is not None else ()
 
 
 def _print_error(app: App, message: object) -> None:

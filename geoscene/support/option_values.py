@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import os
 import types
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from dataclasses import fields
 from functools import lru_cache
 from numbers import Integral, Real
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Union, cast, get_args, get_origin, get_type_hints
+
+from geoscene.support.registry import unknown_name
 
 Reader = Callable[[Any], Any]
 """Returns the value of an option for what is given; raises ValueError, which says what may be given."""
@@ -44,6 +47,26 @@ def expect(value: object, kind: type[Any], *, name: str, error: type[Exception])
     """Raise an error, which names the parameter, unless a value is of a class."""
     if not isinstance(value, kind):
         raise error(f"`{name}` {brief(value)}: give a {kind.__name__}")
+
+
+def words_of(text: str) -> tuple[str, ...]:
+    """Words of a text that are separated by commas, in lower case; raises ValueError for an empty one."""
+    words = tuple(word.strip().lower() for word in text.split(","))
+    if not all(words):
+        raise ValueError("has an empty part; give words separated by single commas")
+    return words
+
+
+def check_words(options: object, *, error: type[Exception], **known: Collection[str]) -> None:
+    """Raise an error if an option, or a word of it, is not among the known words by its name.
+
+    error : is raised; None is valid, and so is an empty text among the words, which messages do not list
+    """
+    for name, words in known.items():
+        value = getattr(options, name)
+        for word in (value,) if isinstance(value, str) else value or ():
+            if word not in words:
+                raise error(unknown_name(f"`{name}`", word, known=[one for one in words if one]))
 
 
 def listed(value: object) -> tuple[Any, ...]:
@@ -93,7 +116,7 @@ def _several(value: Any, kinds: tuple[Any, ...], *, split: bool) -> tuple[Any, .
         if kinds[0] not in (str, Path):
             raise ValueError("give a list of numbers, not a text")
         text = os.fspath(value)
-        value = [word.strip() for word in text.split(",") if word.strip()] if split else [text]
+        value = [text] if not split else words_of(text) if text.strip() else ()
     found = listed(value)
     if not endless and len(found) != len(kinds):
         raise ValueError(f"give {len(kinds)} values")
@@ -110,9 +133,11 @@ def _whole(value: Any) -> int:
 
 
 def _number(value: Any) -> float:
-    if type(value) is not bool and isinstance(value, Real):
-        return float(value)
-    raise ValueError("give a number")
+    if type(value) is bool or not isinstance(value, Real):
+        raise ValueError("give a number")
+    if not math.isfinite(value):
+        raise ValueError("give a finite number")
+    return float(value)
 
 
 def _switch(value: Any) -> bool:

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from geoscene.support.console import Report, note_new_folder, with_flags
+from geoscene.support.console import Report, note_new_folder, whole, with_flags
 from geoscene.support.progress import progress_bar
 from lidar.cli.program import JsonFlag, Out, QuietFlag, Reporting, app, show
 from lidar.errors import InputError
@@ -65,7 +65,7 @@ def view(
     out: Annotated[Path | None, Parameter(name=["--out", "-o"], group=OUTPUT)] = None,
     options: PlaybackOptions = PlaybackOptions(),
     serve: bool = False,
-    port: int = 8765,
+    port: Annotated[int | None, Parameter(converter=whole)] = None,
     open3d: bool = False,
     report: Reporting = Report(),
 ) -> int:
@@ -92,7 +92,7 @@ def view(
     serve
         Write no file; serve the player at 127.0.0.1 until interrupted, for drives of any length.
     port
-        Port of the server; 0 for a free one.
+        Port of the server, 8765 by default; 0 for a free one.
     open3d
         Write no file; open the first frame, or a file of points, in a window of Open3D (extra open3d).
     """
@@ -101,13 +101,15 @@ def view(
 
     if (out is not None) + serve + open3d != 1:
         raise InputError("give one of `out`, `serve` and `open3d`")
+    if port is not None and not serve:
+        raise InputError(f"`port` {port}: has no effect without `serve`; leave it out")
     if open3d:
         from lidar.tools.view.live import show_window  # noqa: PLC0415
 
         show_window(dataset, options=options)
         return 0
     if serve:
-        return _serve(dataset, options, port=port)
+        return _serve(dataset, options, port=_PORT if port is None else port)
     assert out is not None  # noqa: S101
     note_new_folder(out)
     with progress_bar(quiet=report.quiet) as progress:
@@ -119,6 +121,10 @@ def view(
     notes = [f"  {with_flags(app, note)}" for note in summary.notes]
     document = {**asdict(summary), "path": str(out)}
     return show(document, "\n".join([f"{out}: {figures}", *notes]), json=report.json)
+
+
+_PORT = 8765
+"""Port of the player's server by default."""
 
 
 def _serve(dataset: Path, options: PlaybackOptions, *, port: int) -> int:

@@ -13,6 +13,7 @@ from geoscene.support.console import (
     Report,
     command_line,
     note_new_folder,
+    number,
     whole,
 )
 from geoscene.support.progress import progress_bar
@@ -195,8 +196,8 @@ def verify(
     /,
     *,
     options: SignOptions = SignOptions(),
-    noise: float = 0.001,
-    false_alarms: float = 0.01,
+    noise: Annotated[float, Parameter(converter=number)] = 0.001,
+    false_alarms: Annotated[float, Parameter(converter=number)] = 0.01,
     json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> int:

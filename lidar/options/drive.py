@@ -63,7 +63,7 @@ def _route(_: object, tokens: Sequence[Token]) -> str | Path | list[tuple[float,
     if len(words) == 1 and points[0] is None:
         return Path(words[0])
     if len(points) < 2 or any(p is None for p in points):
-        raise ValueError(f"{' '.join(words)}: random, a file, or two or more LAT,LON")
+        raise ValueError("give random, a file, or two or more LAT,LON")
     return [p for p in points if p is not None]
 
 
@@ -73,7 +73,7 @@ def _waypoint(word: str) -> tuple[float, float] | None:
     except ValueError:
         return None
     if not (abs(lat) <= 90 and abs(lon) <= 180):
-        raise ValueError(f"{word}: not a latitude and longitude in degrees")
+        raise ValueError(f"{word} is not a latitude and longitude in degrees")
     return lat, lon
 
 
@@ -84,14 +84,12 @@ def _time(_: object, tokens: Sequence[Token]) -> datetime:
 def read_time(text: str) -> datetime:
     """The time of an ISO 8601 text, UTC unless it states a zone; raises ValueError for others."""
     if re.search(r":\d\d:60", text):
-        raise ValueError(
-            f"{text}: a drive cannot start within a leap second; give the second before or after"
-        )
+        raise ValueError("a drive cannot start within a leap second; give the second before or after")
     try:
         when = datetime.fromisoformat(text)
         return when.replace(tzinfo=UTC) if when.tzinfo is None else when.astimezone(UTC)
     except (ValueError, OverflowError):
-        raise ValueError(f"{text}: not an ISO 8601 time such as 2026-06-21T08:00:00") from None
+        raise ValueError("give an ISO 8601 time such as 2026-06-21T08:00:00") from None
 
 
 def _traffic(_: object, tokens: Sequence[Token]) -> Any:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from cyclopts import Parameter, Token
 
-from geoscene.support.console import SEVERAL
+from geoscene.support.console import SEVERAL, only_value, whole
 from geoscene.support.option_values import take_values
 from lidar.errors import InputError
 from lidar.options.shared import check_positive, check_words, lower
@@ -26,9 +26,9 @@ FILM_COLORS = ("class", "height", "intensity", "time", "origin")
 
 
 def _pixels(_: object, tokens: Sequence[Token]) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", tokens[0].value.strip().lower())
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", only_value(tokens).strip().lower())
     if not found:
-        raise ValueError(f"{tokens[0].value}: give WIDTHxHEIGHT in pixels, such as 1280x720")
+        raise ValueError("give WIDTHxHEIGHT in pixels, such as 1280x720")
     return int(found[1]), int(found[2])
 
 
@@ -63,7 +63,7 @@ class PlaybackOptions(_OfFrames):
     """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
     default."""
 
-    every: int | None = None
+    every: Annotated[int | None, Parameter(converter=whole)] = None
     """Show each n-th of these frames only; by default all, or as many as fit `max_mb`."""
 
     max_mb: Annotated[float, Parameter(name="--max-size")] = 40.0
@@ -122,7 +122,7 @@ class FilmOptions(_OfFrames):
     """FIRST:END: frames from FIRST up to, not including, END, either of which may be left out; all by
     default. They are of the first scanner, or of the first camera in films of cameras only."""
 
-    every: int = 1
+    every: Annotated[int, Parameter(converter=whole)] = 1
     """Show each n-th of these frames only."""
 
     speed: float = 1.0

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,7 +12,7 @@ from cyclopts import Parameter, Token
 
 from geoscene.classes import Class
 from geoscene.options import Degrees
-from geoscene.support.console import SEVERAL, WORDS, degrees, whole
+from geoscene.support.console import SEVERAL, WORDS, degrees, numbers, only_value, whole
 from geoscene.support.option_values import take_values
 from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
@@ -40,22 +40,14 @@ ECHOES = ("all", "first", "last", "single")
 """Echoes of a pulse that a map can be made of."""
 
 
-def _span(_: object, tokens: Sequence[Token]) -> tuple[float, float]:
-    text = tokens[0].value.strip()
-    try:
-        first, last = (float(word) for word in text.split(","))
-    except ValueError:
-        raise ValueError(f"{text}: give two numbers of seconds as FROM,TO") from None
-    return first, last
+_SPAN = numbers(2, "two numbers of seconds as FROM,TO")
 
 
 def _outliers(_: object, tokens: Sequence[Token]) -> tuple[int, float]:
-    text = tokens[0].value.strip()
-    try:
-        neighbours, factor = text.split(",")
+    with suppress(ValueError):
+        neighbours, factor = only_value(tokens).split(",")
         return int(neighbours), float(factor)
-    except ValueError:
-        raise ValueError(f"{text}: give a number of neighbours and a factor, such as 16,2") from None
+    raise ValueError("give a number of neighbours and a factor, once, such as 16,2")
 
 
 @Parameter(name="*")
@@ -92,7 +84,7 @@ class MapOptions:
     polygon: Path | None = None
     """Use returns in the polygons of this GeoJSON file only; with --bbox, in both."""
 
-    time: Annotated[tuple[float, float] | None, Parameter(converter=_span, n_tokens=1, metavar="FROM,TO")] = (
+    time: Annotated[tuple[float, float] | None, Parameter(converter=_SPAN, n_tokens=1, metavar="FROM,TO")] = (
         None
     )
     """Use returns of this time only: seconds since the drive's start, the end excluded."""
@@ -140,7 +132,7 @@ class MapOptions:
         check_positive(self, voxel=" of metres", resolution=" of metres")
         if self.outliers is not None:
             neighbours, factor = self.outliers
-            if not (1 <= neighbours <= MOST_NEIGHBOURS and 0 <= factor < math.inf):
+            if not (1 <= neighbours <= MOST_NEIGHBOURS and factor >= 0):
                 raise InputError(
                     f"`outliers` {neighbours},{factor:g}: give 1 to {MOST_NEIGHBOURS} neighbours and a"
                     " factor of 0 or more"

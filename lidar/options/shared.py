@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from cyclopts import Group, Parameter, Token
 
+from geoscene.support import option_values
 from geoscene.support.option_values import listed
-from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
 from lidar.parameters import split_pairs, value_text
 
 OUTPUT = Group("Output", sort_key=3)
 
 
-def check_words(options: object, **known: Collection[str]) -> None:
-    """Raise InputError if an option, or a word of it, is not among the known words by its name."""
-    for name, words in known.items():
-        value = getattr(options, name)
-        for word in (value,) if isinstance(value, str) else value:
-            if word not in words:
-                raise InputError(unknown_name(f"`{name}`", word, known=[one for one in words if one]))
+check_words = partial(option_values.check_words, error=InputError)
+"""Raise InputError if an option, or a word of it, is not among the known words by its name."""
 
 
 def check_whole(options: object, **bounds: tuple[int, int]) -> None:
@@ -33,10 +28,10 @@ def check_whole(options: object, **bounds: tuple[int, int]) -> None:
 
 
 def check_positive(options: object, **units: str) -> None:
-    """Raise InputError if an option that is given is not positive and finite; ``units`` follow "number"."""
+    """Raise InputError if an option that is given is not positive; ``units`` follow "number"."""
     for name, unit in units.items():
         value = getattr(options, name)
-        if value is not None and not 0 < value < math.inf:
+        if value is not None and not value > 0:
             raise InputError(f"`{name}` {value:g}: give a positive number{unit}")
 
 

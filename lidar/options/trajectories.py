@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter, Token
+from cyclopts import Parameter
 
-from geoscene.support.console import SEVERAL, WORDS
+from geoscene.support.console import SEVERAL, WORDS, numbers
 from geoscene.support.option_values import take_values
 from lidar.errors import InputError
 from lidar.options.shared import SETTINGS, check_words, lower, taken_settings
@@ -25,13 +22,7 @@ ALIGNMENTS = ("none", "origin", "se3", "sim3", "yaw-position")
 """Motions of an estimated trajectory onto the true one."""
 
 
-def _six(_: object, tokens: Sequence[Token]) -> tuple[float, ...]:
-    text = tokens[0].value.strip()
-    with suppress(ValueError):
-        values = tuple(float(word) for word in text.split(","))
-        if len(values) == 6 and all(map(math.isfinite, values)):
-            return values
-    raise ValueError(f"{text}: give six numbers, three of metres and three of degrees")
+_POSE = numbers(6, "six numbers, three of metres and three of degrees")
 
 
 @Parameter(name="*")
@@ -57,7 +48,7 @@ class OdometryOptions:
     of the drive's rig."""
 
     start_pose: Annotated[
-        tuple[float, ...] | None, Parameter(converter=_six, n_tokens=1, metavar="X,Y,Z,ROLL,PITCH,YAW")
+        tuple[float, ...] | None, Parameter(converter=_POSE, n_tokens=1, metavar="X,Y,Z,ROLL,PITCH,YAW")
     ] = None
     """Where the vehicle begins: scene metres, and degrees as alpha, beta and gamma of poses.csv. By default
     poses are relative to the first."""
@@ -113,7 +104,7 @@ class EvaluateOptions:
         """Validate the options."""
         take_values(self, error=InputError)
         check_words(self, align=ALIGNMENTS, associate=("interpolated", "nearest"))
-        if self.max_gap is not None and not 0 <= self.max_gap < math.inf:
+        if self.max_gap is not None and self.max_gap < 0:
             raise InputError(f"`max_gap` {self.max_gap:g}: give seconds, 0 or more")
         for word in self.delta:
             if not re.fullmatch(r"[1-9]\d{0,8}f|\d{1,9}(\.\d+)?m", word) or not float(word[:-1]):

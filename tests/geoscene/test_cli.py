@@ -77,7 +77,11 @@ def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
         ("geoscene", ["build", "--demo", "--dem", "nowhere.tif", "-o", "x"], "nowhere.tif"),
         ("geoscene", ["build", "--demo", "--dem-server", "http://x/", "-o", "x"], "--dem tiles"),
         ("geoscene", ["build", "--demo", "--reach", "nan", "-o", "x"], "--reach nan"),
-        ("geoscene", ["build", "--point", "1,2", "--radius", "nan", "-o", "x"], "radius nan"),
+        (
+            "geoscene",
+            ["build", "--point", "1,2", "--radius", "nan", "-o", "x"],
+            "--radius nan: give a number",
+        ),
         ("geoscene", ["build", "--demo", "--along", "nan,nan", "nan,nan", "-o", "x"], "--along nan,nan"),
         ("geoscene", ["info", "nowhere"], "nowhere"),
         ("geoscene", ["validate", "nowhere"], "nowhere"),

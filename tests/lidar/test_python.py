@@ -94,7 +94,7 @@ def test_options_take_what_the_command_line_takes(name, given, taken):
         ("settings", 3, "`settings` 3: give a list"),
         ("settings", [1], r"`settings` \[1\]: give NAME=VALUE"),
         ("start", 3, "`start` 3: give a datetime"),
-        ("start", "noon", "`start` 'noon': noon: not an ISO 8601 time"),
+        ("start", "noon", "`start` 'noon': give an ISO 8601 time"),
     ],
 )
 def test_an_unusable_value_is_named_with_what_is_allowed(name, given, words):

@@ -226,7 +226,7 @@ class DriveServer(ThreadingHTTPServer):
     Answers only requests that name this host, so that pages of other sites cannot read the drive through a
     host name of theirs that leads here.
 
-    Raises InputError for a port that is taken, and as `Drive`.
+    Raises InputError for a port that is taken or none, and as `Drive`.
     """
 
     daemon_threads = True
@@ -234,6 +234,8 @@ class DriveServer(ThreadingHTTPServer):
     def __init__(
         self, dataset: Dataset, *, options: PlaybackOptions = PlaybackOptions(), port: int = 0
     ) -> None:
+        if not 0 <= port < 1 << 16:
+            raise InputError(f"`port` {port}: give 0 to 65535")
         self.drive = Drive(dataset, options)
         self.page = served_page(self.drive)
         self.sweep = lru_cache(_KEPT)(lambda scanner, k: self.drive.sweep(k, scanner=scanner))

@@ -234,7 +234,7 @@ def test_scenes_with_flat_roofs_on_request(tmp_path):
     osm = town(GERMANY, scattered(6), height="8")
     scene = build(osm, tmp_path / "scene", options=BuildOptions(roofs="flat"))
     assert set(scene.features("buildings").columns["roof_shape"]) == {"flat"}
-    with pytest.raises(InputError, match="guess or flat"):
+    with pytest.raises(InputError, match="known are guess, flat"):
         BuildOptions(roofs="thatched")
-    with pytest.raises(InputError, match="guess or flat"):
+    with pytest.raises(InputError, match="known are guess, flat"):
         ExportOptions(roofs="thatched")

@@ -92,7 +92,7 @@ def test_scene_and_drive_use_the_same_driving_side(given, tmp_path):
 
 
 def test_unknown_driving_side_is_refused():
-    with pytest.raises(InputError, match="`driving_side` middle: left or right"):
+    with pytest.raises(InputError, match="`driving_side` 'middle' is unknown"):
         BuildOptions(driving_side="middle")
 
 

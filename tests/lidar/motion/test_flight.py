@@ -112,7 +112,7 @@ def test_every_built_in_vehicle_loads_and_an_error_lists_every_fault(tmp_path):
     # the wheels turn about a point on the line of the rear axle (Ackermann); turning circle, wheelbase, track
     radius = np.sqrt((11.4 / 2) ** 2 - 2.71**2) - 1.55 / 2
     assert load_vehicle("car").turning_radius == pytest.approx(radius, abs=0.01)
-    with pytest.raises(InputError, match="unknown vehicle tank"):
+    with pytest.raises(InputError, match="vehicle 'tank' is unknown"):
         load_vehicle("tank")
     path = tmp_path / "mine.toml"
     path.write_text('name = "mine"\nkind = "boat"\nlength = -1\nwings = 2\nsteering = "soft"\n')
