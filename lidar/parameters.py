@@ -230,7 +230,10 @@ def split_items(text: str, names: Collection[str], *, main: str = "", default: s
     """
     items: list[Item] = []
     key = ""
-    for part in filter(None, map(str.strip, text.split(","))):
+    parts = list(map(str.strip, text.split(",")))
+    if not all(parts):
+        raise InputError(f"{text!r}: has an empty part; {_FORM}")
+    for part in parts:
         left, equals, value = (word.strip() for word in part.partition("="))
         head, colon, parameter = (word.strip() for word in left.rpartition(":"))
         if equals and colon:
@@ -254,8 +257,6 @@ def split_items(text: str, names: Collection[str], *, main: str = "", default: s
             items[-1].values[key] += f",{part}"
             continue
         _put(items[-1], key, value=value, text=text)
-    if not items:
-        raise InputError(f"{text!r}: {_FORM}")
     return items
 
 

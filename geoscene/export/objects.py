@@ -144,7 +144,7 @@ def parts(
     found = layers is None
     known = [*scene.layers, BARE]
     if unknown := sorted(set(layers or ()) - set(known)):
-        raise InputError(f"no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
+        raise InputError(f"`layers`: no layer {', '.join(unknown)}; this scene has {', '.join(known)}")
     spans = scene.tile_spans.tolist()
     for done, ((i, j), span) in enumerate(zip(scene.tile_indices, spans, strict=True)):
         progress(stage, done, total=len(spans))

@@ -242,7 +242,7 @@ def chosen_layers(scene: Scene, layers: Collection[str] | None, *, others: Colle
         return [*known, *others]
     if unknown := sorted(set(layers) - {*scene.layers, *others}):
         names = ", ".join([*scene.layers, *others])
-        raise InputError(f"no layer {', '.join(unknown)}; this scene has {names}")
+        raise InputError(f"`layers`: no layer {', '.join(unknown)}; this scene has {names}")
     chosen = [name for name in [*known, *others] if name in layers]
     if not chosen:
         raise InputError(f"`layers` {', '.join(layers)}: no features in this scene")

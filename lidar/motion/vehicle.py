@@ -13,6 +13,7 @@ from typing import Any, TypeGuard, cast
 
 import numpy as np
 
+from geoscene.support.registry import unknown_name
 from lidar.errors import InputError
 from lidar.toml_table import read_table
 
@@ -104,7 +105,8 @@ def load_vehicle(name: str | Path) -> Vehicle:
     elif str(name) in vehicle_names():
         file = resources.files("lidar.motion").joinpath("vehicles", f"{name}.toml")
     else:
-        raise InputError(f"unknown vehicle {name}; give a .toml file or one of {', '.join(vehicle_names())}")
+        remedy = f"give a .toml file or one of {', '.join(vehicle_names())}"
+        raise InputError(unknown_name("vehicle", str(name), known=vehicle_names(), remedy=remedy))
     return _check(read_table(file).data, str(name))
 
 

@@ -69,7 +69,7 @@ def read_track(path: Path, frame: Frame) -> RecordedTrack:
     """
     if not path.exists():
         raise RouteError(
-            f"{path} does not exist; a route is random, a GPX or GeoJSON file, or LAT,LON LAT,LON ..."
+            f"{path}: does not exist; give random, a GPX or GeoJSON file, or LAT,LON LAT,LON ..."
         )
     points = read_points(path)
     if len(points) < 2:

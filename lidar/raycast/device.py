@@ -27,7 +27,7 @@ def name_fault(name: str) -> str:
     """Description of an invalid device name; empty for a valid one."""
     if name in (CPU, WARP_CPU) or re.fullmatch(_CUDA, name):
         return ""
-    return f"device={name}: choose one of {DEVICES}"
+    return f"device {name!r}: choose one of {DEVICES}"
 
 
 def check_device(name: str) -> None:

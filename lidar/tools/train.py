@@ -107,9 +107,17 @@ def train(
     trees : of the forest
     every : of how many frames one is used; those that follow each other are nearly the same
 
-    Raises InputError if there are no road users, or too few vehicles, and MissingExtraError without
-    scikit-learn.
+    Raises InputError for numbers out of their bounds, and if there are no road users, or too few vehicles;
+    MissingExtraError without scikit-learn.
     """
+    for name, value, low, high in (
+        ("seed", seed, 0, (1 << 32) - 1),  # as scikit-learn takes it
+        ("trees", trees, 1, 10_000),
+        ("every", every, 1, 1_000_000),
+        ("workers", workers, 1, 256),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"`{name}` {value}: give {low} to {high}")
     need("sklearn", "learn")
     opened = opened_datasets(datasets)
     jobs = _jobs(opened, every=every)

@@ -286,8 +286,8 @@ def match_poses(estimate: Path3D, truth: Path3D, *, how: str, gap_s: float | Non
     if len(pairs) < 2:
         spans = (f"{p.time_ns[0] / 1e9:.3f} to {p.time_ns[-1] / 1e9:.3f}" for p in (estimate, truth))
         raise InputError(
-            f"{len(pairs)} poses at common times: those of the estimate are {', of the truth '.join(spans)}"
-            " (seconds since 1970)"
+            f"{len(pairs)} poses at common times with a `max_gap` of {gap_ns / 1e9:g} s: those of the"
+            f" estimate are {', of the truth '.join(spans)} (seconds since 1970)"
         )
     return pairs
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from geoscene.errors import reason_of
 from geoscene.support.untrusted import read_toml
 from lidar.errors import InputError
 from lidar.parameters import check_parameters, parameter, read_values
@@ -99,6 +99,5 @@ def _values(given: dict[str, Any], *, where: str) -> dict[str, Any]:
 def _file_table(path: Path) -> dict[str, Any]:
     try:
         return read_toml(path.read_text("utf-8-sig"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"`settings_file` {path}: not a readable TOML file ({why})") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"`settings_file` {path}: not a readable TOML file ({reason_of(error)})") from None
