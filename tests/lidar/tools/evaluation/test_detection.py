@@ -292,6 +292,7 @@ def drive(scene, tmp_path_factory):
         "lidar", "drive", scene.path, "--route", "random", "--duration", 0.6, "--seed", 3, "--rig",
         "kitti", "--format", "pcd", "--traffic", "vehicles=60,parked=0.8,pedestrians=30,cyclists=5", "-o",
         out, "-q", "--set", "shadows=off", "--set", "detail=off",
+        "--set", "supersample=1",
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
     return out
