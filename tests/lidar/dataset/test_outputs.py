@@ -551,7 +551,7 @@ def test_a_resumed_drive_counts_all_of_its_points(scene, rig, recorded, tmp_path
 
 
 def test_camera_settings_change_colours_but_not_ground_truth(scene, rig, tmp_path):
-    options = replace(OPTIONS, rig=rig, duration=0.3, traffic=None, formats=("pcd",), labels=(), deskew="")
+    options = replace(OPTIONS, rig=rig, duration=0.2, traffic=None, formats=("pcd",), labels=(), deskew="")
     changes = {
         "plain": {},
         "noise": {"settings": (("camera_noise", "on"),)},
