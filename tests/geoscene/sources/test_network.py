@@ -431,7 +431,7 @@ def test_neither_user_nor_key_of_an_address_is_in_errors(server):
             locate("Esplanadi, Helsinki", servers=replace(servers, nominatim=wrong))
         assert "pa55word" not in str(caught.value)
     for wrong in ("me:pa55word@nowhere", "ftp://me:pa55word@nowhere"):
-        with pytest.raises(InputError, match="'nowhere': give one that begins with https://") as caught:
+        with pytest.raises(InputError, match=r"^nowhere: give the address of a server") as caught:
             Servers(nominatim=wrong)
 
 
