@@ -22,6 +22,7 @@ from geoscene.support.console import (
     degrees,
     note_new_folder,
     number,
+    parts,
     print_json,
     whole,
 )
@@ -70,7 +71,7 @@ class MapSource:
     nominatim: str | None = None
     """URL of another Nominatim server."""
 
-    overpass: str | None = None
+    overpass: Annotated[tuple[str, ...], Parameter(converter=parts, n_tokens=1, metavar="URL,...")] = ()
     """URL of another Overpass server, or several separated by commas, tried in turn."""
 
     dem_server: str | None = None
@@ -115,7 +116,7 @@ def read_map(source: MapSource, *, progress: Progress = silent) -> Any:
     if source.nominatim:
         servers = replace(servers, nominatim=source.nominatim)
     if source.overpass:
-        servers = replace(servers, overpass=tuple(source.overpass.split(",")))
+        servers = replace(servers, overpass=source.overpass)
     fetched: dict[str, Any] = {"cache_dir": cache_of(source), "refresh": source.refresh}
     fetched |= {"servers": servers, "progress": progress}
     data = None

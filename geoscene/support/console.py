@@ -31,7 +31,7 @@ from cyclopts import (
 )
 
 from geoscene.errors import DamagedFileError, InputError
-from geoscene.support.option_values import words_of
+from geoscene.support.option_values import parts_of, words_of
 from geoscene.support.registry import unknown_name
 from geoscene.support.storage import url_of
 from geoscene.support.urls import without_secrets
@@ -123,6 +123,11 @@ class Report:
 
 def _words(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
     return tuple(word for token in tokens for word in words_of(token.value))
+
+
+def parts(_: object, tokens: Sequence[Token]) -> tuple[str, ...]:
+    """Converter of options that take comma-separated texts."""
+    return tuple(part for token in tokens for part in parts_of(token.value))
 
 
 WORDS = Parameter(converter=_words, n_tokens=1, metavar="STR,...")
@@ -376,10 +381,10 @@ def _with_option(app: App, text: str) -> str:
         elif word.startswith("-") and not _NUMBERS.fullmatch(word):
             flag = ""
         given = value if name in takes else word
-        parts = {given, *re.split("[=,]", given)}
-        if flag and subject in parts:
+        said = {given, *re.split("[=,]", given)}
+        if flag and subject in said:
             return f"{flag} {text}"
-        if flag and flag not in text and any(part and repr(part) in text for part in parts):
+        if flag and flag not in text and any(part and repr(part) in text for part in said):
             return f"{flag}: {text}"
         if flag and (equals or name not in takes) and not takes[flag]:
             flag = ""

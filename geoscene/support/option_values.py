@@ -49,12 +49,17 @@ def expect(value: object, kind: type[Any], *, name: str, error: type[Exception])
         raise error(f"`{name}` {brief(value)}: give a {kind.__name__}")
 
 
+def parts_of(text: str) -> tuple[str, ...]:
+    """Parts of a text that are separated by commas; raises ValueError for an empty one."""
+    parts = tuple(map(str.strip, text.split(",")))
+    if not all(parts):
+        raise ValueError("has an empty part; separate parts by single commas")
+    return parts
+
+
 def words_of(text: str) -> tuple[str, ...]:
     """Words of a text that are separated by commas, in lower case; raises ValueError for an empty one."""
-    words = tuple(word.strip().lower() for word in text.split(","))
-    if not all(words):
-        raise ValueError("has an empty part; give words separated by single commas")
-    return words
+    return tuple(map(str.lower, parts_of(text)))
 
 
 def check_words(options: object, *, error: type[Exception], **known: Collection[str]) -> None:
