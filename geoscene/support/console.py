@@ -381,7 +381,7 @@ def _with_option(app: App, text: str) -> str:
         elif word.startswith("-") and not _NUMBERS.fullmatch(word):
             flag = ""
         given = value if name in takes else word
-        said = {given, *re.split("[=,]", given)}
+        said = {given, *re.split("[=,]", given), *re.split("[=,]", given.lower())}
         if flag and subject in said:
             return f"{flag} {text}"
         if flag and flag not in text and any(part and repr(part) in text for part in said):

@@ -6,14 +6,14 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
 from cyclopts import App
 from helpers.programs import ENVIRONMENT
 
 from geoscene.errors import GeosceneError, InputError
-from geoscene.support.console import DEFAULTS, main, note_new_folder
+from geoscene.support.console import DEFAULTS, SEVERAL, main, note_new_folder
 from geoscene.support.files import json_bytes
 
 app = App(name="program", default_parameter=DEFAULTS, suppress_keyboard_interrupt=False)
@@ -26,6 +26,14 @@ def train(data: Path, /, *, epochs: int = 3, mode: Literal["a", "b"] = "a", mode
     del data, mode
     if epochs < 0:
         raise InputError(f"`epochs` {epochs}: give 0 or more, and a `model_file` ({model_file})")
+
+
+@app.command
+def read(*, files: Annotated[list[str], SEVERAL], words: str = "", json: bool = False):
+    del json
+    if words:
+        raise InputError(f"word {words.rsplit(',', maxsplit=1)[-1].lower()!r} is unknown")
+    raise InputError(f"{files[-1]}: no such file")
 
 
 @group.command
@@ -68,7 +76,10 @@ def run(monkeypatch, capsys):
         ("detector --wrong", "see program detector --help"),
         ("flat x", "NUMBER x: give a whole number; see program flat --help"),
         ("flat nowhere", "NUMBER nowhere: give a whole number"),
-        ("nope", "Available commands: detector, flat; see program --help"),
+        ("read --files one two", "program: --files two: no such file"),
+        ("read --files=two --words a,B", "program: --words: word 'b' is unknown"),
+        ("read --files one --words=", "program: --words '': is empty; give a value, or leave it out"),
+        ("nope", "Available commands: detector, read, flat; see program --help"),
     ],
 )
 def test_wrong_usage_is_one_line(run, words, message):
