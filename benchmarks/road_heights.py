@@ -8,7 +8,8 @@ Samples lie 0.25 m apart on the centre lines of the road graph, each street once
     height  if the first surface below 2 m over the graph is more than 5 cm from the graph's height (with the
             camber of a scene with relief, if it is not between the edge and the crown),
     road    if that surface is not a street's (a sidewalk, soil, a building ...),
-    blocked if something stands between it and 2.5 m over it, or between it and the next one 0.5 m above them,
+    blocked if something stands between it and 2.5 m over it (or the mapped height of a lower passage), or
+            between it and the next one 0.5 m above them,
     step    if that surface is more than 12 cm higher or lower than at the next sample,
     hole    if there is no surface below it.
 
@@ -50,6 +51,7 @@ DEEP = 30.0
 DRIVEN = (Class.ROAD, Class.LANE_MARKING, Class.CROSSING, Class.RAIL)
 FAULTS = ("height", "road", "blocked", "step", "hole")
 KINDS = ("ground", "bridge", "tunnel")
+MAPPED = ("height", "maxheight:physical", "maxheight")
 SEED = 1e-3
 
 
@@ -92,17 +94,20 @@ def measure(scene: Scene) -> tuple[Samples, RoadGraph, dict[str, Float], NDArray
     at = xyz + np.append(
         np.random.default_rng(0).uniform(-SEED, SEED, (len(xyz), 2)), np.zeros((len(xyz), 1)), 1
     )
-    down = caster.cast(at + ABOVE * up, np.broadcast_to(-up, at.shape), far=ABOVE + DEEP)
-    rise = np.where(np.isinf(down.range), np.nan, ABOVE - down.range)
+    free = free_heights(scene, at)
+    above = np.minimum(ABOVE, free - AMID)
+    down = caster.cast(at + above[:, None] * up, np.broadcast_to(-up, at.shape), far=ABOVE + DEEP)
+    rise = np.where(np.isinf(down.range), np.nan, above - down.range)
     crown = CAMBER * graph.width[points.edge] / 2 if scene.manifest["options"]["relief"] != "off" else 0.0
     off = np.where(rise > 0, np.maximum(rise - crown, 0.0), rise)
     over = caster.cast(at + OFF * up, np.broadcast_to(up, at.shape), far=FREE - OFF)
+    low = over.range + OFF < np.minimum(FREE, free - OFF)
     # A face that is seen from its back closes a body, or the ground, around the sample.
     within = caster.cast(at + 2 * OFF * up, np.broadcast_to(up, at.shape), far=1e3)
     next_one = np.flatnonzero(points.followed)
     run = at[next_one + 1] - at[next_one]
     ahead = caster.cast(at[next_one] + AMID * up, run, far=1.0)
-    blocked = np.where(np.isfinite(over.range), over.range + OFF, np.nan)
+    blocked = np.where(low, over.range + OFF, np.nan)
     inside = np.isfinite(within.range) & (within.cosine < 0) & ~(rise > OFF)
     blocked[inside] = 0.0
     blocked[next_one[np.isfinite(ahead.range)]] = AMID
@@ -124,6 +129,19 @@ def measure(scene: Scene) -> tuple[Samples, RoadGraph, dict[str, Float], NDArray
         },
         below,
     )
+
+
+def free_heights(scene: Scene, places: Float) -> Float:
+    """Mapped free heights of passages of buildings over places (n, 3) in metres, infinite elsewhere."""
+    free = np.full(len(places), np.inf)
+    if scene.table_length("passages"):
+        passages = scene.features("passages")
+        height = np.asarray(passages.columns["height"], float)
+        height[~np.isin(passages.columns["height_source"], MAPPED)] = np.inf
+        points = shapely.points(places[:, :2])
+        place, passage = shapely.STRtree(passages.geometry).query(points, predicate="within")
+        np.minimum.at(free, place, height[passage])
+    return free
 
 
 def report(scene: Scene, *, worst: int) -> dict[str, Any]:

@@ -150,6 +150,14 @@ def test_streets_that_cross_on_terrain_without_a_node_have_one_height(bench, tmp
     assert not faults(bench, scene)
 
 
+def test_a_passage_is_no_fault_if_it_is_as_low_as_its_sign_says(bench, tmp_path):
+    corners = {11: (-30, -9), 12: (30, -9), 13: (30, 9), 14: (-30, 9)}
+    inside = STREET | {"tunnel": "building_passage", "maxheight": "1.8"}
+    ways = [(STREET, [1, 2]), (inside, [2, 3]), (STREET, [3, 4]), (STREET, [5, 6])]
+    ways.append(({"building": "yes", "height": "9"}, [11, 12, 13, 14, 11]))
+    assert not faults(bench, built(tmp_path, CROSSING | corners, ways))
+
+
 def HILLS(x, y):  # noqa: N802 - a constant
     return 300.0 + 12.0 * np.sin(x / 40.0) * np.cos(y / 55.0) + 0.1 * x
 
