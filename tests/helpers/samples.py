@@ -8,5 +8,6 @@ def measure_little(patch):
     patch.setattr(search, "SAMPLES", (3, 6))
     patch.setattr(sample, "MOST_RAYS", 127)
     patch.setattr(sample, "_SCREENED", 800)
-    patch.setattr(sample, "_COMPARED", 40)
+    patch.setattr(sample, "_HARD", 40)
+    patch.setattr(sample, "_EASY", 40)
     patch.setattr(sample, "_BLOCKS", 16)

@@ -15,7 +15,7 @@ from lidar.tools.tradeoff.errors import LOST, ErrorEstimate
 
 Kind = Literal["scanners", "cameras"]
 
-RAYS = (1, 7, 13, 19, 37, 61, 91, 127, 169, 217, 331, 499, 665)
+RAYS = (1, 7, 13, 19, 37, 61, 91, 127, 217, 331, 499)
 """Numbers of rays per pulse to choose from, the cheapest first.
 
 Poses, precision and the second trace are none of the choice, as they save a few percent at most.
@@ -51,6 +51,11 @@ class Ladder:
     def values(self, row: int) -> dict[str, int]:
         """The settings of a row, by name."""
         return dict(zip(self.names, self.rows[row], strict=True))
+
+    def rays(self, row: int) -> int:
+        """Rays per pulse or pixel of a row; 1 if none is to be picked."""
+        found = self.values(row)
+        return found.get("rays", 1) * found.get("supersample", 1) ** 2 * found.get("blur", 1)
 
 
 def ladders_of(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import inf, nan
@@ -35,6 +35,7 @@ from lidar.tools.tradeoff.bench import (
 )
 from lidar.tools.tradeoff.errors import (
     IMAGE_STATISTICS,
+    RESAMPLES,
     ErrorEstimate,
     ImageError,
     PulseReturns,
@@ -43,9 +44,11 @@ from lidar.tools.tradeoff.errors import (
 )
 from lidar.tools.tradeoff.variants import camera_reference, noiseless, scanner_reference
 
-_SCREENED, _SCREENS, _COMPARED = 6000, (1, 19, 61), 120
-"""Pulses of a frame that are screened, their numbers of rays, and how many of the hardest and of the others
-are compared with the reference."""
+_SCREENED, _SCREENS = 6000, (1, 19, 61)
+"""Pulses of a frame that are screened, and their numbers of rays."""
+
+_HARD, _EASY = 120, 240
+"""Pulses compared with the reference: of those on which the screens differ most, and of the others."""
 
 _BLOCKS, _FEWEST = 48, 12
 """Blocks of pixels of a frame that are compared, of all cameras, and of each at least."""
@@ -117,17 +120,18 @@ class DriveSample:
         self._progress("measuring errors", done, total=len(jobs))
 
     def figures(self, row: int) -> dict[str, dict[str, ErrorEstimate]]:
-        """Figures of the errors of one of the settings, by sensor, with 95 % intervals by resampling frames.
+        """Figures of the errors of one of the settings, by sensor, with 95 % intervals.
 
-        They are those of `range_figures` and `image_figures`.
+        They are those of `range_estimates` and `image_figures`, the latter by resampling frames.
         """
         found = {}
         for sensor in self._sensors:
-            figures: Callable[[Sequence[Any]], Mapping[str, float]] = (
-                range_figures if isinstance(sensor, Scanner) else partial(image_figures, camera=sensor)
-            )
             frames = [errors[row] for errors in self._errors[sensor.name]]
-            found[sensor.name] = resample(frames, seed=0, figures=figures)
+            if isinstance(sensor, Scanner):
+                complete = len(frames) == len(self._frames[sensor.name])
+                found[sensor.name] = range_estimates(frames, complete=complete)
+            else:
+                found[sensor.name] = resample(frames, seed=0, figures=partial(image_figures, camera=sensor))
         return found
 
     def _frame_errors(self, bench: Bench, sensor: Scanner | Camera, *, frame: int) -> list[Any]:
@@ -205,7 +209,9 @@ def scanner_errors(
     screened = chosen_pulses(count, _SCREENED, frame=frame, seed=seed)
     casts = [frame_returns(settings=replace(plain, rays=rays), pulses=screened) for rays in _SCREENS]
     rng = np.random.default_rng([seed, frame, 1])
-    pulses, weights = _stratify(screened, casts, count=count, rng=rng)
+    hard, easy = _stratify(screened, casts, count=count, rng=rng)
+    pulses, weights = np.sort(np.concatenate([hard, easy])), np.ones(count)
+    weights[easy] = (len(screened) - len(hard)) / max(len(easy), 1)
     exact = scanner_reference(plain, rays=MOST_RAYS)
     truth = frame_returns(settings=exact, pulses=pulses, backend=EXACT)
     return [
@@ -239,10 +245,12 @@ def _returns(
 
 def _stratify(
     pulses: NDArray[np.int64], casts: Sequence[PulseReturns], *, count: int, rng: np.random.Generator
-) -> tuple[NDArray[np.int64], Float]:
-    """Pulses to compare of some that were cast with different rays, and weights (count,) by row of a pulse.
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Of pulses that were cast with different rays, those on which these casts differ most, and some others.
 
-    Those on which these casts differ most are taken, with weight 1; others at random, for all others.
+    The latter are chosen at random. Both are ascending.
+
+    count : pulses of the frame
     """
     first, *others = casts
     apart = np.zeros(count)
@@ -251,11 +259,7 @@ def _stratify(
         np.maximum.at(apart, first.key[a] // 256, np.abs(first.range[a] - other.range[b]))
         apart[np.setxor1d(first.key, other.key) // 256] = inf
     order = pulses[np.argsort(-apart[pulses], kind="stable")]
-    hard, easy = order[:_COMPARED], rng.permutation(order[_COMPARED:])[:_COMPARED]
-    weights = np.ones(count)
-    if len(easy):
-        weights[easy] = (len(order) - len(hard)) / len(easy)
-    return np.sort(np.concatenate([hard, easy])), weights
+    return np.sort(order[:_HARD]), np.sort(rng.permutation(order[_HARD:])[:_EASY])
 
 
 def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
@@ -263,13 +267,40 @@ def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
 
     NaN without returns; and ``lost``, missed and extra returns over those of the reference.
     """
-    ranges = np.concatenate([f.range for f in frames])
+    return {name: error.value for name, error in range_estimates(frames, complete=True).items()}
+
+
+def range_estimates(frames: Sequence[SampledError], *, complete: bool) -> dict[str, ErrorEstimate]:
+    """The figures of `range_figures` with 95 % intervals by resampling pulses, and the frames of a sample.
+
+    complete : whether these are all frames of the drive, so that none but the pulses are a sample
+    """
+    if not frames:
+        return {}
+    rng = np.random.default_rng(0)
+    ranges, weight = (np.concatenate([getattr(f, name) for f in frames]) for name in ("range", "weight"))
+    of = np.repeat(np.arange(len(frames)), [len(f.range) for f in frames])
     order = np.argsort(ranges)
-    below = np.cumsum(np.concatenate([f.weight for f in frames])[order])
-    ranges = ranges[order]
-    missed, extra, returns = np.sum([(f.missed, f.extra, f.returns) for f in frames], axis=0).tolist()
+    ranges, weight, of = ranges[order], weight[order], of[order]
+    lost = np.array([(f.missed + f.extra, f.returns) for f in frames])
+    times = rng.multinomial(len(frames), np.full(len(frames), 1 / len(frames)), size=RESAMPLES)
+    again = []
+    for one in times:
+        drawn = weight * rng.poisson(1.0, len(weight)) * (1 if complete else one[of])
+        again.append(_weighted_figures(ranges, drawn, lost=one @ lost))
+    found = {}
+    for name, value in _weighted_figures(ranges, weight, lost=lost.sum(axis=0)).items():
+        if not np.isnan(value):
+            low, high = np.nanpercentile([figures[name] for figures in again], [2.5, 97.5])
+            found[name] = ErrorEstimate(value, float(low), float(high))
+    return found
+
+
+def _weighted_figures(ranges: Float, weight: Float, *, lost: Float) -> dict[str, float]:
+    """Figures of ascending errors; ``lost`` (2,) has missed and extra returns, and all of the reference."""
+    below, (some, returns) = np.cumsum(weight), lost.tolist()
     found = {f"range_{p:g}_m": _quantile(ranges, below, share=p / 100) for p in PERCENTS}
-    return found | {"lost": (missed + extra) / returns if returns else nan}
+    return found | {"lost": some / returns if returns else nan}
 
 
 def _quantile(values: Float, below: Float, *, share: float) -> float:

@@ -40,8 +40,12 @@ from lidar.tools.tradeoff.pick import (
 from lidar.tools.tradeoff.sample import DriveSample, sensors_with
 from lidar.world.world import Worlds
 
-SAMPLES = (12, 24, 48, 96)
+SAMPLES = (6, 12, 24)
 """Frames of the sample, which grows until it answers."""
+
+_DEARER, _DEAREST = 1.5, 3.0
+"""Times the rays of the first row that is within an accuracy by its estimate. A row with so many that is
+surely within it is taken at once; one with so many is taken in the end."""
 
 _TIMINGS = 3
 """Frames of each sensor that are timed."""
@@ -142,8 +146,10 @@ def _follow(worlds: Worlds, plan: DrivePlan, *, sensor: Scanner | Camera, frame:
 def find_accurate(search: Search, accuracy: AccuracyTarget) -> dict[Kind, int]:
     """The first row of each ladder with which errors are within an accuracy, by the end of their intervals.
 
-    The sample grows until some row is, or all intervals begin beyond the accuracy. The order of the
-    rows is the same on all machines, and so are the sample and the rows.
+    The sample grows until some row is that has few more rays than the first row whose errors are within it by
+    their estimates, or all intervals begin beyond the accuracy. If the largest sample does not decide, that
+    first row is taken unless one that is sure has at most `_DEAREST` times its rays. The order of the rows
+    is the same on all machines, and so are the sample and the rows.
 
     Raises InputError, which names the nearest, if there is none.
     """
@@ -163,55 +169,63 @@ def find_accurate(search: Search, accuracy: AccuracyTarget) -> dict[Kind, int]:
 def _first_within(
     search: Search, kind: Kind, *, limits: Mapping[str, float], accuracy: AccuracyTarget
 ) -> int:
-    """The first row of a ladder whose errors are within limits, by name."""
-    sample = search.sample(kind)
+    """The first row of a ladder whose errors are within limits, by name; see `find_accurate`."""
+    sample, ladder = search.sample(kind), search.ladders[kind]
     for frames in SAMPLES:
         sample.grow(frames)
-        every = [worst_errors(sample.figures(row)) for row in range(len(sample.settings))]
-        shares = [
-            {name: errors[name].high / limit for name, limit in limits.items() if name in errors}
-            for errors in every
-        ]
-        for row, of in enumerate(shares):
-            if max(of.values(), default=0.0) <= 1:
-                return row
-        hopeless = (
-            all(errors[name].low > limit for errors in every if name in errors)
-            for name, limit in limits.items()
-        )
-        if sample.complete or any(hopeless):
+        every = [sample.figures(row) for row in range(len(sample.settings))]
+        sure = _first(every, limits, end="high")
+        likely = _first(every, limits, end="value")
+        if sure < len(every) and ladder.rays(sure) <= _DEARER * ladder.rays(likely):
+            return sure
+        if sample.complete or _first(every, limits, end="low") == len(every):
             break
-    best = min(range(len(every)), key=lambda row: max(shares[row].values()))
-    figure = max(shares[best], key=shares[best].__getitem__)
+    if likely < len(every):
+        affordable = sure < len(every) and ladder.rays(sure) <= _DEAREST * ladder.rays(likely)
+        return sure if affordable else likely
+    worst = [_worst(errors, limits, end="value") for errors in every]
+    best = min(range(len(worst)), key=lambda row: worst[row][0])
+    _, figure, error = worst[best]
     label = label_of(search.ladders[kind].values(best))
-    raise InputError(_out_of_reach(accuracy, every[best][figure], figure=figure, label=label))
+    raise InputError(_out_of_reach(accuracy, error, figure=figure, label=label))
 
 
-def worst_errors(errors: Mapping[str, Mapping[str, ErrorEstimate]]) -> dict[str, ErrorEstimate]:
-    """Each figure of the sensor with the largest upper end."""
-    found: dict[str, ErrorEstimate] = {}
-    for figures in errors.values():
-        for name, error in figures.items():
-            if name not in found or error.high > found[name].high:
-                found[name] = error
-    return found
+def _first(
+    every: Sequence[Mapping[str, Mapping[str, ErrorEstimate]]], limits: Mapping[str, float], *, end: str
+) -> int:
+    """The first row one of whose ends of errors is within limits; their number if there is none."""
+    within = (row for row, errors in enumerate(every) if _worst(errors, limits, end=end)[0] <= 1)
+    return next(within, len(every))
+
+
+def _worst(
+    errors: Mapping[str, Mapping[str, ErrorEstimate]], limits: Mapping[str, float], *, end: str
+) -> tuple[float, str, ErrorEstimate]:
+    """The largest error of any sensor over its limit, by one of its ``ends``, with its name and all of it."""
+    found = [
+        (getattr(figures[name], end) / limit, name, figures[name])
+        for figures in errors.values()
+        for name, limit in limits.items()
+        if name in figures
+    ]
+    return max(found, key=lambda one: one[0], default=(0.0, "", ErrorEstimate(0.0, 0.0, 0.0)))
 
 
 def _out_of_reach(accuracy: AccuracyTarget, error: ErrorEstimate, *, figure: str, label: str) -> str:
     """The message of an accuracy that no row reaches, with the nearest."""
     if figure == "rgb_rms":
         return (
-            f"`accuracy` {accuracy.text}: no number of rays is sure to reach {levels(accuracy.levels)};"
+            f"`accuracy` {accuracy.text}: no number of rays reaches {levels(accuracy.levels)};"
             f" {label} comes nearest with {error.to_text(levels)}: give"
-            f" {levels(_round_up(error.high))} or more"
+            f" {levels(_round_up(error.value))} or more"
         )
     what, of = ("number of rays", "returns") if figure.startswith("range") else ("image", "depths")
     nearest = f"{label} comes" if label and figure.startswith("range") else "it comes"
     length, smaller = accuracy.text.split("@")[0].split(",")[0], _smaller(accuracy.percent)
     return (
-        f"`accuracy` {accuracy.text}: no {what} is sure to reach {metres(accuracy.metres)} at"
+        f"`accuracy` {accuracy.text}: no {what} reaches {metres(accuracy.metres)} at"
         f" {accuracy.percent:g} % of the {of}; {nearest} nearest with {error.to_text()}: give"
-        f" {metres(_round_up(error.high))} or more, or a smaller share, as in {length}@{smaller:g}"
+        f" {metres(_round_up(error.value))} or more, or a smaller share, as in {length}@{smaller:g}"
     )
 
 
