@@ -18,7 +18,10 @@ _STRAIGHT = 0.005
 """Metres by which a profile may be off between the lines across it."""
 
 _LEVEL = 1e-3
-"""Metres: the heights of a road whose ground needs no lines."""
+"""Metres: the heights of a road whose ground needs no lines, unless a higher or lower one is beside it."""
+
+_GRADED = 40.0
+"""Metres between the centre lines of roads within which the ground of one slopes to that of the other."""
 
 _NEAR = 50.0
 """Metres from an area within which roads count: more than between vertices."""
@@ -49,7 +52,10 @@ def crease_lines(graph: RoadGraph, height: Height, *, area: Any | None = None) -
     single = graph.once
     on_ground = ~graph.bridge & ~graph.tunnel
     uneven = np.array([bool(np.abs(line[:, 2]).max() > _LEVEL) for line in graph.geometry], np.bool_)
-    once = np.flatnonzero(single & on_ground & uneven)
+    once = np.flatnonzero(single & on_ground)
+    drawn = edge_lines(graph)
+    tree = shapely.STRtree(drawn[uneven])
+    once = once[np.unique(tree.query(drawn[once], predicate="dwithin", distance=_GRADED)[0])]
     once = once[in_reach(edge_lines(graph)[once], area, metres=_NEAR)]
     if not len(once):
         return np.empty((0, 2, 2))

@@ -150,6 +150,23 @@ def test_streets_that_cross_on_terrain_without_a_node_have_one_height(bench, tmp
     assert not faults(bench, scene)
 
 
+def test_a_level_street_beside_the_ramp_of_a_tunnel_stays_level(bench, tmp_path):
+    beside = {
+        1: (-200, 0),
+        2: (-60, 0),
+        3: (60, 0),
+        4: (200, 0),
+        9: (-240, 7.5),
+        10: (-66, 7.5),
+        11: (-66, 200),
+    }
+    ways = [(ROAD, [1, 2]), (ROAD | {"tunnel": "yes"}, [2, 3]), (ROAD, [3, 4]), (STREET, [5, 8])]
+    scene = built(tmp_path, CROSSING | beside, [*ways, (STREET, [9, 10, 11])], only=("roads",))
+    assert heights(scene, 100).min() < -3.0
+    assert not heights(scene, 104).any()
+    assert not faults(bench, scene)
+
+
 def test_a_passage_is_no_fault_if_it_is_as_low_as_its_sign_says(bench, tmp_path):
     corners = {11: (-30, -9), 12: (30, -9), 13: (30, 9), 14: (-30, 9)}
     inside = STREET | {"tunnel": "building_passage", "maxheight": "1.8"}
