@@ -45,7 +45,7 @@ SAMPLES = (6, 12, 24)
 
 _DEARER, _DEAREST = 1.5, 3.0
 """Times the rays of the first row that is within an accuracy by its estimate. A row with so many that is
-surely within it is taken at once; one with so many is taken in the end."""
+surely within it is taken at once; the last with so many is taken in the end."""
 
 _TIMINGS = 3
 """Frames of each sensor that are timed."""
@@ -147,9 +147,9 @@ def find_accurate(search: Search, accuracy: AccuracyTarget) -> dict[Kind, int]:
     """The first row of each ladder with which errors are within an accuracy, by the end of their intervals.
 
     The sample grows until some row is that has few more rays than the first row whose errors are within it by
-    their estimates, or all intervals begin beyond the accuracy. If the largest sample does not decide, that
-    first row is taken unless one that is sure has at most `_DEAREST` times its rays. The order of the rows
-    is the same on all machines, and so are the sample and the rows.
+    their estimates, or all intervals begin beyond the accuracy. If the largest sample does not decide, the
+    last row with at most `_DEAREST` times the rays of that first row is taken, or a cheaper one that is sure.
+    The order of the rows is the same on all machines, and so are the sample and the rows.
 
     Raises InputError, which names the nearest, if there is none.
     """
@@ -181,8 +181,8 @@ def _first_within(
         if sample.complete or _first(every, limits, end="low") == len(every):
             break
     if likely < len(every):
-        affordable = sure < len(every) and ladder.rays(sure) <= _DEAREST * ladder.rays(likely)
-        return sure if affordable else likely
+        most = _DEAREST * ladder.rays(likely)
+        return max(row for row in range(min(sure + 1, len(every))) if ladder.rays(row) <= most)
     worst = [_worst(errors, limits, end="value") for errors in every]
     best = min(range(len(worst)), key=lambda row: worst[row][0])
     _, figure, error = worst[best]
