@@ -56,8 +56,8 @@ class Obstacles:
     clear: Float
 
 
-# Weights of the least-squares terms, per metre of road. Ground far from any bridge or tunnel holds a road
-# more firmly than a ramp does, and those that no ramp leads to do not give way; violated bounds cost more.
+# Weights of the least-squares terms, per metre of road. The ground holds a ramp more firmly with the distance
+# from its bridge or tunnel, and other roads so that they do not give way; violated bounds cost more.
 _FIXED, _FIRM, _RAMP, _LOOSE = 1e4, 100.0, 1.0, 1e-6
 _RAMP_REACH = 150.0
 # Over more than this length (metres) a bridge or tunnel behaves as a taut string rather than as a beam.
@@ -69,6 +69,9 @@ _STILL, _MOVED = 1e-9, 1e-4
 _HARD, _STEADY, _HARDEST = 1e8, 4e9, 1e9
 """Of slopes; of changes of slope, of stations at full spacing; of heights, which come first where a
 short ramp cannot serve all."""
+_STEEPEST, _HELD, _GIVE = 1e12, 1e10, 0.1
+"""Of the steepest gradient; of roads beyond ramps, which may be so many metres off the ground: where a ramp
+is too short, it is steep, and where it cannot be steeper, the clearance is less, but these do not move."""
 _WITHIN = 1.0
 """Metres inside the edges of a carriageway at which its height is looked up: a raster's cells blur kerbs."""
 _CLOSE = 1.0
@@ -94,9 +97,10 @@ def profile(
     if one of them is a bridge or a tunnel, and else, without a common node, as high;
     bridges and tunnels that overlap a road beside them have its height or that distance over or under it;
     a bridge is above obstacles and the ground; a tunnel is under the ground, deeper with the distance from
-    its mouth, and if gradients allow entirely so after 15 m; gradients; changes of gradient. Bounds that
-    contradict each other (a ramp too short for its gradient) are relaxed: first those between carriageways
-    side by side, then gradients, then heights. Solved by an interior-point method.
+    its mouth, and if gradients allow entirely so after 15 m; gradients; changes of gradient; near bridges and
+    tunnels roads beyond their ramps have the height of the ground. Bounds that contradict each other (a ramp
+    too short for its gradient) are relaxed: first those between carriageways side by side, then gradients up
+    to ``steepest``, then clearances. Solved by an interior-point method.
 
     ground    : height of the terrain, which roads follow where no bound prevents it
     obstacles : railway tracks and waterways that bridges cross
@@ -109,8 +113,12 @@ def profile(
         terrain = _near_edges(graph, stations, ground=ground)
     else:
         terrain = np.asarray(ground(stations.xy[:, 0], stations.xy[:, 1]), float)
-    bounds = _bounds(graph, stations, terrain=terrain, ground=ground, obstacles=obstacles, options=options)
-    z = _solve(graph, stations, terrain=terrain, bounds=bounds, options=options)
+    ramp = _along_ramps(graph, stations)
+    bounds = _bounds(
+        graph, stations, terrain=terrain, ground=ground, obstacles=obstacles, ramp=ramp, options=options
+    )
+    weight = _weights(graph, stations, ramp=ramp)
+    z = _solve(graph, stations, terrain=terrain, bounds=bounds, weight=weight, options=options)
     return _with_heights(graph, stations, z=z)
 
 
@@ -128,16 +136,41 @@ def _near_edges(graph: RoadGraph, stations: Stations, *, ground: Height) -> Floa
     return total / count
 
 
-def _weights(graph: RoadGraph, stations: Stations) -> Float:
-    """Weight of the distance from the ground at each station: per metre, times the station's length."""
+def _along_ramps(graph: RoadGraph, stations: Stations) -> Float:
+    """Metres (v,) of stations on ramps from their bridge or tunnel, `_RAMP_REACH` at all others.
+
+    A ramp is a road on the ground from the end of a bridge or a tunnel to its first junction of roads on
+    the ground.
+    """
     a, b, metres, edge = stations.segments
     structure = graph.bridge[edge] | graph.tunnel[edge]
     count = len(stations.xy)
     ends = np.zeros(count, np.bool_)
     ends[a[structure]] = ends[b[structure]] = True
-    far = _distance(count, (a[~structure], b[~structure], metres[~structure]), start=ends, limit=_RAMP_REACH)
-    per_metre = _RAMP + (_FIRM - _RAMP) * (far / _RAMP_REACH) ** 2
-    per_metre[far >= _RAMP_REACH] = _FIXED
+    arms = np.bincount(np.concatenate([a[~structure], b[~structure]]), minlength=count)
+    junction = arms > np.where(ends, 1, 2)
+    part = ~structure & ~junction[a] & ~junction[b]
+    return _distance(count, (a[part], b[part], metres[part]), start=ends & ~junction, limit=_RAMP_REACH)
+
+
+def _near_structures(graph: RoadGraph, stations: Stations) -> Bools:
+    """Whether stations (v,) are within `_RAMP_REACH` of a bridge or a tunnel along roads on the ground."""
+    a, b, metres, edge = stations.segments
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+    ends = np.zeros(len(stations.xy), np.bool_)
+    ends[a[structure]] = ends[b[structure]] = True
+    links = a[~structure], b[~structure], metres[~structure]
+    near: Bools = _distance(len(ends), links, start=ends, limit=_RAMP_REACH) < _RAMP_REACH
+    return near
+
+
+def _weights(graph: RoadGraph, stations: Stations, *, ramp: Float) -> Float:
+    """Weight of the distance from the ground at each station: per metre, times the station's length."""
+    a, b, metres, edge = stations.segments
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+    count = len(stations.xy)
+    per_metre = _RAMP + (_FIRM - _RAMP) * (ramp / _RAMP_REACH) ** 2
+    per_metre[ramp >= _RAMP_REACH] = _FIXED
     share = np.where(structure, 0.0, metres / 2)
     held = np.bincount(a, share, count) + np.bincount(b, share, count)
     return np.maximum(held * per_metre, _LOOSE)
@@ -172,6 +205,7 @@ def _bounds(
     terrain: Float,
     ground: Height,
     obstacles: Obstacles | None,
+    ramp: Float,
     options: ProfileOptions,
 ) -> Bounds:
     """All bounds on heights."""
@@ -183,6 +217,13 @@ def _bounds(
     most = np.where(structure, options.slope * metres, np.maximum(options.slope * metres, own))
     rows.add([(b, 1.0), (a, -1.0)], -most, weight=_HARD)
     rows.add([(a, 1.0), (b, -1.0)], -most, weight=_HARD)
+    around = _near_structures(graph, stations)
+    part = structure | around[a] | around[b]
+    for begin, end in ((a[part], b[part]), (b[part], a[part])):
+        rows.add([(end, 1.0), (begin, -1.0)], -options.steepest * metres[part], weight=_STEEPEST)
+    held = np.flatnonzero(around & (ramp >= _RAMP_REACH))
+    for sign in (1.0, -1.0):
+        rows.add([(held, sign)], sign * terrain[held] - _GIVE, weight=_HELD)
 
     p, q, r, before, after = stations.triples
     near = np.minimum(before, after)
@@ -336,12 +377,17 @@ def _over_obstacles(
 
 
 def _solve(
-    graph: RoadGraph, stations: Stations, *, terrain: Float, bounds: Bounds, options: ProfileOptions
+    graph: RoadGraph,
+    stations: Stations,
+    *,
+    terrain: Float,
+    bounds: Bounds,
+    weight: Float,
+    options: ProfileOptions,
 ) -> Float:
     """Heights (v,) of minimum cost within the bounds."""
     from scipy.sparse import csr_array, diags_array  # noqa: PLC0415  (slow to import)
 
-    weight = _weights(graph, stations)
     p, q, r, before, after = stations.triples
     before, after = np.maximum(before, 0.5), np.maximum(after, 0.5)
     reach = (before + after) / 2

@@ -213,6 +213,50 @@ def test_on_the_ground_a_road_follows_the_terrain():
     assert steps_beyond(graph, hills).max() <= OPTIONS.step + 1e-3
 
 
+def named(graph, way):
+    """Line of the first edge of a way."""
+    return graph.geometry[int(np.flatnonzero(graph.osm_id == f"way/{way}")[0])]
+
+
+@pytest.mark.parametrize("kind", [BRIDGE, TUNNEL])
+def test_streets_stay_on_the_ground_where_a_ramp_between_them_is_too_short(kind):
+    places = {
+        1: (0, -300),
+        2: (0, 0),
+        3: (0, 300),
+        4: (25, 0),
+        5: (90, 0),
+        6: (300, 0),
+        7: (55, -300),
+        8: (55, 300),
+    }
+    ways = [(ROAD, [1, 2, 3]), (ROAD, [2, 4]), (kind, [4, 5]), (ROAD, [5, 6]), (ROAD, [7, 8])]
+    graph = profile(graph_of(places, ways), flat)
+    along, _, high = named(graph, 101).T
+    steepest = np.abs(np.diff(high) / np.diff(along)).max()
+    assert OPTIONS.slope < steepest <= OPTIONS.steepest + 1e-3
+    assert clearances(graph).min() > HIGH - 0.3
+    assert np.abs(named(graph, 100)[:, 2]).max() < 0.3
+    assert np.abs(named(graph, 104)[:, 2]).max() < 1.5  # the street that is crossed gives way a little
+
+
+def test_a_ramp_that_leaves_a_bridge_falls_to_the_first_junction_on_the_ground():
+    places = OVER | {2: (-200, 0), 3: (200, 0), 7: (0, 20), 8: (100, 160), 9: (100, 400)}
+    ways = [
+        (ROAD, [1, 2]),
+        (BRIDGE, [2, 7, 3]),
+        (ROAD, [3, 4]),
+        (ROAD, [5, 6]),
+        (ROAD, [7, 8]),
+        (ROAD, [8, 9]),
+    ]
+    ways += [(ROAD, [8, 6])]
+    graph = profile(graph_of(places | {5: (40, -300), 6: (40, 300)}, ways), flat)
+    ramp = named(graph, 104)[:, 2]
+    assert ramp[0] > 2.0
+    assert abs(ramp[-1]) < 0.3
+
+
 def test_no_road_is_steeper_than_the_steepest_streets_there_are():
     def ridge(x, y):
         return np.maximum(60 - 0.6 * np.abs(x), 0.0) + 0 * y
