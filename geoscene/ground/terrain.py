@@ -139,6 +139,7 @@ def open_terrain(
     unit: str | None = None,
     vertical: Literal["orthometric", "ellipsoidal"] | None = None,
     outside: Literal["error", "nearest"] = "error",
+    around: float = 0.0,
 ) -> Terrain:
     """The terrain within a scene's bounds, from elevation rasters.
 
@@ -148,11 +149,12 @@ def open_terrain(
     interpolated, so no seam shows between them. Voids (the raster's nodata, not a number, or lower than
     -500 m or higher than 9,000 m) and spikes are filled from around by inverse distances and listed.
 
-    bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within is read
+    bounds   : (xmin, ymin, xmax, ymax), scene metres; only what lies within, and around, is read
     unit     : of heights (``m``, ``ft``, ``us-ft``) where the files do not state it or are wrong
     vertical : reference of heights where the files do not state it; a geoid (``orthometric``) by default
     outside  : what to do where no raster covers the bounds: raise, or take the ``nearest`` height and tell
                the share
+    around   : metres beyond the bounds in which heights are read where rasters cover them
 
     Raises SourceNotFoundError for a missing file, InputError for one that is no raster, has no CRS or an
     unknown unit, for rasters that do not cover the bounds, and for ones that differ in the reference of
@@ -180,7 +182,8 @@ def open_terrain(
                 break
         else:
             groups.append([raster])
-    read = [found for group in groups if (found := _read(group, frame, bounds=bounds)) is not None]
+    wide = shapely.bounds(shapely.buffer(box, around, join_style="mitre")).tolist()
+    read = [found for group in groups if (found := _read(group, frame, bounds=wide)) is not None]
     read.sort(key=lambda found: found.spacing)
     if not read:
         names = ", ".join(r.path.name for r in rasters)

@@ -67,6 +67,7 @@ from geoscene.roadgraph import (
     find_obstacles,
     graded_ground,
     profile,
+    take_heights,
 )
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
 from geoscene.roadgraph.clipping import clip_graph
@@ -90,7 +91,7 @@ from geoscene.roadgraph.tags import find_unused_inclines
 from geoscene.roadgraph.walls import HEADROOM, Walls
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
-from geoscene.sources import OsmData
+from geoscene.sources import AROUND_BOUNDS, OsmData
 from geoscene.structures import (
     Passages,
     StructureOptions,
@@ -230,13 +231,13 @@ def make_plan(
     terrain = Terrain(frame)
     if options.dem:
         gaps = cast("Literal['error', 'nearest']", options.dem_gaps)
-        terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps)
+        terrain = open_terrain(options.dem, frame, bounds=extent, outside=gaps, around=AROUND_BOUNDS)
         problems += terrain.problems
     frame = replace(frame, vertical=terrain.vertical)
 
     progress("roads", 0, total=0)
     if "roads" in options.only:
-        osm = _collect(problems, lengthen_structures(osm, frame))
+        osm = _collect(problems, _with_clear_ends(osm, frame))
     passages = _collect(problems, find_passages(_only_roads(osm, options), buildings, frame=frame))
     solid = _on_ground(buildings, passages, free=HEADROOM)
     some = np.flatnonzero([shape is not None for shape in solid])
@@ -384,6 +385,20 @@ class _Roads:
     uneven: bool
 
 
+def _with_clear_ends(osm: OsmData, frame: Frame) -> tuple[OsmData, list[Problem]]:
+    """The map with bridges and tunnels that end clear of streets, also beyond its bounds."""
+    whole, problems = lengthen_structures(_with_around(osm), frame)
+    count = len(osm.ways)
+    found = replace(osm, ways=whole.ways[:count], around=whole.ways[count:])
+    beyond = {way.osm_id for way in osm.around}
+    return found, [problem for problem in problems if problem.osm_id not in beyond]
+
+
+def _with_around(osm: OsmData) -> OsmData:
+    """The map with the ways beyond its bounds, after its own."""
+    return replace(osm, ways=[*osm.ways, *osm.around])
+
+
 def _plan_roads(
     osm: OsmData,
     frame: Frame,
@@ -405,8 +420,11 @@ def _plan_roads(
     if not terrain.grids:
         problems += find_unused_inclines(mapped.ways)
     surveyed = 0.0 < terrain.spacing <= _SURVEYED
-    obstacles = find_obstacles(osm, frame)
-    graph = profile(graph, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))
+    around = _with_around(mapped)
+    whole = build_road_graph(around, frame, options=road_options, walls=walls)[0] if mapped.around else graph
+    obstacles = find_obstacles(around, frame)
+    whole = profile(whole, terrain.height, obstacles=obstacles, options=ProfileOptions(edges=surveyed))
+    graph = take_heights(graph, whole) if mapped.around else whole
     uneven = bool(terrain.grids) or any(line[:, 2].any() for line in graph.geometry)
     height = None
     if uneven:
@@ -420,7 +438,8 @@ def _plan_roads(
 
 def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:
     """The map that roads are read from: without features if the scene has none."""
-    return osm if "roads" in options.only else replace(osm, areas=[], ways=[], relations=[], points=[])
+    none = replace(osm, areas=[], ways=[], relations=[], points=[], around=[])
+    return osm if "roads" in options.only else none
 
 
 @dataclass(frozen=True, slots=True)

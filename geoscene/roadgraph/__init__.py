@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from geoscene.roadgraph.graphml import write_graphml as write_graphml
     from geoscene.roadgraph.longitudinal_profile import ProfileOptions as ProfileOptions
     from geoscene.roadgraph.longitudinal_profile import profile as profile
+    from geoscene.roadgraph.longitudinal_profile import take_heights as take_heights
 
 __getattr__ = lazily(
     __name__,
@@ -32,6 +33,7 @@ __getattr__ = lazily(
         "main_network": "graph",
         "profile": "longitudinal_profile",
         "read_graphml": "graphml",
+        "take_heights": "longitudinal_profile",
         "write_graphml": "graphml",
     },
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -119,6 +120,27 @@ def profile(
     )
     weight = _weights(graph, stations, ramp=ramp)
     z = _solve(graph, stations, terrain=terrain, bounds=bounds, weight=weight, options=options)
+    return _with_heights(graph, stations, z=z)
+
+
+def take_heights(graph: RoadGraph, whole: RoadGraph, *, options: ProfileOptions | None = None) -> RoadGraph:
+    """A graph with the heights that `profile` gave to one of these and more ways."""
+    options = options or ProfileOptions()
+    stations = place_stations(graph, spacing=options.spacing)
+    of_way: dict[str, list[int]] = defaultdict(list)
+    for edge in np.flatnonzero(whole.once).tolist():
+        for name in whole.osm_id[edge].split(";"):
+            of_way[name].append(edge)
+    lines = np.fromiter(map(shapely.linestrings, whole.geometry), object, count=len(whole))
+    z = np.zeros(len(stations.xy))
+    begin = np.flatnonzero(np.diff(stations.edge, prepend=-1))
+    for start, stop in zip(begin.tolist(), [*begin[1:].tolist(), len(stations.edge)], strict=True):
+        names = graph.osm_id[stations.edge[start]].split(";")
+        some = lines[sorted({edge for name in names for edge in of_way[name]})]
+        points = shapely.points(stations.place[start:stop])
+        nearest = some[np.argmin(shapely.distance(points[:, None], some), axis=1)]
+        on_line = shapely.line_interpolate_point(nearest, shapely.line_locate_point(nearest, points))
+        z[stations.row[start:stop]] = shapely.get_z(on_line)
     return _with_heights(graph, stations, z=z)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from geoscene.sources.data import AROUND_BOUNDS as AROUND_BOUNDS
 from geoscene.sources.data import Area as Area
 from geoscene.sources.data import OsmData as OsmData
 from geoscene.sources.data import Relation as Relation

@@ -10,6 +10,8 @@ import shapely
 from geoscene.errors import SourceNotFoundError
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import (
+    AROUND_BOUNDS,
+    METRES_PER_DEGREE,
     Bounds,
     OsmData,
     Relation,
@@ -28,6 +30,7 @@ from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Ints
 
 _KINDS = ("road", "railway", "waterway", "barrier")
+_TRAVELLED = ("highway", "railway", "waterway")
 _CROWD, _CELL = 32, 1e-4
 """Lines of a kind in one place, and the side of a place in degrees, about 10 m."""
 
@@ -135,6 +138,22 @@ def _select(data: OsmData, bounds: Bounds) -> OsmData:
     )
 
 
+def _ways_around(elements: Elements, bounds: Bounds, *, inside: set[str]) -> list[Way]:
+    """Streets, railways and waterways up to `AROUND_BOUNDS` metres beyond the bounds, not ``inside``."""
+    west, south, east, north = bounds
+    up = AROUND_BOUNDS / METRES_PER_DEGREE
+    aside = up / max(np.cos(np.radians((south + north) / 2)), 0.01)
+    near = _intersect(elements, (west - aside, south - up, east + aside, north + up))
+    rows = [
+        row
+        for row in np.flatnonzero(near).tolist()
+        if any(key in elements.way_tags[row] for key in _TRAVELLED)
+        and not is_area(elements.way_tags[row])
+        and f"way/{elements.way_id[row]}" not in inside
+    ]
+    return _lines(elements, rows)[0]
+
+
 def features(elements: Elements, *, bounds: Bounds | None = None, source: str = "") -> OsmData:
     """The features of a map extract, each kind in order of id.
 
@@ -194,6 +213,7 @@ def features(elements: Elements, *, bounds: Bounds | None = None, source: str = 
     )
     if bounds is not None:
         data = _select(data, bounds)
+        data = replace(data, around=_ways_around(elements, bounds, inside={way.osm_id for way in data.ways}))
         if not (data.ways or data.areas or data.points):
             lonlat = elements.node_xy / UNITS
             covered = (*lonlat.min(axis=0), *lonlat.max(axis=0))

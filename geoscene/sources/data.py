@@ -21,6 +21,9 @@ Progress = Callable[[Iterable[Any]], Iterable[Any]]
 METRES_PER_DEGREE = 111_195.0
 """Of latitude, on a sphere of 6371 km, the mean radius of the Earth (IUGG)."""
 
+AROUND_BOUNDS = 500.0
+"""Metres beyond given bounds within which streets count for the heights of those within."""
+
 _ALL_VALUES: frozenset[str] = frozenset()
 
 NOISE = frozenset(
@@ -217,6 +220,8 @@ class OsmData:
     attribution : of these data, if more specific than the registry's
     added       : credits of other sources from which features were merged in
     cloud       : what was measured in point clouds, for the report; None without
+    around      : streets, railways and waterways beyond the bounds, whole, on which the heights of streets
+                  within depend; not part of the scene
     """
 
     bounds: Bounds
@@ -231,6 +236,7 @@ class OsmData:
     attribution: str = ""
     added: tuple[Credit, ...] = ()
     cloud: dict[str, Any] | None = None
+    around: list[Way] = field(default_factory=list)
 
     @property
     def digest(self) -> str:
@@ -238,7 +244,7 @@ class OsmData:
         import shapely  # noqa: PLC0415  (this module is imported for its names alone)
 
         digest = hashlib.sha256()
-        for way in self.ways:
+        for way in [*self.ways, *self.around]:
             digest.update(repr((way.osm_id, sorted(way.tags.items()))).encode() + way.lonlat.tobytes())
         shapes = shapely.to_wkb([area.geometry for area in self.areas])
         for area, shape in zip(self.areas, shapes, strict=True):

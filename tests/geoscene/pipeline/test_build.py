@@ -147,7 +147,7 @@ def test_face_features_are_rows_of_the_geopackage(scene):
         for feature in np.unique(mesh.feature[built])[:3]:
             corners = mesh.vertices[mesh.faces[mesh.feature == feature]] + tile.origin
             row = layer.iloc[int(feature)]
-            assert corners[..., 2].max() == pytest.approx(row.height, abs=0.01)
+            assert corners[..., 2].max() == pytest.approx(row.base + row.height, abs=0.01)
 
 
 def test_every_building_height_has_a_source(scene):

@@ -175,6 +175,24 @@ def test_a_passage_is_no_fault_if_it_is_as_low_as_its_sign_says(bench, tmp_path)
     assert not faults(bench, built(tmp_path, CROSSING | corners, ways))
 
 
+def test_a_ramp_has_its_height_also_where_the_bridge_is_beyond_the_bounds(tmp_path):
+    places = {n: (x + 80, y) for n, (x, y) in CROSSING.items()}
+    path = write_map(tmp_path / "map.osm", places, crossing({"bridge": "yes"}, {}))
+    terrain = (write_terrain(tmp_path / "dem.tif", SLOPE),)
+    found = []
+    for reach in (250.0, 30.0):
+        (west, east), (south, north) = FRAME.to_geographic(np.array([-250.0, reach]), np.array([-99.0, 99.0]))
+        osm = read_osm(path, bounds=(west, south, east, north))
+        scene = build(osm, tmp_path / str(reach), options=BuildOptions(dem=terrain, use="map"))
+        graph = scene.road_graph()
+        line = graph.geometry[np.flatnonzero(graph.osm_id == "way/100")[0]]
+        x, _ = FRAME.from_geographic(*scene.frame.to_geographic(line[:, 0], line[:, 1]))
+        found.append(np.interp([-20.0, 0.0, 10.0, 25.0], x, line[:, 2]))
+    np.testing.assert_allclose(*found, atol=0.001)
+    assert found[0][-1] > SLOPE(25.0, 0.0) + 2.0
+    assert set(graph.osm_id) == {"way/100"}
+
+
 def HILLS(x, y):  # noqa: N802 - a constant
     return 300.0 + 12.0 * np.sin(x / 40.0) * np.cos(y / 55.0) + 0.1 * x
 
