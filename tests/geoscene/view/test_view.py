@@ -265,8 +265,8 @@ def test_a_page_must_be_named_as_one(scene, tmp_path):
     [
         ({"bounds_deg": (0.0, 0.0, 1.0, 1.0)}, "nothing there"),
         ({"bounds_deg": (25.0, 60.2, 24.9, 60.1)}, "west, south, east, north"),
-        ({"max_mb": 0.0}, "more than 0"),
-        ({"max_mb": float("nan")}, "more than 0"),
+        ({"max_mb": 0.0}, "above 0"),
+        ({"max_mb": float("nan")}, "finite"),
     ],
 )
 def test_invalid_options_are_refused(scene, tmp_path, options, message):
