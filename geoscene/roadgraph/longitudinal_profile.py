@@ -70,9 +70,12 @@ _STILL, _MOVED = 1e-9, 1e-4
 _HARD, _STEADY, _HARDEST = 1e8, 4e9, 1e9
 """Of slopes; of changes of slope, of stations at full spacing; of heights, which come first where a
 short ramp cannot serve all."""
-_STEEPEST, _HELD, _GIVE = 1e12, 1e10, 0.1
-"""Of the steepest gradient; of roads beyond ramps, which may be so many metres off the ground: where a ramp
-is too short, it is steep, and where it cannot be steeper, the clearance is less, but these do not move."""
+_STEEPEST, _HELD = 1e12, 1e10
+"""Of the steepest gradient; of roads beyond ramps: where a ramp is too short, it is steep, and where it cannot
+be steeper, the clearance is less, but these do not move."""
+_GIVE, _CUT = 0.1, 40.0
+"""Metres that roads beyond ramps may be off the ground, and more for each unit of its slope: on hillsides they
+are cut and filled, and elevation models are less exact."""
 _WITHIN = 1.0
 """Metres inside the edges of a carriageway at which its height is looked up: a raster's cells blur kerbs."""
 _CLOSE = 1.0
@@ -186,6 +189,16 @@ def _near_structures(graph: RoadGraph, stations: Stations) -> Bools:
     return near
 
 
+def _steepness(stations: Stations, *, terrain: Float) -> Float:
+    """Greatest slope of the ground along roads at each station (v,)."""
+    a, b, metres, _ = stations.segments
+    slope = np.abs(terrain[b] - terrain[a]) / np.maximum(metres, _CLOSE)
+    found = np.zeros(len(terrain))
+    for end in (a, b):
+        np.maximum.at(found, end, slope)
+    return found
+
+
 def _weights(graph: RoadGraph, stations: Stations, *, ramp: Float) -> Float:
     """Weight of the distance from the ground at each station: per metre, times the station's length."""
     a, b, metres, edge = stations.segments
@@ -244,8 +257,9 @@ def _bounds(
     for begin, end in ((a[part], b[part]), (b[part], a[part])):
         rows.add([(end, 1.0), (begin, -1.0)], -options.steepest * metres[part], weight=_STEEPEST)
     held = np.flatnonzero(around & (ramp >= _RAMP_REACH))
+    give = (_GIVE + _CUT * _steepness(stations, terrain=terrain))[held]
     for sign in (1.0, -1.0):
-        rows.add([(held, sign)], sign * terrain[held] - _GIVE, weight=_HELD)
+        rows.add([(held, sign)], sign * terrain[held] - give, weight=_HELD)
 
     p, q, r, before, after = stations.triples
     near = np.minimum(before, after)
