@@ -71,11 +71,11 @@ _HARD, _STEADY, _HARDEST = 1e8, 4e9, 1e9
 """Of slopes; of changes of slope, of stations at full spacing; of heights, which come first where a
 short ramp cannot serve all."""
 _STEEPEST, _HELD = 1e12, 1e10
-"""Of the steepest gradient; of roads beyond ramps: where a ramp is too short, it is steep, and where it cannot
-be steeper, the clearance is less, but these do not move."""
+"""Of the steepest gradient; of roads beyond ramps: where a ramp is too short, it is steep, and where it
+cannot be steeper, the clearance is less, but these do not move."""
 _GIVE, _CUT = 0.1, 40.0
-"""Metres that roads beyond ramps may be off the ground, and more for each unit of its slope: on hillsides they
-are cut and filled, and elevation models are less exact."""
+"""Metres that roads beyond ramps may be off the ground, and more for each unit of its slope: on hillsides
+they are cut and filled, and elevation models are less exact."""
 _WITHIN = 1.0
 """Metres inside the edges of a carriageway at which its height is looked up: a raster's cells blur kerbs."""
 _CLOSE = 1.0
