@@ -235,11 +235,17 @@ def resample(
     if not frames:
         return {}
     picks = np.random.default_rng(seed).integers(0, len(frames), (RESAMPLES, len(frames)))
-    again = [figures([frames[k] for k in pick]) for pick in picks]
+    return with_intervals(figures(frames), [figures([frames[k] for k in pick]) for pick in picks])
+
+
+def with_intervals(
+    figures: Mapping[str, float], resampled: Sequence[Mapping[str, float]]
+) -> dict[str, ErrorEstimate]:
+    """Figures with the 95 % intervals of those of resampled data; not those that are NaN."""
     found = {}
-    for name, value in figures(frames).items():
+    for name, value in figures.items():
         if not np.isnan(value):
-            low, high = np.nanpercentile([one[name] for one in again], [2.5, 97.5])
+            low, high = np.nanpercentile([one[name] for one in resampled], [2.5, 97.5])
             found[name] = ErrorEstimate(value, float(low), float(high))
     return found
 

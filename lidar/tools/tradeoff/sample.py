@@ -41,6 +41,7 @@ from lidar.tools.tradeoff.errors import (
     PulseReturns,
     percentile,
     resample,
+    with_intervals,
 )
 from lidar.tools.tradeoff.variants import camera_reference, noiseless, scanner_reference
 
@@ -262,16 +263,11 @@ def _stratify(
     return np.sort(order[:_HARD]), np.sort(rng.permutation(order[_HARD:])[:_EASY])
 
 
-def range_figures(frames: Sequence[SampledError]) -> dict[str, float]:
+def range_estimates(frames: Sequence[SampledError], *, complete: bool) -> dict[str, ErrorEstimate]:
     """Metres that shares of the returns of frames do not exceed, by name, such as ``range_99.9_m``.
 
-    NaN without returns; and ``lost``, missed and extra returns over those of the reference.
-    """
-    return {name: error.value for name, error in range_estimates(frames, complete=True).items()}
-
-
-def range_estimates(frames: Sequence[SampledError], *, complete: bool) -> dict[str, ErrorEstimate]:
-    """The figures of `range_figures` with 95 % intervals by resampling pulses, and the frames of a sample.
+    Also ``lost``, missed and extra returns over those of the reference. With 95 % intervals by resampling
+    pulses, and the frames of a sample; not those without returns.
 
     complete : whether these are all frames of the drive, so that none but the pulses are a sample
     """
@@ -284,16 +280,11 @@ def range_estimates(frames: Sequence[SampledError], *, complete: bool) -> dict[s
     ranges, weight, of = ranges[order], weight[order], of[order]
     lost = np.array([(f.missed + f.extra, f.returns) for f in frames])
     times = rng.multinomial(len(frames), np.full(len(frames), 1 / len(frames)), size=RESAMPLES)
-    again = []
+    resampled = []
     for one in times:
         drawn = weight * rng.poisson(1.0, len(weight)) * (1 if complete else one[of])
-        again.append(_weighted_figures(ranges, drawn, lost=one @ lost))
-    found = {}
-    for name, value in _weighted_figures(ranges, weight, lost=lost.sum(axis=0)).items():
-        if not np.isnan(value):
-            low, high = np.nanpercentile([figures[name] for figures in again], [2.5, 97.5])
-            found[name] = ErrorEstimate(value, float(low), float(high))
-    return found
+        resampled.append(_weighted_figures(ranges, drawn, lost=one @ lost))
+    return with_intervals(_weighted_figures(ranges, weight, lost=lost.sum(axis=0)), resampled)
 
 
 def _weighted_figures(ranges: Float, weight: Float, *, lost: Float) -> dict[str, float]:

@@ -186,14 +186,17 @@ def _first_within(
     worst = [_worst(errors, limits, end="value") for errors in every]
     best = min(range(len(worst)), key=lambda row: worst[row][0])
     _, figure, error = worst[best]
-    label = label_of(search.ladders[kind].values(best))
+    label = label_of(ladder.values(best))
     raise InputError(_out_of_reach(accuracy, error, figure=figure, label=label))
 
 
 def _first(
     every: Sequence[Mapping[str, Mapping[str, ErrorEstimate]]], limits: Mapping[str, float], *, end: str
 ) -> int:
-    """The first row one of whose ends of errors is within limits; their number if there is none."""
+    """The first row all of whose errors are within limits by one end of their intervals, or their number.
+
+    end : ``low``, ``value`` or ``high`` of the estimates
+    """
     within = (row for row, errors in enumerate(every) if _worst(errors, limits, end=end)[0] <= 1)
     return next(within, len(every))
 
@@ -201,7 +204,7 @@ def _first(
 def _worst(
     errors: Mapping[str, Mapping[str, ErrorEstimate]], limits: Mapping[str, float], *, end: str
 ) -> tuple[float, str, ErrorEstimate]:
-    """The largest error of any sensor over its limit, by one of its ``ends``, with its name and all of it."""
+    """The largest error of any sensor over its limit, with its name and estimate; ``end`` as of `_first`."""
     found = [
         (getattr(figures[name], end) / limit, name, figures[name])
         for figures in errors.values()

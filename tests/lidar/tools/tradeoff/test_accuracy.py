@@ -28,7 +28,6 @@ from lidar.tools.tradeoff.sample import (
     DriveSample,
     SampledError,
     range_estimates,
-    range_figures,
     sampled_error,
 )
 from lidar.tools.tradeoff.search import DriveCost, find_accurate, find_affordable, pace_of
@@ -290,10 +289,10 @@ def test_weighted_errors_of_matched_missed_and_extra_returns():
     )
     np.testing.assert_allclose(error.range, [0.1, 0])
     assert (error.weight.tolist(), error.missed, error.extra, error.returns) == ([1, 10], 1, 5, 12)
-    found = range_figures([error, error])
-    assert found["range_90_m"] == 0
-    assert found["range_95_m"] == pytest.approx(0.1)
-    assert found["lost"] == pytest.approx(6 / 12)
+    found = range_estimates([error, error], complete=True)
+    assert found["range_90_m"].value == 0
+    assert found["range_95_m"].value == pytest.approx(0.1)
+    assert found["lost"].value == pytest.approx(6 / 12)
 
 
 def test_missed_and_extra_returns_are_stated_where_they_matter():
