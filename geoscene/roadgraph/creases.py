@@ -56,11 +56,11 @@ def crease_lines(graph: RoadGraph, height: Height, *, area: Any | None = None) -
     drawn = edge_lines(graph)
     tree = shapely.STRtree(drawn[uneven])
     once = once[np.unique(tree.query(drawn[once], predicate="dwithin", distance=_GRADED)[0])]
-    once = once[in_reach(edge_lines(graph)[once], area, metres=_NEAR)]
+    once = once[in_reach(drawn[once], area, metres=_NEAR)]
     if not len(once):
         return np.empty((0, 2, 2))
     begun = structure_starts(graph)
-    begun = begun.take(in_reach(edge_lines(graph)[begun.edge], area, metres=_NEAR))
+    begun = begun.take(in_reach(drawn[begun.edge], area, metres=_NEAR))
     lines = [*graph.geometry[once], *begun.line]
     edge = np.append(once, begun.edge)
     xyz = np.concatenate(lines)

@@ -161,17 +161,24 @@ def _near_edges(graph: RoadGraph, stations: Stations, *, ground: Height) -> Floa
     return total / count
 
 
+def _structures(graph: RoadGraph, stations: Stations) -> tuple[Bools, Bools]:
+    """Whether segments (s,) are of bridges or tunnels, and whether stations (v,) are on these."""
+    a, b, _, edge = stations.segments
+    structure = graph.bridge[edge] | graph.tunnel[edge]
+    on = np.zeros(len(stations.xy), np.bool_)
+    on[a[structure]] = on[b[structure]] = True
+    return structure, on
+
+
 def _along_ramps(graph: RoadGraph, stations: Stations) -> Float:
     """Metres (v,) of stations on ramps from their bridge or tunnel, `_RAMP_REACH` at all others.
 
     A ramp is a road on the ground from the end of a bridge or a tunnel to its first junction of roads on
     the ground.
     """
-    a, b, metres, edge = stations.segments
-    structure = graph.bridge[edge] | graph.tunnel[edge]
-    count = len(stations.xy)
-    ends = np.zeros(count, np.bool_)
-    ends[a[structure]] = ends[b[structure]] = True
+    a, b, metres, _ = stations.segments
+    structure, ends = _structures(graph, stations)
+    count = len(ends)
     arms = np.bincount(np.concatenate([a[~structure], b[~structure]]), minlength=count)
     junction = arms > np.where(ends, 1, 2)
     part = ~structure & ~junction[a] & ~junction[b]
@@ -180,10 +187,8 @@ def _along_ramps(graph: RoadGraph, stations: Stations) -> Float:
 
 def _near_structures(graph: RoadGraph, stations: Stations) -> Bools:
     """Whether stations (v,) are within `_RAMP_REACH` of a bridge or a tunnel along roads on the ground."""
-    a, b, metres, edge = stations.segments
-    structure = graph.bridge[edge] | graph.tunnel[edge]
-    ends = np.zeros(len(stations.xy), np.bool_)
-    ends[a[structure]] = ends[b[structure]] = True
+    a, b, metres, _ = stations.segments
+    structure, ends = _structures(graph, stations)
     links = a[~structure], b[~structure], metres[~structure]
     near: Bools = _distance(len(ends), links, start=ends, limit=_RAMP_REACH) < _RAMP_REACH
     return near

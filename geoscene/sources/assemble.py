@@ -11,7 +11,6 @@ from geoscene.errors import SourceNotFoundError
 from geoscene.sources.areas import Places, is_multipolygon, multipolygon_areas, way_areas
 from geoscene.sources.data import (
     AROUND_BOUNDS,
-    METRES_PER_DEGREE,
     Bounds,
     OsmData,
     Relation,
@@ -25,7 +24,7 @@ from geoscene.sources.data import (
     kind_of,
 )
 from geoscene.sources.elements import UNITS, Elements
-from geoscene.sources.extent import checked_bounds, locate, near_extent
+from geoscene.sources.extent import checked_bounds, locate, near_extent, widened
 from geoscene.support.problems import Action, Problem
 from geoscene.typing import Bools, Ints
 
@@ -140,10 +139,7 @@ def _select(data: OsmData, bounds: Bounds) -> OsmData:
 
 def _ways_around(elements: Elements, bounds: Bounds, *, inside: set[str]) -> list[Way]:
     """Streets, railways and waterways up to `AROUND_BOUNDS` metres beyond the bounds, not ``inside``."""
-    west, south, east, north = bounds
-    up = AROUND_BOUNDS / METRES_PER_DEGREE
-    aside = up / max(np.cos(np.radians((south + north) / 2)), 0.01)
-    near = _intersect(elements, (west - aside, south - up, east + aside, north + up))
+    near = _intersect(elements, widened(bounds, AROUND_BOUNDS))
     rows = [
         row
         for row in np.flatnonzero(near).tolist()

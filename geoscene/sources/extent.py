@@ -176,6 +176,14 @@ def _beyond(lonlat: Float, bounds: Bounds) -> Float:
     return metres * METRES_PER_DEGREE
 
 
+def widened(bounds: Bounds, metres: float) -> Bounds:
+    """Bounds in degrees with a margin on all sides."""
+    west, south, east, north = bounds
+    up = metres / METRES_PER_DEGREE
+    aside = up / max(float(np.cos(np.radians((south + north) / 2))), 1e-6)
+    return west - aside, south - up, east + aside, north + up
+
+
 def _main_part(lonlat: Float) -> Bools:
     """(n,) bool, points not in a small group at an end beyond a wide gap in longitude or latitude."""
     kept = np.arange(len(lonlat))
@@ -201,10 +209,9 @@ def _main_part(lonlat: Float) -> Bools:
 
 def _cut(stated: Bounds, found: Bounds) -> tuple[Bounds, list[Problem]]:
     """Stated bounds, limited to 10 km beyond the nodes' extent, and a report."""
-    dy = _EMPTY / METRES_PER_DEGREE
-    dx = dy / max(float(np.cos(np.radians((found[1] + found[3]) / 2))), 1e-6)
-    west, south = max(stated[0], found[0] - dx), max(stated[1], found[1] - dy)
-    east, north = min(stated[2], found[2] + dx), min(stated[3], found[3] + dy)
+    wide = widened(found, _EMPTY)
+    west, south = max(stated[0], wide[0]), max(stated[1], wide[1])
+    east, north = min(stated[2], wide[2]), min(stated[3], wide[3])
     if west >= east or south >= north:
         west, south, east, north = found
     elif (west, south, east, north) == stated:
