@@ -208,7 +208,7 @@ def scenes_of(path: Path, given: argparse.Namespace, folder: Path) -> Iterator[t
         if (ground == "level" and given.only != "terrain") or (dem and given.only != "level"):
             options = BuildOptions(
                 relief="off",
-                lod=0,
+                lod=1,
                 dem=dem,
                 dem_gaps="nearest",
                 only=("buildings", "roads", "landcover", "barriers"),

@@ -60,10 +60,10 @@ def build_solids(
     """One valid body (`check_solids`) per building, and the simplified or dropped ones.
 
     Vertices lie on the 0.1 mm grid. Faces have the building's row as feature, class BUILDING, and surface,
-    material and colour. LoD 0 extrudes the outline from the ground to the mean height of its parts; LoD 1 has
-    parts with their undersides and flat tops at full height; LoD 2 has roofs. A building whose body is not a
-    solid is built again with its parts on a common grid, then with parts that have roofs overlapping others,
-    then with flat roofs, then with cleaned footprints, and is dropped if that fails too.
+    material and colour. LoD 0 extrudes the outline from its lowest underside to the mean height of its parts;
+    LoD 1 has parts with their undersides and flat tops at full height; LoD 2 has roofs. A building whose body
+    is not a solid is built again with its parts on a common grid, then with parts that have roofs overlapping
+    others, then with flat roofs, then with cleaned footprints, and is dropped if that fails too.
 
     base : (count,) or (n,) z in metres of each building's base, in the order of the table; a part stands on
            its building's base
@@ -131,7 +131,7 @@ def _pieces(buildings: Buildings, base: Float, *, foot: Float, lod: int) -> _Pie
     polygon, row, building = polygon[order], row[order], building[order]
     low, high = buildings.min_height[row], buildings.height[row]
     if lod == 0:
-        low, high = np.minimum(low, 0.0), _mean_heights(buildings)[row]
+        low, high = _lowest(buildings)[row], _mean_heights(buildings)[row]
     flat = (
         np.full(len(row), lod < 2) | (buildings.roof_shape[row] == "flat") | (buildings.roof_height[row] <= 0)
     )
@@ -170,6 +170,13 @@ def _straighten(polygons: Polygons, building: Ints) -> Polygons:
     out = polygons.copy()
     out[longer] = shapely.polygons(shapely.linearrings(corners[kept], indices=ring[kept]), indices=of)
     return out
+
+
+def _lowest(buildings: Buildings) -> Float:
+    """Lowest undersides (n,) of the drawn rows of each row's outline, in metres above its base."""
+    lowest, drawn = np.full(len(buildings), np.inf), buildings.drawn
+    np.minimum.at(lowest, buildings.outline[drawn], buildings.min_height[drawn])
+    return np.where(np.isinf(lowest), buildings.min_height, lowest)
 
 
 def _mean_heights(buildings: Buildings) -> Float:

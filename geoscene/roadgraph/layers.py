@@ -50,4 +50,4 @@ def _oddity(tags: Tags) -> tuple[str, str] | None:
         return ("odd-layer", f"{text} of a bridge, which passes over the ground") if layer < 0 else None
     if is_tunnel(tags):
         return ("odd-layer", f"{text} of a tunnel, which passes under the ground") if layer > 0 else None
-    return "layer-without-structure", f"{text} without bridge or tunnel has no effect"
+    return "layer-without-structure", f"{text} has no effect: no bridge, and no tunnel below the ground"

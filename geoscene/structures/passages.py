@@ -213,9 +213,13 @@ def _eaves(buildings: Buildings, row: Ints) -> Float:
 
 
 def _is_passage(tags: Tags) -> bool:
-    """Whether a road, path or track runs on the ground through buildings or under their roofs."""
+    """Whether a road, path or track runs on the ground through buildings or under their roofs.
+
+    ``level`` does not take a road with ``tunnel=building_passage`` off the ground.
+    """
     inside = tags.get("tunnel") in _COVERED or tags.get("covered", "no") != "no"
-    on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
+    road = tags.get("tunnel") in _COVERED and drivable(tags, private=True)
+    on_ground = place_and_layer(tags)[0] == 0 and (road or not storey_tag(tags))
     return inside and on_ground and _width(tags) > 0 and tags.get("indoor", "no") == "no"
 
 

@@ -744,6 +744,16 @@ def test_what_stands_on_the_ground_reaches_down_to_the_foot(lod):
     assert mesh.vertices[:, 2].max() == pytest.approx(106.75 if lod == 0 else 109.0)
 
 
+@pytest.mark.parametrize("lod", [0, 1, 2])
+def test_a_house_over_a_street_leaves_it_free_at_every_level_of_detail(lod):
+    areas = (house(1, box(0, 0, 20, 10), height="9", min_height="4"), house(2, box(50, 0, 5, 5)),
+             part(3, box(50, 0, 5, 5), height="7", min_height="5"),
+             part(4, box(50, 0, 5, 5), height="9", min_height="7"))  # fmt: skip
+    table, _ = read_buildings(osm(*areas), FRAME)
+    mesh, _ = build_solids(table, base=np.zeros(table.count), lod=lod)
+    assert [mesh.take(mesh.feature == k).vertices[:, 2].min() for k in (0, 1)] == [4.0, 5.0]
+
+
 def test_a_part_on_top_stands_on_the_outline_and_not_over_a_hole():
     areas = (house(1, box(0, 0, 20, 10), height="15"),
              part(2, box(5, 2, 6, 6), height="18", min_height="15"))  # fmt: skip

@@ -104,6 +104,7 @@ def classes(plan, *places):
         (PASSAGE | {"maxheight": "3.8", "height": "4.2 m"}, 4.2),
         (PASSAGE | {"layer": "-1"}, 4.5),
         (PASSAGE | {"layer": "1"}, 4.5),
+        (PASSAGE | {"level": "-2"}, 4.5),
         ({"covered": "yes"}, 4.5),
         ({"tunnel": "covered"}, 4.5),
         ({"tunnel": "yes"}, 4.5),
