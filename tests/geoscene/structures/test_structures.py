@@ -39,6 +39,7 @@ from geoscene.structures.layered import (
     raise_shell,
     without_slivers,
 )
+from geoscene.structures.verges import Clearances, without_ground_roads
 
 FRAME = Frame.at(10.0, 50.0)
 SIZES = StructureOptions()
@@ -676,6 +677,23 @@ def test_adjacent_carriageways_are_divided_midway():
             assert blocked(mesh, points) == 0
             z, _ = first_below(mesh, moved(points, 0, 0, 1.5))
             np.testing.assert_allclose(z, points[:, 2], atol=0.02)
+
+
+@pytest.mark.parametrize(("z", "whole"), [(6.0, True), (4.2, True), (3.0, False)])
+def test_a_deck_is_whole_across_a_road_if_a_car_passes_below(z, whole):
+    graph = Town(town({1: (-200, -200), 2: (200, 200)}, [(ROAD, [1, 2])])).graph
+    line = np.array([[-30.0, 0.0, z], [30.0, 0.0, z]])
+    deck = shapely.box(-30, -4, 30, 4)
+    (left,) = without_ground_roads(
+        np.array([deck], object),
+        np.fromiter([line], object),
+        foot=np.array([False]),
+        ends=np.fromiter([line[:, :2]], object),
+        sizes=Clearances(np.array([4.0]), np.array([SIZES.headroom]), np.array([SIZES.deck])),
+        graph=graph,
+        headroom=SIZES.headroom,
+    )
+    assert (left.area == pytest.approx(deck.area)) == whole
 
 
 def ground_mesh(town, extent):
