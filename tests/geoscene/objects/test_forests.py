@@ -182,6 +182,7 @@ def test_rays_views_and_exports_meet_the_same_trees(scene, tmp_path):
     assert view_scene(scene, tmp_path / "a.html").path.stat().st_size > 12 * len(table) / 4
 
 
+@pytest.mark.full
 def test_an_obj_that_would_be_too_large_is_refused_with_its_size(scene, tmp_path):
     out = tmp_path / "a.obj"
     written = export_scene(scene, out).path.stat().st_size

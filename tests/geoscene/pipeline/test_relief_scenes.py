@@ -111,6 +111,7 @@ def test_modelled_tiles_are_watertight(relief):
     assert any((t.mesh.surface == DOOR).any() for t in tiles)
 
 
+@pytest.mark.full
 def test_cityjson_has_windows_and_doors_in_closed_solids(relief, tmp_path):
     out = tmp_path / "city.city.json"
     export_scene(relief, out, options=ExportOptions(layers=("buildings",), relief="mesh"))

@@ -636,7 +636,7 @@ def test_forking_tunnels_share_one_tube_without_walls_across_lanes():
 def test_tunnels_that_meet_at_any_angle_leave_no_wall_at_the_bend(arms_deg):
     places, ways = {1: (0.0, 0.0)}, []
     for k, arm in enumerate(np.radians(arms_deg)):
-        for n, far in ((10, 200), (20, 500)):
+        for n, far in ((10, 120), (20, 420)):
             places[n + k] = (far * np.cos(arm), far * np.sin(arm))
         ways += [(TUNNEL, [1, 10 + k]), (ROAD, [10 + k, 20 + k])]
     meeting = Town(town(places, ways))

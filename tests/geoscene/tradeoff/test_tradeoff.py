@@ -26,6 +26,7 @@ def found():
     return tradeoff(partial(read_osm, demo_path(), bounds=BOX), BuildOptions(), settings=("lod", "for"))
 
 
+@pytest.mark.full
 def test_errors_are_against_the_full_scene_and_ordered(found):
     rows = {row.label: row for row in found.rows}
     full = rows["full scene"]
@@ -43,6 +44,7 @@ def test_errors_are_against_the_full_scene_and_ordered(found):
         assert 2e7 < row.cost.memory_bytes < 4e9
 
 
+@pytest.mark.full
 def test_report_has_table_plot_page_and_document(found, tmp_path):
     write_report(found, tmp_path)
     assert json.loads((tmp_path / "tradeoff.json").read_text()) == json.loads(json.dumps(document(found)))

@@ -8,6 +8,7 @@ from lidar.sensors.camera.texture import GRAINS, detail
 from lidar.sensors.camera.texture_blocks import BLOCK, DETAIL, PAINTED, PLACES, UPRIGHT, factors, scratch
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("wide", [1e-3, 0.02, 0.5])
 def test_factors_of_mixed_pixels_are_those_of_one_pixel_each(wide):
     rng = np.random.default_rng(0)

@@ -252,6 +252,7 @@ def test_the_map_of_another_place_is_refused(attacked, scene, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.full
 def test_all_leaves_the_map_out_where_the_scene_is_gone(attacked, scene, tmp_path):
     moved = tmp_path / "moved"
     shutil.copytree(attacked, moved)

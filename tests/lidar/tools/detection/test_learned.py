@@ -220,6 +220,7 @@ def _f1(folder: Path, out: Path, detector: str) -> float:
     return 2 * (hits / users) * (right / boxes) / (hits / users + right / boxes)
 
 
+@pytest.mark.full
 def test_it_finds_more_vehicles_than_the_rules_on_a_drive_it_was_not_trained_on(
     street: Path, tmp_path: Path
 ) -> None:

@@ -62,6 +62,7 @@ def assert_follows(found, metres):
     assert turned.max() < 0.01
 
 
+@pytest.mark.full
 def test_small_gicp_follows_a_drive_in_a_bend_uphill(estimated):
     assert_follows(estimated[0], 0.05)
 

@@ -308,6 +308,7 @@ def test_attacks_without_truth_files_of_clouds_are_told_from_the_drive_without_a
     assert spoofed.success.share == 1.0
 
 
+@pytest.mark.full
 def test_a_matrix_of_drives(written: Callable[..., Path], tmp_path: Path) -> None:
     file = written(PHANTOM + DAZZLE + '[defences]\nuse = ["occlusion", "shadow"]')
     first = redteam(file, tmp_path / "out")

@@ -63,6 +63,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(recorded, tmp_path):
     same_files(summary.path, tmp_path / "out")
 
 
+@pytest.mark.full
 def test_repeated_sweep_keeps_finished_drives_and_mends_the_others(scene, tmp_path):
     file = written(tmp_path / "grid.toml", scene)
     first = sweep(file, tmp_path / "out")

@@ -100,6 +100,7 @@ def test_blocks_are_spread_so_that_small_effects_are_met(scene, drive):
             assert inside.min() >= 1
 
 
+@pytest.mark.full
 def test_errors_of_a_camera_on_a_drive(found):
     (one,) = found.comparisons
     assert (one.kind, one.samples, one.frames) == ("camera", 256, 2)
@@ -117,6 +118,7 @@ def test_errors_of_a_camera_on_a_drive(found):
     assert "For 10 levels rms" in recommendation(one, 10.0)
 
 
+@pytest.mark.full
 def test_the_report_of_a_camera_is_written(found, tmp_path):
     write_report(found, tmp_path / "out")
     assert (tmp_path / "out/pareto_front.png").exists()

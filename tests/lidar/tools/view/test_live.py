@@ -105,6 +105,7 @@ def plain(scene, short, tmp_path_factory):
     return out
 
 
+@pytest.mark.full
 @pytest.mark.usefixtures("viewer")
 def test_what_is_shown_is_what_is_recorded(scene, short, plain, tmp_path):
     watched = tmp_path / "drive"
