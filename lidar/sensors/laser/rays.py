@@ -53,7 +53,7 @@ def widest_gap(rays: int) -> float:
     return float(np.diff(across, axis=0).max(initial=0.0))
 
 
-_UNIFORM = 0.5 * np.sqrt(3.0)
+_UNIFORM = 0.5 * math.sqrt(3.0)
 """Width of a uniform profile with the standard deviation of a Gaussian one, in widths of that at 1/e^2."""
 
 
@@ -85,12 +85,12 @@ class Beam:
 
     @property
     def footprint(self) -> tuple[float, float]:
-        """Height of a ray's share of the beam, metres, at its start, and its growth per metre.
+        """Height of the beam, metres, at its start, and its growth per metre.
 
-        A Gaussian profile spreads as far as a uniform one of 0.87 of its width at 1/e^2.
+        Relief below the size of the footprint has no effect on the range of a pulse, whatever the number of
+        its rays. A Gaussian profile spreads as far as a uniform one of 0.87 of its width at 1/e^2.
         """
-        share = 2.0 * float(_UNIFORM / np.sqrt(self.rays))
-        return share * float(self.size[1]), share * float(self.spread[1])
+        return 2.0 * _UNIFORM * float(self.size[1]), 2.0 * _UNIFORM * float(self.spread[1])
 
 
 def beam_of(
