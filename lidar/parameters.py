@@ -165,8 +165,12 @@ def read_values(kind: type[Any], given: Mapping[str, Any], *, also: Collection[s
     for name in given:
         if name not in known:
             raise InputError(unknown_name("parameter", name, known=[*known, *also]))
+    metres = {f.name for f in parameters_of(kind) if f.metadata["unit"] == "m"}
     return {
-        name: _value(value, known[name]) if isinstance(value, str) else value for name, value in given.items()
+        name: _value(_in_metres(value) if name in metres else value, known[name])
+        if isinstance(value, str)
+        else value
+        for name, value in given.items()
     }
 
 
@@ -184,6 +188,16 @@ def build(registry: Registry[type[P]], item: Item, *, also: Collection[str] = ()
         return kind(**read_values(kind, item.values, also=also))
     except InputError as error:
         raise InputError(f"{item.source}{registry.what} {item.name}: {error}") from None
+
+
+_LENGTH = re.compile(r"([\d.]+) ?(mm|cm|m)")
+_EXPONENTS = {"mm": "e-3", "cm": "e-2", "m": ""}
+
+
+def _in_metres(text: str) -> str:
+    """A length such as 5mm, 1cm or 0.5 m as a number of metres; another text as it is."""
+    found = _LENGTH.fullmatch(text)
+    return found[1] + _EXPONENTS[found[2]] if found else text
 
 
 def _value(text: str, kind: type) -> Any:

@@ -60,7 +60,9 @@ def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> Settings
 
 def _change(settings: S, given: Mapping[str, str]) -> S:
     """Settings of one group with those that are given and that it has changed."""
-    own = {name: text for name, text in given.items() if hasattr(settings, name)}
+    own = {name: text for name, text in given.items() if name in {f.name for f in fields(settings)}}
+    if "footprint" in own:
+        own = {"rays": "1", **own}
     try:
         return replace(settings, **read_values(type(settings), own))
     except InputError as error:

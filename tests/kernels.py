@@ -34,6 +34,7 @@ USES = {
         (*ROAD, "--traffic=on", "-o=full"),
         (*ROAD, "--weather=rain=10mm/h", "--road=by-weather", "-o=rain"),
         (*ROAD, "--rig=vlp16", "--fidelity=survey", "--weather=fog=80m", "-o=fog"),
+        (*ROAD, "--rig=vlp16", "--set=footprint=1cm", "-o=footprints"),
         (
             *DRIVE,
             "--rig=drone",

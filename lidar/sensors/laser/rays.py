@@ -6,7 +6,7 @@ import functools
 import math
 import threading
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +45,41 @@ def bundle(rays: int) -> Float:
     return np.concatenate([np.zeros((1, 2)), place - place.mean(axis=0)]) if rays > 1 else np.zeros((1, 2))
 
 
+class BeamSample(NamedTuple):
+    """Rays that sample a beam.
+
+    place : (rays, 2) on the unit disc, the beam's axis first
+    power : (rays,) share of the pulse's power that each ray has
+    gap   : widest gap between neighbours in projection on any line, on the unit disc
+    """
+
+    place: Float
+    power: Float
+    gap: float
+
+
 @functools.cache
-def widest_gap(rays: int) -> float:
-    """Widest gap between neighbours of a `bundle` in projection on any line, on the unit disc."""
+def equal_rays(rays: int) -> BeamSample:
+    """The rays of `bundle`, of equal power."""
+    place = bundle(rays)
+    return BeamSample(place, np.full(rays, 1.0 / rays), _widest_gap(place))
+
+
+@functools.cache
+def probe() -> BeamSample:
+    """Seven rays: the axis, and six at the rim, where a beam first meets what stands beside a surface.
+
+    Their powers are such that a plane at any angle has the mean range of a Gaussian beam, to third order.
+    """
+    angle = np.arange(6) * math.pi / 3
+    place = np.concatenate([np.zeros((1, 2)), np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+    rim = float((bundle(MOST_RAYS) ** 2).sum(axis=1).mean())
+    return BeamSample(place, np.append(1.0 - rim, np.full(6, rim / 6)), _widest_gap(place))
+
+
+def _widest_gap(place: Float) -> float:
     angle = np.linspace(0, math.pi, 720, endpoint=False)
-    across = np.sort(bundle(rays) @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
+    across = np.sort(place @ np.stack([np.cos(angle), np.sin(angle)]), axis=0)
     return float(np.diff(across, axis=0).max(initial=0.0))
 
 
@@ -59,15 +89,15 @@ _UNIFORM = 0.5 * math.sqrt(3.0)
 
 @dataclass(frozen=True, slots=True)
 class Beam:
-    """Rays of equal power that sample the cross-section of each pulse.
+    """Rays that sample the cross-section of each pulse.
 
-    place  : (rays, 2) on the unit disc, see `bundle`; the beam's axis comes first
+    sample : its rays
     spread : (2,) radians, half angles of the beam to the left and up
     size   : (2,) metres, half of the beam's width and height where it starts
-    turn   : (n,) radians by which ``place`` is turned for each pulse; empty for one ray
+    turn   : (n,) radians by which its rays are turned for each pulse; empty for one ray
     """
 
-    place: Float
+    sample: BeamSample
     spread: Float
     size: Float
     turn: Float
@@ -75,12 +105,12 @@ class Beam:
     @property
     def rays(self) -> int:
         """Number of rays per pulse."""
-        return len(self.place)
+        return len(self.sample.place)
 
     @property
     def gap(self) -> Gap:
         """Widest gap between neighbouring rays, in the wider direction of the beam."""
-        share = widest_gap(self.rays)
+        share = self.sample.gap
         return Gap(share * float(self.size.max()), share * float(self.spread.max()))
 
     @property
@@ -94,16 +124,15 @@ class Beam:
 
 
 def beam_of(
-    rays: int, *, divergence: tuple[float, float], aperture: tuple[float, float], turn: Float
+    sample: BeamSample, *, divergence: tuple[float, float], aperture: tuple[float, float], turn: Float
 ) -> Beam:
     """The beam of a scanner.
 
-    rays       : rays per pulse
     divergence : (2,) radians, full 1/e^2 angles, horizontal and vertical
     aperture   : (2,) metres, size of the beam at its start
     turn       : (n,) as in `Beam`
     """
-    return Beam(bundle(rays), np.divide(divergence, 2), np.divide(aperture, 2), turn)
+    return Beam(sample, np.divide(divergence, 2), np.divide(aperture, 2), turn)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +217,7 @@ class MovingSensor:
             fired.origin[part],
             work - part.start,
             (self._turn, self._shift),
-            (beam.place, beam.spread, beam.size, beam.turn[part]),
+            (beam.sample.place, beam.spread, beam.size, beam.turn[part]),
             (out.index, out.direction, out.origin, out.order),
         )
         return out

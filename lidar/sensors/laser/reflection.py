@@ -94,7 +94,7 @@ class SurfaceOptics:
         n = len(hits.range)
         found, apart = _columns(n), np.empty(n, np.bool_)
         count, row, is_water = self.fill(
-            found, hits, first=0, rays=1, separation=0.0, gap=AXIS_ONLY, apart=apart
+            found, hits, first=0, power=np.ones(1), separation=0.0, gap=AXIS_ONLY, apart=apart
         )
         return found.take(slice(count)), row, is_water
 
@@ -104,13 +104,14 @@ class SurfaceOptics:
         hits: Hits,
         *,
         first: int,
-        rays: int,
+        power: Float,
         separation: float,
         gap: Gap,
         apart: NDArray[np.bool_],
     ) -> tuple[int, NDArray[np.int32], NDArray[np.bool_]]:
         """Fill columns with the echoes of the pulses from number ``first`` on, and return their number.
 
+        ``power`` (rays,) is the share of each ray of a pulse.
         Also returned are the rays (k,) that hit glass or water, and whether they hit water. The surfaces of
         pulses with such rays are marked in ``apart`` and not merged into echoes.
         """
@@ -118,7 +119,7 @@ class SurfaceOptics:
         count, found = _receive(
             (hits.range, hits.face, hits.instance, hits.cosine),
             first,
-            rays,
+            power,
             self.faces,
             self.tables,
             separation,
@@ -131,7 +132,7 @@ class SurfaceOptics:
         surface = self.faces.packed[hits.face[ray] + self.faces.start[hits.instance[ray]]]
         is_water: NDArray[np.bool_] = surface & 255 == glossy_codes()[1]
         wet = row[is_water]
-        echoes.apparent[wet] = glint(echoes.cosine[wet]) / rays
+        echoes.apparent[wet] = glint(echoes.cosine[wet]) * power[ray[is_water] % len(power)]
         return count, ray, is_water
 
 
@@ -143,7 +144,7 @@ def _with_open(plain: Float, covered: Float) -> Float:
 class EchoCollector:
     """Collects the echoes of consecutive pulses, batch after batch.
 
-    beam       : of the pulses; its rays have equal power
+    beam       : of the pulses
     separation : metres; surfaces closer than this give one echo
     pulses     : number of pulses in all
     """
@@ -163,7 +164,7 @@ class EchoCollector:
             self._columns.take(part),
             hits,
             first=first,
-            rays=self._beam.rays,
+            power=self._beam.sample.power,
             separation=self._separation,
             gap=self._gap,
             apart=self._glossy[part],
@@ -197,7 +198,7 @@ def _columns(n: int) -> Echoes:
 def _receive(
     hits: Any,
     pulse: Any,
-    rays: Any,
+    shares: Any,
     faces: Any,
     tables: Any,
     separation: Any,
@@ -212,7 +213,7 @@ def _receive(
     starts, named, packed, own = faces.start, faces.named, faces.packed, len(faces.start) - 1
     reflectance, specular, factor, mirrors = tables.reflectance, tables.specular, tables.factor, tables.glossy
     films, soaked = tables.film, tables.soaked
-    low, law, spread = tables.low, tables.law, len(tables.factor) > 0
+    low, law, spread, rays = tables.low, tables.law, len(tables.factor) > 0, len(shares)
     numbers, ranges, apparents, features, classes, cosines, trues, axes = out
     back, away, slant, depth = np.empty(rays), np.empty(rays), np.empty(rays), np.empty(rays)
     axis = np.zeros(rays, np.bool_)
@@ -241,7 +242,7 @@ def _receive(
                 rho = one_off if rho > RETRO else min(one_off, RETRO)
             surfaces[k], slant[k], away[k] = surface, c, distance[i]
             depth[k] = depth_of(distance[i], c, gap)
-            back[k] = sent_back(rho, c, specular[material], law) / rays
+            back[k] = sent_back(rho, c, specular[material], law) * shares[k]
             insert(row, size, k, away)
             size += 1
             plain &= not mirrors[material]

@@ -112,8 +112,9 @@ def cast(
     pulses : (k,) ascending rows of the frame's pulses to send; all by default
     """
     firings = find_pulse(sensor, frame, settings=settings)
-    if pulses is not None:
-        firings = chosen(firings, np.isin(np.arange(len(firings)), pulses))
+    kept = None if pulses is None else np.isin(np.arange(len(firings)), pulses)
+    if kept is not None and not settings.footprint:
+        firings, kept = chosen(firings, kept), None
     sent = firings
     if settings.angle_noise:
         noise = generator(seed, sensor.name, frame, "angle").standard_normal((len(firings), 3))
@@ -135,6 +136,11 @@ def cast(
         frame=frame,
         threads=threads,
     )
+    if kept is not None:  # rays of a pulse depend on those that are fired beside it
+        number = (np.cumsum(kept) - 1).astype(np.int32)
+        echoes = echoes.where(kept[echoes.pulse])
+        echoes = replace(echoes, pulse=number[echoes.pulse])
+        firings, sent = chosen(firings, kept), chosen(sent, kept)
     if settings.extinction:
         away = echoes.range + sensor.pattern.range_offset
         echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
@@ -186,7 +192,7 @@ def detect(sweep: Sweep, echoes: Echoes, *, deviates: Deviates) -> DetectedEchoe
         first = len(sweep.echoes) + k * len(sweep.firings)
         echoes = join(echoes, trace(found, origin, source=first + found.pulse) if is_traced else found)
     number, count = number_echoes(echoes)
-    if settings.rays > 1 or settings.mirrors or false or is_traced:
+    if settings.traces_footprints or settings.mirrors or false or is_traced:
         power = receive(sensor, echoes)
         rows = select_reported(
             echoes, power, mode=sensor.return_mode, most=sensor.max_echoes, second=sensor.second_strongest

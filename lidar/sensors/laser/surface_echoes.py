@@ -8,18 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.typing import Float
+from geoscene.typing import Float, Ints
 from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator, uniform_of
 from lidar.raycast import Caster, Hits
 from lidar.raycast.hits import own_faces
-from lidar.sensors.laser.rays import MovingSensor, PulseRays, beam_of
+from lidar.sensors.laser.footprints import Watch, adaptive_echoes
+from lidar.sensors.laser.rays import BeamSample, MovingSensor, PulseRays, beam_of, equal_rays
 from lidar.sensors.laser.reflection import EchoCollector, SurfaceOptics
 from lidar.sensors.physics.echoes import Echoes, by_pulse, join, merge
 from lidar.sensors.physics.reflect import pane_reflection, reflect, surface_reflection
 from lidar.sensors.physics.settings import ScannerSettings
-from lidar.sensors.rig.patterns.beams import Firings
+from lidar.sensors.rig.patterns.beams import Firings, chosen
 from lidar.sensors.rig.scanner import Sensor
 from lidar.world.surfaces import SurfaceFaces
 from lidar.world.world import World
@@ -171,59 +172,96 @@ def surface_echoes(
     time        : (n,) ray times of the pulses; None in a static world
     seed, frame : of random reflectances, leaves, and turns of each pulse's rays about its axis
     """
-    rays, turn = settings.rays, np.empty(0)
-    if rays > 1:
+    turn, foliage = np.empty(0), None
+    if settings.traces_footprints:
         turn = 2 * np.pi * generator(seed, sensor.name, frame, "footprint").random(len(pulses))
-    beam = beam_of(rays, divergence=sensor.divergence, aperture=sensor.aperture, turn=turn)
     far = min(sensor.max_range - sensor.pattern.range_offset, world.reach)
-    separation = sensor.echo_separation
-    batch = max(_BATCH // rays, 1)
-    optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
-    moving = MovingSensor(pulses, mount, trajectory=trajectory, beam=beam, batch=batch)
-    collector = EchoCollector(optics, beam, separation=separation, pulses=len(pulses))
-    foliage = None
     if settings.foliage:
         leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
         foliage = Foliage(world.caster, world.faces, far, leaf_seed)
-    footprint = beam.footprint
-    beyond: list[Echoes] = []
-    for number, first in enumerate(range(0, len(pulses), batch)):
-        cast = moving.rays(number)
-        moments = None if time is None else np.repeat(time[first : first + batch], rays)
-        hits = world.caster.cast_posed(
-            cast.poses,
-            cast.index,
-            directions=cast.direction,
-            offsets=cast.origin,
-            far=far,
-            time=moments,
-            order=cast.order,
-            precision=settings.precision,
-            retrace=settings.retrace,
-            footprint=footprint,
-            threads=threads,
-        )
-        pierced = None if foliage is None else foliage.pierce(hits, cast, first=first * rays, time=moments)
-        glossy = collector.take(hits, first)
-        if len(glossy):
-            pulse, ray = np.divmod(glossy, np.int32(rays))
-            skip = np.zeros(len(glossy))
-            if pierced is not None:
-                through = np.isin(glossy, pierced)
-                skip[through] = hits.range[glossy[through]] - _CLEAR
-            beyond += _beyond(
-                cast.take(glossy),
-                pulse + np.int32(first),
-                power=np.full(len(ray), 1 / rays),
-                optics=optics,
-                far=far,
-                time=None if moments is None else moments[glossy],
-                skip=skip,
+    optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
+    tracer = _Tracer(pulses, mount, sensor, trajectory, optics, time, turn, foliage, far, threads)
+    if settings.footprint:
+        return adaptive_echoes(tracer.echoes, pulses, faces=world.faces, tolerance=settings.footprint)
+    return tracer.echoes(equal_rays(settings.rays))
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracer:
+    """Casts beams of pulses of a frame; fields as the parameters of `surface_echoes`.
+
+    turn    : (n,) as in `Beam`
+    foliage : None if rays end on crowns
+    far     : metres
+    """
+
+    pulses: Firings
+    mount: Mount
+    sensor: Sensor
+    trajectory: Trajectory
+    optics: SurfaceOptics
+    time: NDArray[np.float32] | None
+    turn: Float
+    foliage: Foliage | None
+    far: float
+    threads: int
+
+    def echoes(self, sample: BeamSample, *, rows: Ints | None = None, watch: Watch | None = None) -> Echoes:
+        """Echoes of the pulses in ``rows``, ascending, or of all, sorted by pulse and range.
+
+        watch : takes the hits of all rays
+        """
+        pulses, time, turn = self.pulses, self.time, self.turn
+        if rows is not None:
+            pulses = chosen(pulses, np.isin(np.arange(len(pulses)), rows))
+            time, turn = None if time is None else time[rows], turn[rows]
+        sensor, settings = self.sensor, self.optics.settings
+        beam = beam_of(sample, divergence=sensor.divergence, aperture=sensor.aperture, turn=turn)
+        rays, batch = beam.rays, max(_BATCH // beam.rays, 1)
+        moving = MovingSensor(pulses, self.mount, trajectory=self.trajectory, beam=beam, batch=batch)
+        collector = EchoCollector(self.optics, beam, separation=sensor.echo_separation, pulses=len(pulses))
+        beyond: list[Echoes] = []
+        for number, first in enumerate(range(0, len(pulses), batch)):
+            cast = moving.rays(number)
+            moments = None if time is None else np.repeat(time[first : first + batch], rays)
+            hits = self.optics.world.caster.cast_posed(
+                cast.poses,
+                cast.index,
+                directions=cast.direction,
+                offsets=cast.origin,
+                far=self.far,
+                time=moments,
+                order=cast.order,
+                precision=settings.precision,
+                retrace=settings.retrace,
+                footprint=beam.footprint,
+                threads=self.threads,
             )
-    echoes, surfaces = collector.echoes()
-    if not len(surfaces):
-        return echoes
-    return by_pulse(echoes, merge(join(surfaces, *beyond), separation, gap=beam.gap))
+            pierced = None
+            if self.foliage is not None:
+                pierced = self.foliage.pierce(hits, cast, first=first * rays, time=moments)
+            if watch is not None:
+                watch(hits, first)
+            glossy = collector.take(hits, first)
+            if len(glossy):
+                pulse, ray = np.divmod(glossy, np.int32(rays))
+                skip = np.zeros(len(glossy))
+                if pierced is not None:
+                    through = np.isin(glossy, pierced)
+                    skip[through] = hits.range[glossy[through]] - _CLEAR
+                beyond += _beyond(
+                    cast.take(glossy),
+                    pulse + np.int32(first),
+                    power=sample.power[ray],
+                    optics=self.optics,
+                    far=self.far,
+                    time=None if moments is None else moments[glossy],
+                    skip=skip,
+                )
+        echoes, surfaces = collector.echoes()
+        if len(surfaces):
+            echoes = by_pulse(echoes, merge(join(surfaces, *beyond), sensor.echo_separation, gap=beam.gap))
+        return echoes if rows is None else replace(echoes, pulse=rows[echoes.pulse].astype(np.int32))
 
 
 def _beyond(

@@ -138,7 +138,7 @@ def measured_range(
         if settings.range_noise == "signal":
             sigma = np.hypot(sigma, signal_sigma(power, sensor.weak_sigma))
         distance = distance + sigma * deviates("range noise", echoes)
-    if settings.stretch and settings.rays == 1:
+    if settings.stretch and not settings.traces_footprints:
         width = stretch_sigma(echoes.range, echoes.cosine, divergence=sensor.divergence[1])
         distance = distance + width * deviates("stretch", echoes)
     return quantise(distance, sensor.range_quantum) if settings.quantise else distance

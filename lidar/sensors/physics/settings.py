@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lidar.parameters import check_parameters, parameter
 from lidar.raycast import PRECISIONS
@@ -13,6 +13,9 @@ NOISES = ("none", "constant", "signal")
 
 POSES = ("firing", "column", "frame")
 """Pulses that share the sensor's pose: none, those of a column, all of a frame."""
+
+LEAST_FOOTPRINT = 1e-4
+"""Metres: least tolerance of ranges. Float32 has steps of 0.03 mm at 300 m."""
 
 MOST_RAYS = 999
 """Maximum number of rays per pulse."""
@@ -64,6 +67,13 @@ class ScannerSettings:
         low=1,
         high=MOST_RAYS,
     )
+    footprint: float = parameter(
+        0.0,
+        "tolerance of ranges for which each pulse has as many rays as its footprint needs, instead of rays; 0"
+        " for a fixed number",
+        unit="m",
+        low=0,
+    )
     mirrors: bool = parameter(default=False, meaning="glass transmits and reflects, water reflects")
     foliage: bool = parameter(
         default=False, meaning="tree crowns and hedges let rays pass between their leaves"
@@ -92,15 +102,32 @@ class ScannerSettings:
     def __post_init__(self) -> None:
         """Validate the settings; one InputError names all faults."""
         noisy = self.detection or self.false_alarms
+        rays, footprint = (n if isinstance(n, int | float) else 0 for n in (self.rays, self.footprint))
         check_parameters(
             self,
             f"daylight_lux={self.daylight_lux:g}: has no effect without detection or false_alarms"
             if self.daylight_lux and not noisy
             else "",
-            f"stretch: has no effect with rays={self.rays}, which trace the surface"
-            if self.stretch and self.rays > 1
+            f"stretch: has no effect with rays={rays}, which trace the surface"
+            if self.stretch and rays > 1
+            else "",
+            "stretch: has no effect with footprint, which traces the surface"
+            if self.stretch and footprint
+            else "",
+            f"footprint and rays={rays}: give one of them" if footprint and rays > 1 else "",
+            f"footprint = {footprint:g} m is below {LEAST_FOOTPRINT:g} m, what ranges of float32 keep"
+            if 0 < footprint < LEAST_FOOTPRINT
             else "",
         )
+
+    @property
+    def traces_footprints(self) -> bool:
+        """Whether a pulse can meet several surfaces."""
+        return self.rays > 1 or self.footprint > 0
+
+    def with_rays(self, rays: int) -> ScannerSettings:
+        """The settings with so many rays for each pulse."""
+        return replace(self, rays=rays, footprint=0.0)
 
 
 PLAIN = ScannerSettings()

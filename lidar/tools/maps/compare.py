@@ -134,9 +134,9 @@ def far_reasons(dataset: Dataset, scene: Scene, *, rows: Sequence[SurfaceDistanc
         )
     with reading_file(dataset.paths.manifest):
         scanner, _, _ = settings_of(recipe["fidelity"], [(name, text) for name, text in recipe["settings"]])
-        if scanner.rays > 1:
+        if scanner.traces_footprints:
             reasons.append(
-                f"pulses have {scanner.rays} rays (setting rays): where one meets several surfaces, as at"
+                "pulses have several rays (settings rays, footprint): where one meets several surfaces, as at"
                 " edges, windows with the room behind them, and leaves, echoes merge to a point between them"
             )
         if recipe.get("stages") or recipe.get("applied_stages"):

@@ -177,7 +177,10 @@ def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
         )
     if wanted.budget and options.scheduler:
         raise InputError("`budget` is for this machine, and `scheduler` for others; leave one of them out")
-    names: dict[Kind, tuple[str, ...]] = {"scanners": ("rays", "stretch"), "cameras": ("supersample",)}
+    names: dict[Kind, tuple[str, ...]] = {
+        "scanners": ("rays", "footprint", "stretch"),
+        "cameras": ("supersample",),
+    }
     if any(isinstance(s, Camera) and s.spec.exposure_ns for s in sensors):
         names["cameras"] += ("blur",)
     held = {
@@ -194,7 +197,10 @@ def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
     taken = [held[kind][0] for kind in here if picks[kind] and held[kind]]
     if taken and (asked or not free):
         (name, value), asker = taken[0], "accuracy" if asked else "budget"
-        why = "picks rays, and more than one has no stretch" if name == "stretch" else "picks it"
+        why = {
+            "stretch": "picks rays, and more than one has no stretch",
+            "footprint": "picks a number of rays instead",
+        }.get(name, "picks it")
         raise InputError(f"`settings` {name}={value}: `{asker}` {why}; leave one of them out")
     return free
 

@@ -19,6 +19,7 @@ RAYS = 217
 
 SCANNER_VALUES: dict[str, tuple[Any, ...]] = {
     "rays": (1, 7, 19, 37, 61, 127),
+    "footprint": (0.03, 0.01),
     "poses": POSES,
     "precision": PRECISIONS,
     "retrace": (True, False),
@@ -175,7 +176,12 @@ class Basis:
 def _change(settings: Any, values: Mapping[str, Any]) -> Any:
     """Settings of a sensor or the world with those values that they have."""
     own = {f.name for f in fields(settings)}
-    return replace(settings, **{name: value for name, value in values.items() if name in own})
+    given = {name: value for name, value in values.items() if name in own}
+    if "rays" in given:
+        settings = settings.with_rays(given["rays"])
+    elif given.get("footprint"):
+        settings = settings.with_rays(1)
+    return replace(settings, **given)
 
 
 def noiseless(settings: ScannerSettings) -> ScannerSettings:
@@ -203,7 +209,8 @@ def noiseless(settings: ScannerSettings) -> ScannerSettings:
 
 def scanner_reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
     """The reference of settings: a pose for every firing and a dense footprint; cast it in float64."""
-    return replace(noiseless(settings), poses="firing", precision="exact", retrace=True, rays=rays)
+    exact = replace(noiseless(settings), poses="firing", precision="exact", retrace=True)
+    return exact.with_rays(rays)
 
 
 def camera_reference(settings: CameraSettings, *, exposed: bool) -> CameraSettings:

@@ -157,7 +157,7 @@ def test_errors_on_a_drive(found):
     asked, *rest = one.rows
     by_label = {r.label: r for r in rest}
     assert asked.label == (
-        "as asked (rays=1, poses=firing, precision=exact, retrace=on, mirrors=off, foliage=off)"
+        "as asked (rays=1, footprint=0, poses=firing, precision=exact, retrace=on, mirrors=off, foliage=off)"
     )
     assert list(by_label) == ["rays=7", "rays=19", "poses=column", "poses=frame"]
     tail = {name: r.error["range_99_m"].value for name, r in by_label.items()}
