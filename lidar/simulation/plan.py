@@ -14,6 +14,7 @@ import shapely
 
 from geoscene import __version__
 from geoscene.classes import Class, materials
+from geoscene.drawing.report import metres
 from geoscene.pipeline.limits import Limit, height_limit
 from geoscene.pipeline.reach import OFFSET, RoadMap
 from geoscene.scene import Scene
@@ -28,6 +29,7 @@ from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
 from lidar.motion.vehicle import Vehicle, load_vehicle, vehicle_on
 from lidar.options.drive import DriveOptions
 from lidar.raycast.device import check_device
+from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.specs import Rig, load_rig
 from lidar.signal.attacks.placed_object import with_objects
@@ -171,6 +173,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     check_start(start, 0)
     rig = load_rig(options.rig)
     sensors = sensors_of(rig, options)
+    _check_tolerance(sensors, options.recording_settings.scanner)
     if any(isinstance(sensor, Camera) for sensor in sensors):
         scene.require("colors")
     road = options.road_conditions()
@@ -202,6 +205,28 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
         geo=Georeference(scene.frame, export_crs(scene.frame, options.crs), exact=options.exact),
         jobs=jobs,
     )
+
+
+_HIDDEN = 0.1
+"""Part of the deviation of range noise below which errors are hidden by it: they add 0.5 % to it."""
+
+
+def _check_tolerance(sensors: Sequence[Scanner | Camera], settings: ScannerSettings) -> None:
+    """Raise InputError for a tolerance of ranges below what a scanner's noise or steps leave of it."""
+    for scanner in (one for one in sensors if isinstance(one, Scanner)):
+        noise = _HIDDEN * scanner.sensor.range_sigma if settings.range_noise != "none" else 0.0
+        step = 0.5 * scanner.sensor.range_quantum if settings.quantise else 0.0
+        least = max(noise, step)
+        if 0 < settings.footprint < least:
+            why = (
+                f"range noise of {metres(scanner.sensor.range_sigma)}"
+                if noise >= step
+                else f"steps of {metres(scanner.sensor.range_quantum)}"
+            )
+            raise InputError(
+                f"`settings` footprint={settings.footprint:g}: {scanner.name} has {why}, in which errors"
+                f" below {metres(least)} do not show; give at least that"
+            )
 
 
 def _refuse_elsewhere(scene: Scene, trajectory: Trajectory, *, sensors: Sequence[Scanner | Camera]) -> None:

@@ -1,5 +1,6 @@
 """Pulses with as many rays as their footprint needs have the echoes of pulses with very many rays."""
 
+from contextlib import nullcontext
 from dataclasses import fields, replace
 
 import numpy as np
@@ -9,10 +10,12 @@ from helpers.sensor_worlds import box, driven, world
 from geoscene.classes import Class
 from lidar.errors import InputError
 from lidar.geometry.attitude import Mount
+from lidar.options.drive import DriveOptions
 from lidar.sensors.laser.scan import cast, measure, scan
 from lidar.sensors.physics.settings import LEVELS, MOST_RAYS, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
 from lidar.settings import settings_of
+from lidar.simulation.plan import plan_drive
 
 GROUND = box((-150, -150, -1), (150, 150, 0), feature=1, klass=Class.ROAD, material="asphalt")
 SENSOR, MOUNT, STILL = load_sensor("vlp16"), Mount((0.0, 0.0, 1.0)), driven((0.0, 0.0, 0.0))
@@ -112,6 +115,21 @@ def test_a_frame_has_the_same_bytes_for_any_number_of_threads():
     ]  # fmt: skip
     for f in fields(clouds[0]):
         np.testing.assert_array_equal(*(getattr(cloud, f.name) for cloud in clouds))
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ((), ""),
+        ((("range_noise", "constant"),), "lidar_top has range noise of 1 cm, in which errors below 1 mm"),
+        ((("quantise", "on"),), "lidar_top has steps of 2 mm, in which errors below 1 mm"),
+    ],
+)
+def test_a_tolerance_that_noise_or_steps_hide_is_refused(scene, more, message):
+    settings = (("footprint", "0.5mm"), *more)
+    options = DriveOptions(route="random", rig="vlp16", duration=0.2, settings=settings)
+    with pytest.raises(InputError, match=message) if message else nullcontext():
+        plan_drive(scene, options)
 
 
 def test_some_pulses_of_a_frame_have_the_echoes_that_they_have_among_all():

@@ -417,6 +417,7 @@ def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, 
     for more, line in (
         (["--accuracy", "1cm", "--set", "rays=3"], "--set rays=3: --accuracy picks it"),
         (["--budget", "1x-realtime", "--set", "stretch=on"], "--set stretch=on: --budget picks rays"),
+        (["--accuracy", "1cm", "--set", "footprint=1cm"], "footprint=1cm: --accuracy picks a number of rays"),
         (["--budget", "1x-realtime", "--scheduler", "tcp://a:1"], "--budget is for this machine"),
         (["--accuracy", "1cm@42"], "--accuracy 1cm@42: after the @ give one of 50, 68"),
         (["--budget", "fast"], "--budget fast: give a speed such as 2x-realtime"),
