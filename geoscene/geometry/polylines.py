@@ -19,6 +19,11 @@ _UNITS = 2.0**30
 """Units of stations per metre in which they are summed: a nanometre each."""
 
 
+def flat(line: Float) -> shapely.LineString:
+    """A line (n, 2 or 3) in plan, for shapely."""
+    return shapely.LineString(line[:, :2])
+
+
 def length(line: Float) -> float:
     """Length in plan."""
     return float(np.hypot(*np.diff(line[:, :2], axis=0).T).sum())

@@ -184,7 +184,7 @@ def find_openings(
 
 def _passes_over(table: Structures, k: int, *, line: Float) -> bool:
     """Whether a road (n, 3) is above the roof of tunnel piece ``k`` wherever it is within its outline."""
-    flat = shapely.LineString(line[:, :2])
+    flat = polylines.flat(line)
     xy = shapely.get_coordinates(shapely.segmentize(flat.intersection(table.polygon[k]), _STEP))
     if not len(xy):
         return False
@@ -266,7 +266,7 @@ def buildings_over(
         low[k] = z.min(initial=np.inf) - table.body[piece]
         high[k] = z.max(initial=-np.inf) + free[k]
     stands = base[buildings.outline[row]]
-    middle = np.array([shapely.LineString(line[:, :2]) for line in table.line[road]], object)
+    middle = np.array([polylines.flat(line) for line in table.line[road]], object)
     within = shapely.length(shapely.intersection(buildings.footprint[row], middle)) > _SCANT
     hit = (shapely.area(common) > _SCANT) & (tunnel | within)
     grounded = buildings.min_height[row] <= 0

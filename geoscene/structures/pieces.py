@@ -149,7 +149,7 @@ def _outlines(
             part = _without_near_vertices(polylines.cut(line, start, end=end))
             outline = whole[m]
             if count > 1:
-                reach = _flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
+                reach = polylines.flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
                 ends = [p for p, last in ((part[0], k == 0), (part[-1], k == count - 1)) if last]
                 discs = [shapely.Point(p[:2]).buffer(_SIDE / 2) for p in ends]
                 wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
@@ -178,7 +178,7 @@ def _wholes(
     """
     whole, half = [], np.empty(len(lines))
     for m, line in enumerate(lines):
-        flat = _flat(line)
+        flat = polylines.flat(line)
         own = members.rows[m]
         own = own[raised.klass[own] != Class.LANE_MARKING]
         shape = _union(raised.polygon[own])
@@ -198,7 +198,7 @@ def _wholes(
             band = shapely.LineString([first[0], beyond]).buffer(half[m], cap_style="flat")
             shape = _union([shape, band])
         whole.append(shape)
-    flats = np.array([_flat(line) for line in lines], object)
+    flats = np.array([polylines.flat(line) for line in lines], object)
     ends = np.array([line[e] for line in lines for e in (0, -1)]).reshape(-1, 3)
     end, other = shapely.STRtree(flats).query(shapely.points(ends[:, :2]), predicate="dwithin", distance=_MET)
     for row, q in zip(end.tolist(), other.tolist(), strict=True):
@@ -209,10 +209,6 @@ def _wholes(
             disc = shapely.Point(ends[row, :2]).buffer(min(half[m], half[q]))
             whole[m] = _union([whole[m], disc])
     return whole, half
-
-
-def _flat(line: Float) -> shapely.LineString:
-    return shapely.LineString(line[:, :2])
 
 
 def _without_near_vertices(line: Float) -> Float:
@@ -268,7 +264,7 @@ def _inner(
         # Where two are so close that a wall would stand in the middle of the road, it is left out.
         wide = min(_VEHICLE, float(half[k]) / 2)
         start, end = np.where(shut[k], wide, 0.0) * (1.0, -1.0) + (0.0, polylines.length(line[k]))
-        middle = _flat(polylines.cut(line[k], start, end=end)).buffer(wide, cap_style="flat")
+        middle = polylines.flat(polylines.cut(line[k], start, end=end)).buffer(wide, cap_style="flat")
         inner[k] = _union([closed, middle]).intersection(polygon[k].buffer(1.0))
     return inner
 

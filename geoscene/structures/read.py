@@ -87,7 +87,7 @@ def place_piers(
     pier, spacing = table.pier.copy(), table.pier_spacing.copy()
     ends, solid = _ends(table), shapely.STRtree(ground.polygon[rows[~rail]])
     for k in np.flatnonzero(~table.tunnel & near).tolist():
-        flat = shapely.LineString(table.line[k][:, :2])
+        flat = polylines.flat(table.line[k])
         count = max(int(np.ceil(flat.length / options.pier_spacing)), 1)
         spacing[k] = flat.length / count
         at = (np.arange(count) + 0.5) * spacing[k]

@@ -171,7 +171,7 @@ def conflict_strips(
     z, away, beside = nearest_on_line(other, middle[:, :2])
     up = middle[:, 2] - z
     short = (np.abs(up) >= least) & (np.abs(up) < np.where(up < 0, needs[1], needs[0]) - _TIGHT)
-    strips, flat = [], shapely.LineString(other[:, :2])
+    strips, flat = [], polylines.flat(other)
     for k in np.flatnonzero(short & beside & (away <= reach)).tolist():
         part = _flat_part(line, cuts, k=k)
         start, end = shapely.line_locate_point(
@@ -217,7 +217,7 @@ def nearer_part(
     around = where.envelope.buffer(half + other_half)
     points = []
     for road, wide, own in ((line, half, 0), (other, other_half, 1)):
-        core = shapely.LineString(road[:, :2])
+        core = polylines.flat(road)
         inset = wide - min(half, other_half)
         if inset > _SAMPLE:
             core = shapely.union_all([core, core.buffer(inset, cap_style="flat").boundary])

@@ -165,7 +165,7 @@ def _linework(
     sloped = slopes_across(table, k)
     for piece in (k, *table.near[k].tolist()):
         line = table.around[piece]
-        flat = shapely.LineString(line[:, :2])
+        flat = polylines.flat(line)
         lines.append(flat)
         if sloped:  # level up to the middle of lanes, sloping from there to the next carriageway
             lines.append(flat.buffer(float(table.half[piece]) / 2, cap_style="flat").boundary)

@@ -59,9 +59,9 @@ def without_ground_roads(
     """Outlines (n,) without the carriageways of roads on the ground at their height.
 
     Of bridges and tunnels for vehicles that run beside a road, too near in height to pass over or under it,
-    each keeps the area nearer to its own line; where one crosses above a road, less free height is
-    enough. Those that begin at the side of a road begin at its edge.
-    Footbridges and foot tunnels leave the whole carriageway.
+    each keeps the area nearer to its own line; those that begin at the side of a road begin at its edge.
+    Footbridges and foot tunnels leave the whole carriageway. Bridges that cross a road pass over it with less
+    free height than others.
 
     ends     : (n,) object, (k, 2) places at which a piece's way begins or ends
     headroom : free height over roads
@@ -79,12 +79,12 @@ def without_ground_roads(
         line = _near(graph.geometry[edge], lines[r], area=polygon[k].envelope.buffer(half + _AROUND))
         if line is None:
             continue
-        band = _flat(line).buffer(half, cap_style="flat")
+        band = polylines.flat(line).buffer(half, cap_style="flat")
         shared = areal(polygon[k].intersection(band))
         if shared.area < _SCANT:
             continue
         needs = float(sizes.free[k]) + THINNEST, headroom + float(sizes.body[k])
-        if shapely.crosses(_flat(line), _flat(around[k])):
+        if shapely.crosses(polylines.flat(line), polylines.flat(around[k])):
             needs = needs[0], _LEAST_FREE + float(sizes.body[k])
         if foot[k]:
             strips = strips_between(line, around[k], reach=half, low=-needs[1], high=needs[0])
@@ -106,13 +106,9 @@ def without_ground_roads(
     for k, shapes in lost.items():
         rest = shapely.get_parts(areal(polygon[k].difference(shapely.union_all(shapes))))
         # What is left on the far side of a road goes, too.
-        own = shapely.intersects(rest, _flat(around[k]))
+        own = shapely.intersects(rest, polylines.flat(around[k]))
         out[k] = shapely.MultiPolygon((rest[own] if own.any() else rest).tolist())
     return out
-
-
-def _flat(line: Float) -> shapely.LineString:
-    return shapely.LineString(line[:, :2])
 
 
 def _near(line: Float, flat: shapely.LineString, *, area: shapely.Geometry) -> Float | None:
@@ -129,7 +125,7 @@ def _near(line: Float, flat: shapely.LineString, *, area: shapely.Geometry) -> F
 def _begun(line: Float, piece: Float, *, ends: Float, half: float) -> list[shapely.Geometry]:
     """Discs around the ends (k, 2) of a piece's way that lie within a road, across which it begins."""
     found: list[shapely.Geometry] = []
-    flat = _flat(line)
+    flat = polylines.flat(line)
     for end in ends:
         z, away, _ = nearest_on_line(line, end[None])
         own, _, _ = nearest_on_line(piece, end[None])
