@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from functools import partial
+from typing import Any, TypeVar
 
 from geoscene.support.registry import unknown_name
 from lidar.dataset.formats import FORMATS, LABELS, Format, LabelFormat
@@ -60,13 +61,15 @@ def settings_of(level: str, changes: Iterable[tuple[str, str]] = ()) -> Settings
 
 def _change(settings: S, given: Mapping[str, str]) -> S:
     """Settings of one group with those that are given and that it has changed."""
-    own = {name: text for name, text in given.items() if name in {f.name for f in fields(settings)}}
-    if "footprint" in own:
-        own = {"rays": "1", **own}
+    own = {name: text for name, text in given.items() if hasattr(settings, name)}
+    change: Callable[..., Any] = partial(replace, settings)
+    if isinstance(settings, ScannerSettings):
+        change = settings.changed
     try:
-        return replace(settings, **read_values(type(settings), own))
+        found: S = change(**read_values(type(settings), own))
     except InputError as error:
         raise InputError(f"`settings` {error}") from None
+    return found
 
 
 def _at(level: str) -> Settings:

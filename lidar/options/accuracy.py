@@ -135,10 +135,10 @@ class TradeoffOptions:
     """Options of a comparison of settings."""
 
     compare: Annotated[tuple[str, ...], Parameter(name="--settings"), WORDS] = ()
-    """Settings to compare, separated by commas: rays, poses, mirrors, foliage of scanners; supersample,
-    edge_rays, blur, shadows, detail, resolution, haze of cameras; precision, retrace of both; origin, reach,
-    forests, trees, furniture, barriers, relief, scene, traffic; georeferencing; all by default. Cheap ones
-    are also tried together. lidar settings explains them."""
+    """Settings to compare, separated by commas: rays, footprint, poses, mirrors, foliage of scanners;
+    supersample, edge_rays, blur, shadows, detail, resolution, haze of cameras; precision, retrace of both;
+    origin, reach, forests, trees, furniture, barriers, relief, scene, traffic; georeferencing; all by
+    default. Cheap ones are also tried together. lidar settings explains them."""
 
     sensors: Annotated[tuple[str, ...], Parameter(name="--sensor"), SEVERAL] = ()
     """Names of the scanners and cameras to compare; all by default."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from lidar.parameters import check_parameters, parameter
 from lidar.raycast import PRECISIONS
@@ -125,9 +126,13 @@ class ScannerSettings:
         """Whether a pulse can meet several surfaces."""
         return self.rays > 1 or self.footprint > 0
 
-    def with_rays(self, rays: int) -> ScannerSettings:
-        """The settings with so many rays for each pulse."""
-        return replace(self, rays=rays, footprint=0.0)
+    def changed(self, **values: Any) -> ScannerSettings:
+        """The settings with other values; of ``rays`` and ``footprint`` the one that is given holds."""
+        if "rays" in values:
+            values = {"footprint": 0.0, **values}
+        elif values.get("footprint"):
+            values["rays"] = 1
+        return replace(self, **values)
 
 
 PLAIN = ScannerSettings()

@@ -114,7 +114,7 @@ def _georeferencing(bench: Bench) -> dict[str, float]:
     if scanner is None:
         return {}
     affine, full = (Georeference(plan.scene.frame, plan.geo.crs, exact=exact) for exact in (False, True))
-    settings = noiseless(plan.options.recording_settings.scanner).with_rays(1)
+    settings = noiseless(plan.options.recording_settings.scanner).changed(rays=1)
     away = []
     for frame in bench.frames[scanner.name]:
         pulses = np.arange(0, len(firings(scanner.sensor, frame)), 8)

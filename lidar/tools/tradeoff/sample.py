@@ -208,7 +208,7 @@ def scanner_errors(
     frame_returns = partial(_returns, bench, scanner, frame=frame)
     count = len(firings(scanner.sensor, frame))
     screened = chosen_pulses(count, _SCREENED, frame=frame, seed=seed)
-    casts = [frame_returns(settings=plain.with_rays(rays), pulses=screened) for rays in _SCREENS]
+    casts = [frame_returns(settings=plain.changed(rays=rays), pulses=screened) for rays in _SCREENS]
     rng = np.random.default_rng([seed, frame, 1])
     hard, easy = _stratify(screened, casts, count=count, rng=rng)
     pulses, weights = np.sort(np.concatenate([hard, easy])), np.ones(count)

@@ -217,7 +217,7 @@ def scanner_method(bench: Bench, scanner: Scanner, *, compared: TradeoffOptions)
         f"{scanner.name} ({scanner.spec.preset})",
         f"float64 ray casting, {rays} rays per pulse, a pose for every firing; 1.5 times as many rays",
         Basis(noiseless(settings.scanner), exact, settings.world, bench.plan.scene.relief),
-        second=exact.with_rays(next_step(rays)),
+        second=exact.changed(rays=next_step(rays)),
         samples=samples,
         statistics=STATISTICS,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 from geoscene.uses import RELIEFS
@@ -176,12 +177,8 @@ class Basis:
 def _change(settings: Any, values: Mapping[str, Any]) -> Any:
     """Settings of a sensor or the world with those values that they have."""
     own = {f.name for f in fields(settings)}
-    given = {name: value for name, value in values.items() if name in own}
-    if "rays" in given:
-        settings = settings.with_rays(given["rays"])
-    elif given.get("footprint"):
-        settings = settings.with_rays(1)
-    return replace(settings, **given)
+    change = settings.changed if isinstance(settings, ScannerSettings) else partial(replace, settings)
+    return change(**{name: value for name, value in values.items() if name in own})
 
 
 def noiseless(settings: ScannerSettings) -> ScannerSettings:
@@ -209,8 +206,7 @@ def noiseless(settings: ScannerSettings) -> ScannerSettings:
 
 def scanner_reference(settings: ScannerSettings, *, rays: int) -> ScannerSettings:
     """The reference of settings: a pose for every firing and a dense footprint; cast it in float64."""
-    exact = replace(noiseless(settings), poses="firing", precision="exact", retrace=True)
-    return exact.with_rays(rays)
+    return noiseless(settings).changed(poses="firing", precision="exact", retrace=True, rays=rays)
 
 
 def camera_reference(settings: CameraSettings, *, exposed: bool) -> CameraSettings:

@@ -1,7 +1,7 @@
 """Pulses with as many rays as their footprint needs have the echoes of pulses with very many rays."""
 
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -11,6 +11,8 @@ from geoscene.classes import Class
 from lidar.errors import InputError
 from lidar.geometry.attitude import Mount
 from lidar.options.drive import DriveOptions
+from lidar.sensors.laser.footprints import COUNTS
+from lidar.sensors.laser.rays import bundle
 from lidar.sensors.laser.scan import cast, measure, scan
 from lidar.sensors.physics.settings import LEVELS, MOST_RAYS, ScannerSettings
 from lidar.sensors.rig.scanner import firings, load_sensor
@@ -60,9 +62,18 @@ def test_houses_steps_and_fences_have_ranges_within_the_tolerance(tolerance):
     place = world(GROUND, *steps, *pickets(0.35, 0.06))
     error, missed, extra = compared(place, tolerance)
     assert len(error) > 3000
-    assert np.mean(error > tolerance) < 0.004  # a third of these pulses meet an edge
+    assert np.mean(error > tolerance) < 0.004
     assert missed < 1e-3
     assert extra < 1e-4
+
+
+@pytest.mark.parametrize("rays", COUNTS)
+def test_the_share_of_a_disc_beyond_an_edge_errs_as_stated(rays):
+    rng = np.random.default_rng(0)
+    angle = rng.uniform(0, 2 * np.pi, 300)
+    across, edge = np.stack([np.cos(angle), np.sin(angle)]), rng.uniform(-1, 1, 300)
+    few, many = (np.mean(bundle(n) @ across > edge, axis=0) for n in (rays, MOST_RAYS))
+    assert np.sqrt(np.mean((few - many) ** 2)) < 0.3 * rays**-0.75
 
 
 def test_smooth_ground_has_the_mean_range_of_a_gaussian_beam_down_to_grazing_angles():
@@ -109,7 +120,7 @@ def test_a_frame_has_the_same_bytes_for_any_number_of_threads():
     clouds = [
         scan(
             SENSOR, MOUNT, trajectory=driven((9.0, 0.0, 0.0)), world=place, frame=2, seed=5, threads=threads,
-            settings=replace(LEVELS["survey"].with_rays(1), footprint=0.02),
+            settings=LEVELS["survey"].changed(footprint=0.02),
         )
         for threads in (1, 2)
     ]  # fmt: skip
@@ -150,6 +161,7 @@ def test_settings_take_lengths_and_replace_the_rays_of_a_level():
         scanner, *_ = settings_of("survey", [("footprint", text)])
         assert (scanner.footprint, scanner.rays) == (0.01, 1)
     assert settings_of("survey", [("rays", "7")])[0].footprint == 0
+    assert settings_of("survey", [("footprint", "0")])[0] == LEVELS["survey"]
 
 
 @pytest.mark.parametrize(
