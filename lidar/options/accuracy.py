@@ -92,7 +92,7 @@ class AccuracyOptions:
     """Options by which rays of scanners and cameras are picked, and errors are checked."""
 
     accuracy: Annotated[str, Parameter(metavar="LENGTH[@PERCENT],LEVELS")] = ""
-    """Pick the fewest rays with which every sensor errs less than this: 1cm for 99.9 % of the ranges and
+    """Pick the cheapest rays with which every sensor errs less than this: 1cm for 99.9 % of the ranges and
     depths, 5mm@99 for 99 % of them, 3levels for colours of cameras (rms, of 255), 1cm,3levels for both. What
     counts is the upper end of the 95 % interval, by a sample of the drive's frames."""
 

@@ -211,18 +211,21 @@ _HIDDEN = 0.1
 """Part of the deviation of range noise below which errors are hidden by it: they add 0.5 % to it."""
 
 
+def least_tolerance(scanner: Scanner, settings: ScannerSettings) -> float:
+    """Metres below which errors of ranges are hidden by the noise or the steps of a scanner; 0 without."""
+    noise = _HIDDEN * scanner.sensor.range_sigma if settings.range_noise != "none" else 0.0
+    step = 0.5 * scanner.sensor.range_quantum if settings.quantise else 0.0
+    return max(noise, step)
+
+
 def _check_tolerance(sensors: Sequence[Scanner | Camera], settings: ScannerSettings) -> None:
     """Raise InputError for a tolerance of ranges below what a scanner's noise or steps leave of it."""
     for scanner in (one for one in sensors if isinstance(one, Scanner)):
-        noise = _HIDDEN * scanner.sensor.range_sigma if settings.range_noise != "none" else 0.0
-        step = 0.5 * scanner.sensor.range_quantum if settings.quantise else 0.0
-        least = max(noise, step)
+        least = least_tolerance(scanner, settings)
         if 0 < settings.footprint < least:
-            why = (
-                f"range noise of {metres(scanner.sensor.range_sigma)}"
-                if noise >= step
-                else f"steps of {metres(scanner.sensor.range_quantum)}"
-            )
+            sigma, step = scanner.sensor.range_sigma, scanner.sensor.range_quantum
+            noisy = settings.range_noise != "none" and least == _HIDDEN * sigma
+            why = f"range noise of {metres(sigma)}" if noisy else f"steps of {metres(step)}"
             raise InputError(
                 f"`settings` footprint={settings.footprint:g}: {scanner.name} has {why}, in which errors"
                 f" below {metres(least)} do not show; give at least that"

@@ -62,7 +62,7 @@ def adaptive_echoes(cast: Cast, pulses: Firings, *, faces: SurfaceFaces, toleran
         _find_rough((hits.range, hits.face, hits.instance), faces, sample.place, fit, tolerance, part)
 
     echoes = cast(sample, watch=watch)
-    rough |= _beside(pulses, rough)
+    rough |= beside(pulses, rough)
     kept, open_ = [echoes.where(~rough[echoes.pulse])], rough
     before = _strongest(echoes, len(pulses), rays=len(sample.place))
     for rays in COUNTS:
@@ -164,11 +164,11 @@ def _find_rough(hits: Any, faces: Any, place: Any, fit: Any, tolerance: Any, rou
             rough[p] = alike < rays
 
 
-def _beside(pulses: Firings, rough: Bools) -> Bools:
-    """Whether pulses (n,) are fired right before or after a rough one by the same laser."""
+def beside(pulses: Firings, some: Bools) -> Bools:
+    """Whether pulses (n,) are fired right before or after some of them by the same laser."""
     order = np.lexsort((pulses.time_ns, pulses.ring))
     same = pulses.ring[order[1:]] == pulses.ring[order[:-1]]
-    ordered, found = rough[order], np.zeros(len(rough), np.bool_)
+    ordered, found = some[order], np.zeros(len(some), np.bool_)
     found[order[1:]] |= same & ordered[:-1]
     found[order[:-1]] |= same & ordered[1:]
     return found

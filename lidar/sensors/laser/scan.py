@@ -14,7 +14,8 @@ from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator
 from lidar.sensors.laser.cloud import Cloud
-from lidar.sensors.laser.surface_echoes import surface_echoes
+from lidar.sensors.laser.footprints import beside
+from lidar.sensors.laser.surface_echoes import SentPulses, surface_echoes
 from lidar.sensors.physics.detector import Deviates, detect_echoes, false_echoes, measured_range, receive
 from lidar.sensors.physics.echoes import Echoes, TracedEchoes, join, number_echoes, select_reported, trace
 from lidar.sensors.physics.link import reflectivity_code, transmission
@@ -112,39 +113,47 @@ def cast(
     pulses : (k,) ascending rows of the frame's pulses to send; all by default
     """
     firings = find_pulse(sensor, frame, settings=settings)
-    kept = None if pulses is None else np.isin(np.arange(len(firings)), pulses)
-    if kept is not None and not settings.footprint:
-        firings, kept = chosen(firings, kept), None
-    sent = firings
+    sent = SentPulses(firings, _turns(len(firings), sensor=sensor, frame=frame, seed=seed, settings=settings))
+    kept = None
+    if pulses is not None:
+        kept = np.isin(np.arange(len(firings)), pulses)
+        needed = kept | beside(firings, kept) if settings.footprint else kept
+        sent, firings, kept = sent.take(needed), chosen(firings, needed), kept[needed]
     if settings.angle_noise:
         noise = generator(seed, sensor.name, frame, "angle").standard_normal((len(firings), 3))
         bent = firings.direction + sensor.angle_sigma * noise
-        sent = replace(firings, direction=bent / np.linalg.norm(bent, axis=1, keepdims=True))
-    time = None
+        bent /= np.linalg.norm(bent, axis=1, keepdims=True)
+        sent = sent._replace(firings=replace(firings, direction=bent))
     if any(group.transform.ndim == 4 for group in world.caster.instances):  # actors move
         start, stop = sensor.window_ns(frame)
-        time = ((firings.time_ns - start) / (stop - start)).astype(np.float32)
+        sent = sent._replace(time=((firings.time_ns - start) / (stop - start)).astype(np.float32))
     echoes = surface_echoes(
         sent,
         mount,
         sensor=sensor,
         trajectory=trajectory,
         world=world,
-        time=time,
         settings=settings,
         seed=seed,
         frame=frame,
         threads=threads,
     )
-    if kept is not None:  # rays of a pulse depend on those that are fired beside it
+    if kept is not None and not kept.all():  # rays of a pulse depend on those that are fired beside it
         number = (np.cumsum(kept) - 1).astype(np.int32)
         echoes = echoes.where(kept[echoes.pulse])
         echoes = replace(echoes, pulse=number[echoes.pulse])
-        firings, sent = chosen(firings, kept), chosen(sent, kept)
+        sent, firings = sent.take(kept), chosen(firings, kept)
     if settings.extinction:
         away = echoes.range + sensor.pattern.range_offset
         echoes = replace(echoes, apparent=echoes.apparent * transmission(away, settings.extinction))
-    return Sweep(sensor, frame, seed, settings, firings, sent, echoes)
+    return Sweep(sensor, frame, seed, settings, firings, sent.firings, echoes)
+
+
+def _turns(count: int, *, sensor: Sensor, frame: int, seed: int, settings: ScannerSettings) -> Float:
+    """Radians by which the rays of each pulse of a frame are turned about its axis; empty for one ray."""
+    if not settings.traces_footprints:
+        return np.empty(0)
+    return 2 * np.pi * generator(seed, sensor.name, frame, "footprint").random(count)
 
 
 def find_pulse(sensor: Sensor, frame: int, *, settings: ScannerSettings) -> Firings:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from geoscene.classes import Class
-from geoscene.typing import Float, Ints
+from geoscene.typing import Bools, Float, Ints
 from lidar.geometry.attitude import Mount
 from lidar.geometry.poses import Trajectory
 from lidar.geometry.random_streams import generator, uniform_of
@@ -154,14 +155,31 @@ _CLEAR = 1e-3  # metres beyond a surface at which the next ray starts
 _BATCH = 1 << 15  # rays per batch, so that their columns stay in the processor's cache
 
 
+class SentPulses(NamedTuple):
+    """Pulses of a frame that are cast.
+
+    firings : their times, origins and directions
+    turn    : (n,) radians by which the rays of each pulse are turned about its axis; empty for one ray
+    time    : (n,) ray times; None in a static world
+    """
+
+    firings: Firings
+    turn: Float
+    time: NDArray[np.float32] | None = None
+
+    def take(self, keep: Bools) -> SentPulses:
+        """Some of them, in the same order."""
+        turn = self.turn[keep] if len(self.turn) else self.turn
+        return SentPulses(chosen(self.firings, keep), turn, None if self.time is None else self.time[keep])
+
+
 def surface_echoes(
-    pulses: Firings,
+    pulses: SentPulses,
     mount: Mount,
     *,
     sensor: Sensor,
     trajectory: Trajectory,
     world: World,
-    time: NDArray[np.float32] | None,
     settings: ScannerSettings,
     seed: int,
     frame: int,
@@ -169,20 +187,17 @@ def surface_echoes(
 ) -> Echoes:
     """The echoes of pulses that a moving sensor fires, within its maximum range, sorted by pulse and range.
 
-    time        : (n,) ray times of the pulses; None in a static world
-    seed, frame : of random reflectances, leaves, and turns of each pulse's rays about its axis
+    seed, frame : of random reflectances and leaves
     """
-    turn, foliage = np.empty(0), None
-    if settings.traces_footprints:
-        turn = 2 * np.pi * generator(seed, sensor.name, frame, "footprint").random(len(pulses))
+    foliage = None
     far = min(sensor.max_range - sensor.pattern.range_offset, world.reach)
     if settings.foliage:
         leaf_seed = int(generator(seed, sensor.name, frame, "foliage").integers(2**63))
         foliage = Foliage(world.caster, world.faces, far, leaf_seed)
     optics = SurfaceOptics(world, sensor.wavelength_nm, settings=settings, seed=seed)
-    tracer = _Tracer(pulses, mount, sensor, trajectory, optics, time, turn, foliage, far, threads)
+    tracer = _Tracer(pulses, mount, sensor, trajectory, optics, foliage, far, threads)
     if settings.footprint:
-        return adaptive_echoes(tracer.echoes, pulses, faces=world.faces, tolerance=settings.footprint)
+        return adaptive_echoes(tracer.echoes, pulses.firings, faces=world.faces, tolerance=settings.footprint)
     return tracer.echoes(equal_rays(settings.rays))
 
 
@@ -190,18 +205,15 @@ def surface_echoes(
 class _Tracer:
     """Casts beams of pulses of a frame; fields as the parameters of `surface_echoes`.
 
-    turn    : (n,) as in `Beam`
     foliage : None if rays end on crowns
     far     : metres
     """
 
-    pulses: Firings
+    pulses: SentPulses
     mount: Mount
     sensor: Sensor
     trajectory: Trajectory
     optics: SurfaceOptics
-    time: NDArray[np.float32] | None
-    turn: Float
     foliage: Foliage | None
     far: float
     threads: int
@@ -211,10 +223,9 @@ class _Tracer:
 
         watch : takes the hits of all rays
         """
-        pulses, time, turn = self.pulses, self.time, self.turn
+        pulses, turn, time = self.pulses
         if rows is not None:
-            pulses = chosen(pulses, np.isin(np.arange(len(pulses)), rows))
-            time, turn = None if time is None else time[rows], turn[rows]
+            pulses, turn, time = self.pulses.take(np.isin(np.arange(len(pulses)), rows))
         sensor, settings = self.sensor, self.optics.settings
         beam = beam_of(sample, divergence=sensor.divergence, aperture=sensor.aperture, turn=turn)
         rays, batch = beam.rays, max(_BATCH // beam.rays, 1)

@@ -12,6 +12,7 @@ from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options.accuracy import AccuracyOptions, read_accuracy, read_budget
 from lidar.options.drive import DriveOptions
+from lidar.parameters import value_text
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation import drive as pipeline
@@ -199,7 +200,6 @@ def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
         (name, value), asker = taken[0], "accuracy" if asked else "budget"
         why = {
             "stretch": "picks rays, and more than one has no stretch",
-            "footprint": "picks a number of rays instead",
         }.get(name, "picks it")
         raise InputError(f"`settings` {name}={value}: `{asker}` {why}; leave one of them out")
     return free
@@ -233,7 +233,7 @@ def driven(
 
     plan = None
     if pick:
-        more = tuple((name, str(value)) for name, value in pick.settings.items())
+        more = tuple((name, value_text(value)) for name, value in pick.settings.items())
         options = replace(options, settings=(*options.settings, *more))
         plan = replace(pick.plan, options=options) if pick.plan else None
     summary = pipeline.drive(
@@ -258,9 +258,16 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
     if notes.get("asked") != wanted.request:
         return None
     try:
-        settings = {str(name): int(value) for name, value in notes["picked"].items()}
+        settings = {str(name): _number(value) for name, value in notes["picked"].items()}
         return Pick(notes["asked"], settings, SensorErrors.from_json(notes, "expected"))
     except (AttributeError, KeyError, TypeError, ValueError):
         raise DatasetError(
             f"{Paths(out).manifest}: damaged (accuracy); set `overwrite` to drive again"
         ) from None
+
+
+def _number(value: object) -> float:
+    """A number of a JSON document; raises TypeError for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return value

@@ -1,4 +1,4 @@
-"""Numbers of rays to choose from for a drive, those that were picked, their errors and costs."""
+"""Settings of rays to choose from for a drive, those that were picked, their errors and costs."""
 
 from __future__ import annotations
 
@@ -9,16 +9,27 @@ from typing import Any, Literal
 from geoscene.drawing.report import levels, metres, share
 from lidar.options.accuracy import AccuracyTarget
 from lidar.options.drive import DriveOptions
+from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.devices import Camera, Scanner
-from lidar.simulation.plan import DrivePlan
+from lidar.simulation.plan import DrivePlan, least_tolerance
 from lidar.tools.tradeoff.errors import LOST, ErrorEstimate
 
 Kind = Literal["scanners", "cameras"]
 
-RAYS = (1, 7, 13, 19, 37, 61, 91, 127, 217, 331, 499)
-"""Numbers of rays per pulse to choose from, the cheapest first.
+SCANNERS = (
+    ("rays", 1, 1.0),
+    ("rays", 7, 2.1),
+    ("footprint", 0.1, 3.1),
+    ("footprint", 0.03, 3.9),
+    ("footprint", 0.01, 5.8),
+    ("footprint", 0.003, 10.0),
+    ("footprint", 0.001, 16.0),
+    ("rays", 217, 54.0),
+)
+"""Rays per pulse, and tolerances of footprints in metres, to choose from, with their costs.
 
-Poses, precision and the second trace are none of the choice, as they save a few percent at most.
+Costs are CPU time to record over that with one ray, about: medians of a VLP-16 in three places. Poses,
+precision and the second trace are none of the choice, as they save a few percent at most.
 """
 
 SUPERSAMPLES = (1, 2, 3, 4, 6, 8)
@@ -35,27 +46,31 @@ PERCENT = 99.9
 
 
 @dataclass(frozen=True, slots=True)
+class Row:
+    """Settings of a kind of sensors.
+
+    settings : names and values; empty if none is to be picked, and the drive's own hold
+    cost     : CPU time over that of one ray, about
+    """
+
+    settings: tuple[tuple[str, float], ...] = ()
+    cost: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
 class Ladder:
     """Settings to choose from for the scanners or the cameras of a rig, the cheapest first.
 
     sensors : all of the kind
-    names   : of the settings that differ; empty if none is to be picked, and the only row is the drive's own
-    rows    : values of these settings
     """
 
     kind: Kind
     sensors: tuple[Scanner | Camera, ...]
-    names: tuple[str, ...]
-    rows: tuple[tuple[int, ...], ...]
+    rows: tuple[Row, ...]
 
-    def values(self, row: int) -> dict[str, int]:
+    def values(self, row: int) -> dict[str, float]:
         """The settings of a row, by name."""
-        return dict(zip(self.names, self.rows[row], strict=True))
-
-    def rays(self, row: int) -> int:
-        """Rays per pulse or pixel of a row; 1 if none is to be picked."""
-        found = self.values(row)
-        return found.get("rays", 1) * found.get("supersample", 1) ** 2 * found.get("blur", 1)
+        return dict(self.rows[row].settings)
 
 
 def ladders_of(
@@ -63,35 +78,56 @@ def ladders_of(
 ) -> dict[Kind, Ladder]:
     """Ladders of the kinds of sensors of a drive; settings are picked for those in ``free``.
 
-    The settings of the drive's fidelity level are among the rows.
+    The settings of the drive's fidelity level are among the rows. Tolerances of footprints are not below what
+    noise and steps of ranges hide.
     """
     settings = options.recording_settings
-    scanner, camera = settings.scanner, settings.camera
     found: dict[Kind, Ladder] = {}
     if scanners := tuple(s for s in sensors if isinstance(s, Scanner)):
-        rays = tuple((count,) for count in sorted({*RAYS, scanner.rays}))
-        found["scanners"] = Ladder("scanners", scanners, ("rays",), rays)
-    cameras = [s for s in sensors if isinstance(s, Camera)]
-    if any(s.spec.exposure_ns for s in cameras):
-        shots = sorted({*EXPOSED, (camera.supersample, camera.blur)}, key=lambda v: (v[0] ** 2 * v[1], v))
-        found["cameras"] = Ladder("cameras", tuple(cameras), ("supersample", "blur"), tuple(shots))
-    elif cameras:
-        sides = tuple((side,) for side in sorted({*SUPERSAMPLES, camera.supersample}))
-        found["cameras"] = Ladder("cameras", tuple(cameras), ("supersample",), sides)
-    return {
-        kind: ladder if kind in free else replace(ladder, names=(), rows=((),))
-        for kind, ladder in found.items()
-    }
+        least = max(least_tolerance(scanner, settings.scanner) for scanner in scanners)
+        found["scanners"] = Ladder("scanners", scanners, _scanner_rows(settings.scanner.rays, least=least))
+    if cameras := tuple(s for s in sensors if isinstance(s, Camera)):
+        blurred = any(s.spec.exposure_ns for s in cameras)
+        found["cameras"] = Ladder("cameras", cameras, _camera_rows(settings.camera, blurred=blurred))
+    return {kind: one if kind in free else replace(one, rows=(Row(),)) for kind, one in found.items()}
 
 
-def settings_of_rows(ladders: Mapping[Kind, Ladder], rows: Mapping[Kind, int]) -> dict[str, int]:
+def _scanner_rows(own: int, *, least: float) -> tuple[Row, ...]:
+    """Rows of scanners; ``own`` rays are of the drive, ``least`` is the smallest tolerance in metres."""
+    rows = [
+        Row(((name, value),), cost) for name, value, cost in SCANNERS if name != "footprint" or value >= least
+    ]
+    if all(row.settings != (("rays", own),) for row in rows):
+        rows.append(Row((("rays", own),), 0.75 + 0.25 * own))
+    return tuple(sorted(rows, key=lambda row: row.cost))
+
+
+def _camera_rows(own: CameraSettings, *, blurred: bool) -> tuple[Row, ...]:
+    """Rows of cameras, whose exposure may take time."""
+    if blurred:
+        shots = {*EXPOSED, (own.supersample, own.blur)}
+        rows = [
+            Row((("supersample", side), ("blur", moments)), float(side**2 * moments))
+            for side, moments in shots
+        ]
+    else:
+        sides = {*SUPERSAMPLES, own.supersample}
+        rows = [Row((("supersample", side),), float(side**2)) for side in sides]
+    return tuple(sorted(rows, key=lambda row: (row.cost, row.settings)))
+
+
+def settings_of_rows(ladders: Mapping[Kind, Ladder], rows: Mapping[Kind, int]) -> dict[str, float]:
     """Values of all settings that are picked, by name."""
     return {name: value for kind, row in rows.items() for name, value in ladders[kind].values(row).items()}
 
 
-def label_of(settings: Mapping[str, int]) -> str:
-    """Settings as text, as in ``rays=7``."""
-    return " ".join(f"{name}={value}" for name, value in settings.items())
+def label_of(settings: Mapping[str, float]) -> str:
+    """Settings as text, as in ``rays=7`` or ``footprint=3cm``."""
+    texts = {
+        name: metres(value).replace(" ", "") if name == "footprint" else f"{value:g}"
+        for name, value in settings.items()
+    }
+    return " ".join(f"{name}={text}" for name, text in texts.items())
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,17 +242,17 @@ class PickCost:
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """Numbers of rays that were picked for a drive.
+    """Settings of rays that were picked for a drive.
 
     asked    : accuracy and budget, as text
-    settings : that were picked, by name
+    settings : that were picked, by name: numbers of rays, metres of footprints
     expected : errors of the drive, by a sample of its frames
     plan     : of the drive, with its own settings; None where an earlier run had picked
     cost     : None likewise
     """
 
     asked: dict[str, str]
-    settings: dict[str, int]
+    settings: dict[str, float]
     expected: SensorErrors
     plan: DrivePlan | None = None
     cost: PickCost | None = None

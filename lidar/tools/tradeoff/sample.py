@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from math import inf, nan
 from typing import Any
@@ -27,6 +27,7 @@ from lidar.tools.tradeoff.bench import (
     EXACT,
     FAST,
     Bench,
+    Pixels,
     blocks_of_frame,
     chosen_pulses,
     image_error,
@@ -45,11 +46,14 @@ from lidar.tools.tradeoff.errors import (
 )
 from lidar.tools.tradeoff.variants import camera_reference, noiseless, scanner_reference
 
-_SCREENED, _SCREENS = 6000, (1, 19, 61)
+_SCREENED, _SCREENS = 6000, (1, 19)
 """Pulses of a frame that are screened, and their numbers of rays."""
 
 _HARD, _EASY = 120, 240
 """Pulses compared with the reference: of those on which the screens differ most, and of the others."""
+
+_EASY_RAYS = 217
+"""Rays of the reference of the others."""
 
 _BLOCKS, _FEWEST = 48, 12
 """Blocks of pixels of a frame that are compared, of all cameras, and of each at least."""
@@ -83,7 +87,9 @@ class DriveSample:
         self._frames = {
             sensor.name: _spread_evenly(_working_frames(plan, sensor))[order] for sensor in sensors
         }
-        self._errors: dict[str, list[list[Any]]] = {sensor.name: [] for sensor in sensors}
+        self._truths: dict[tuple[str, int], ScannerTruth | CameraTruth] = {}
+        self._errors: dict[tuple[str, int, int], Any] = {}  # by sensor, frame and row
+        self._size = 0
         self._blocks = max(_FEWEST, _BLOCKS // max(len(sensors), 1))
         if idle := [name for name, frames in self._frames.items() if not len(frames)]:
             raise InputError(
@@ -93,19 +99,23 @@ class DriveSample:
     @property
     def counts(self) -> dict[str, int]:
         """Number of frames in the sample, by sensor."""
-        return {name: len(errors) for name, errors in self._errors.items()}
+        return {name: min(self._size, len(frames)) for name, frames in self._frames.items()}
 
     @property
     def complete(self) -> bool:
         """Whether all frames of the drive are in the sample."""
-        return all(len(self._errors[name]) == len(frames) for name, frames in self._frames.items())
+        return all(len(frames) <= self._size for frames in self._frames.values())
 
-    def grow(self, frames: int) -> None:
-        """Add frames until the sample has ``frames`` of each sensor, or all that there are."""
-        added = {
-            name: set(of[len(self._errors[name]) : frames].tolist()) for name, of in self._frames.items()
-        }
-        jobs = [job for job in self._plan.jobs if job.frame in added.get(job.sensor.name, ())]
+    def grow(self, frames: int, rows: Sequence[int] | None = None) -> None:
+        """Add frames until the sample has ``frames`` of each sensor, or all that there are.
+
+        rows : numbers of the settings whose errors are measured in all of them; all by default
+        """
+        self._size = max(self._size, frames)
+        wanted = range(len(self.settings)) if rows is None else rows
+        chosen = {name: set(of[: self._size].tolist()) for name, of in self._frames.items()}
+        jobs = [job for job in self._plan.jobs if job.frame in chosen.get(job.sensor.name, ())]
+        jobs = [job for job in jobs if self._missing(job.sensor, frame=job.frame, rows=wanted)]
         done = 0
         for run, _ in chunks(jobs, self._plan.trajectory):
             numbers = {sensor.name: list[int]() for sensor in self._sensors}
@@ -116,30 +126,42 @@ class DriveSample:
             )
             for job in run:
                 self._progress("measuring errors", done, total=len(jobs))
-                self._errors[job.sensor.name].append(self._frame_errors(bench, job.sensor, frame=job.frame))
+                self._measure(bench, job.sensor, frame=job.frame, rows=wanted)
                 done += 1
         self._progress("measuring errors", done, total=len(jobs))
 
     def figures(self, row: int) -> dict[str, dict[str, ErrorEstimate]]:
         """Figures of the errors of one of the settings, by sensor, with 95 % intervals.
 
-        They are those of `range_estimates` and `image_figures`, the latter by resampling frames.
+        They are those of `range_estimates` and `image_figures`, the latter by resampling frames. They have
+        been measured in all frames of the sample.
         """
         found = {}
         for sensor in self._sensors:
-            frames = [errors[row] for errors in self._errors[sensor.name]]
+            every = self._frames[sensor.name]
+            frames = [self._errors[sensor.name, frame, row] for frame in every[: self._size].tolist()]
             if isinstance(sensor, Scanner):
-                complete = len(frames) == len(self._frames[sensor.name])
-                found[sensor.name] = range_estimates(frames, complete=complete)
+                found[sensor.name] = range_estimates(frames, complete=len(frames) == len(every))
             else:
                 found[sensor.name] = resample(frames, seed=0, figures=partial(image_figures, camera=sensor))
         return found
 
-    def _frame_errors(self, bench: Bench, sensor: Scanner | Camera, *, frame: int) -> list[Any]:
-        """Errors of each of the settings in a frame."""
-        if isinstance(sensor, Scanner):
-            return scanner_errors(bench, sensor, frame=frame, settings=self.settings)
-        return camera_errors(bench, sensor, frame=frame, settings=self.settings, blocks=self._blocks)
+    def _missing(self, sensor: Scanner | Camera, *, frame: int, rows: Sequence[int]) -> list[int]:
+        """Those of some settings whose errors in a frame have not been measured."""
+        return [row for row in rows if (sensor.name, frame, row) not in self._errors]
+
+    def _measure(self, bench: Bench, sensor: Scanner | Camera, *, frame: int, rows: Sequence[int]) -> None:
+        """Measure errors of some of the settings in a frame."""
+        key = sensor.name, frame
+        if key not in self._truths:
+            self._truths[key] = (
+                scanner_truth(bench, sensor, frame=frame, settings=self.settings[0])
+                if isinstance(sensor, Scanner)
+                else camera_truth(bench, sensor, frame=frame, settings=self.settings[0], blocks=self._blocks)
+            )
+        truth = self._truths[key]
+        for row in self._missing(sensor, frame=frame, rows=rows):
+            self._errors[sensor.name, frame, row] = truth.error(bench, self.settings[row])
 
 
 def sensors_with(sensors: Sequence[Scanner | Camera], *, kinds: Collection[str]) -> list[Scanner | Camera]:
@@ -200,25 +222,46 @@ def sampled_error(found: PulseReturns, *, exact: PulseReturns, weights: Float) -
     )
 
 
-def scanner_errors(
-    bench: Bench, scanner: Scanner, *, frame: int, settings: Sequence[ScannerSettings]
-) -> list[SampledError]:
-    """Errors of each of some settings in a frame of a scanner."""
-    plain, seed = noiseless(settings[0]), bench.plan.options.seed
+@dataclass(frozen=True, slots=True)
+class ScannerTruth:
+    """Some pulses of a frame of a scanner and their true returns.
+
+    pulses  : (k,) ascending rows of the frame's pulses
+    weights : by row of a pulse in its frame, as of `SampledError`
+    """
+
+    scanner: Scanner
+    frame: int
+    pulses: NDArray[np.int64]
+    weights: Float
+    returns: PulseReturns
+
+    def error(self, bench: Bench, settings: ScannerSettings) -> SampledError:
+        """Errors that settings make."""
+        found = _returns(
+            bench, self.scanner, frame=self.frame, settings=noiseless(settings), pulses=self.pulses
+        )
+        return sampled_error(found, exact=self.returns, weights=self.weights)
+
+
+def scanner_truth(bench: Bench, scanner: Scanner, *, frame: int, settings: ScannerSettings) -> ScannerTruth:
+    """Pulses of a frame on which errors are likely, and some others, with returns of very many rays."""
+    plain, seed = noiseless(settings), bench.plan.options.seed
     frame_returns = partial(_returns, bench, scanner, frame=frame)
     count = len(firings(scanner.sensor, frame))
     screened = chosen_pulses(count, _SCREENED, frame=frame, seed=seed)
     casts = [frame_returns(settings=plain.changed(rays=rays), pulses=screened) for rays in _SCREENS]
     rng = np.random.default_rng([seed, frame, 1])
     hard, easy = _stratify(screened, casts, count=count, rng=rng)
-    pulses, weights = np.sort(np.concatenate([hard, easy])), np.ones(count)
+    weights = np.ones(count)
     weights[easy] = (len(screened) - len(hard)) / max(len(easy), 1)
-    exact = scanner_reference(plain, rays=MOST_RAYS)
-    truth = frame_returns(settings=exact, pulses=pulses, backend=EXACT)
-    return [
-        sampled_error(frame_returns(settings=noiseless(one), pulses=pulses), exact=truth, weights=weights)
-        for one in settings
+    parts = [
+        frame_returns(settings=scanner_reference(plain, rays=rays), pulses=pulses, backend=EXACT)
+        for pulses, rays in ((hard, MOST_RAYS), (easy, min(_EASY_RAYS, MOST_RAYS)))
     ]
+    columns = ([getattr(part, f.name) for part in parts] for f in fields(PulseReturns))
+    returns = PulseReturns(*(np.concatenate(column) for column in columns))
+    return ScannerTruth(scanner, frame, np.sort(np.concatenate([hard, easy])), weights, returns)
 
 
 def _returns(
@@ -304,23 +347,39 @@ def _quantile(values: Float, below: Float, *, share: float) -> float:
     return float(values[min(int(np.searchsorted(below, share * below[-1])), len(values) - 1)])
 
 
-def camera_errors(
-    bench: Bench, camera: Camera, *, frame: int, settings: Sequence[CameraSettings], blocks: int
-) -> list[ImageError]:
-    """Errors of each of some settings in blocks of pixels of a frame; depths are those of the files."""
+@dataclass(frozen=True, slots=True)
+class CameraTruth:
+    """Blocks of pixels of a frame of a camera and their true colours and depths; blocks as of `pixels`."""
+
+    camera: Camera
+    frame: int
+    blocks: Ints
+    exact: Pixels
+
+    def error(self, bench: Bench, settings: CameraSettings) -> ImageError:
+        """Errors that settings make; depths are those of the files."""
+        near = bench.plan.options.recording_settings.world
+        world = bench.world(self.camera, self.frame, backend=FAST, settings=near)
+        found = pixels(
+            bench.shot(self.camera, self.frame),
+            self.blocks,
+            world=world,
+            settings=replace(settings, camera_noise=False),
+        )
+        return image_error(replace(found, depth=counts_to_depth(depth_to_counts(found.depth))), self.exact)
+
+
+def camera_truth(
+    bench: Bench, camera: Camera, *, frame: int, settings: CameraSettings, blocks: int
+) -> CameraTruth:
+    """Blocks of a frame with colours and depths of very many rays."""
     near = bench.plan.options.recording_settings.world
-    exact = camera_reference(settings[0], exposed=camera.spec.exposure_ns > 0)
-    shot = bench.shot(camera, frame)
     chosen = blocks_of_frame(camera.spec, blocks, frame=frame, seed=bench.plan.options.seed)
     whole = bench.world(camera, frame, backend=EXACT, settings=replace(near, origin="near", reach=inf))
-    truth = pixels(shot, chosen, world=whole, settings=exact)
-    world = bench.world(camera, frame, backend=FAST, settings=near)
-
-    def error(one: CameraSettings) -> ImageError:
-        found = pixels(shot, chosen, world=world, settings=replace(one, camera_noise=False))
-        return image_error(replace(found, depth=counts_to_depth(depth_to_counts(found.depth))), truth)
-
-    return [error(one) for one in settings]
+    exact = camera_reference(settings, exposed=camera.spec.exposure_ns > 0)
+    return CameraTruth(
+        camera, frame, chosen, pixels(bench.shot(camera, frame), chosen, world=whole, settings=exact)
+    )
 
 
 def image_figures(frames: Sequence[ImageError], *, camera: Camera) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Numbers of rays for a drive, by an accuracy or a budget of time: a search over a sample of its frames."""
+"""Settings of rays for a drive, by an accuracy or a budget of time: a search over a sample of its frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ from geoscene.support.progress import Progress
 from lidar.errors import InputError
 from lidar.options.accuracy import AccuracyOptions, AccuracyTarget, read_accuracy, read_budget
 from lidar.options.drive import DriveOptions
+from lidar.parameters import value_text
+from lidar.sensors.camera.settings import CameraSettings
+from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner
+from lidar.settings import RecordingSettings
 from lidar.simulation.frame_loop import chunks, record_frame
 from lidar.simulation.plan import DrivePlan, plan_drive
 from lidar.tools.tradeoff.bench import spread_frames
@@ -44,8 +48,11 @@ SAMPLES = (6, 12, 24)
 """Frames of the sample, which grows until it answers."""
 
 _DEARER, _DEAREST = 1.5, 3.0
-"""Times the rays of the first row that is within an accuracy by its estimate. A row with so many that is
-surely within it is taken at once; the last with so many is taken in the end."""
+"""Times the cost of the first row that is within an accuracy by its estimate. A row of so much that is
+surely within it is taken at once; the last of so much is taken in the end."""
+
+_CHEAP = 30.0
+"""Cost up to which rows are tried first, and dearer ones only if none of these is within the accuracy."""
 
 _TIMINGS = 3
 """Frames of each sensor that are timed."""
@@ -77,19 +84,22 @@ class Search:
         """The sample of a kind of sensors, of all rows of its ladder."""
         if kind not in self._samples:
             ladder, own = self.ladders[kind], self.plan.options.recording_settings
-            settings: Any = own.scanner if kind == "scanners" else own.camera
-            rows = [replace(settings, **ladder.values(row)) for row in range(len(ladder.rows))]
+            rows = [self._changed(own, kind=kind, row=row) for row in range(len(ladder.rows))]
             sensors = sensors_with(ladder.sensors, kinds=self.kinds)
             self._samples[kind] = DriveSample(self.plan, sensors, settings=rows, progress=self.progress)
         return self._samples[kind]
+
+    def _changed(self, own: RecordingSettings, *, kind: Kind, row: int) -> ScannerSettings | CameraSettings:
+        """The drive's settings of a kind of sensors with those of a row."""
+        values: dict[str, Any] = self.ladders[kind].values(row)
+        return own.scanner.changed(**values) if kind == "scanners" else replace(own.camera, **values)
 
     def errors(self, rows: Mapping[Kind, int]) -> dict[str, dict[str, ErrorEstimate]]:
         """Figures of each sensor, from the sample as far as it has grown, or the smallest."""
         found: dict[str, dict[str, ErrorEstimate]] = {}
         for kind, row in rows.items():
             sample = self.sample(kind)
-            if not any(sample.counts.values()):
-                sample.grow(SAMPLES[0])
+            sample.grow(SAMPLES[0], rows=[row])
             found |= sample.figures(row)
         return found
 
@@ -105,7 +115,7 @@ class Search:
     def _measure_cost(self, kind: Kind, row: int) -> DriveCost:
         """The cost of frames that are recorded, files and all, with a row of a ladder."""
         ladder = self.ladders[kind]
-        more = tuple((name, str(value)) for name, value in ladder.values(row).items())
+        more = tuple((name, value_text(value)) for name, value in ladder.values(row).items())
         options = replace(self.plan.options, settings=(*self.plan.options.settings, *more))
         plan = replace(self.plan, options=options)
         seconds, load = [0.0] * _TIMINGS, 0.0
@@ -146,9 +156,9 @@ def _follow(worlds: Worlds, plan: DrivePlan, *, sensor: Scanner | Camera, frame:
 def find_accurate(search: Search, accuracy: AccuracyTarget) -> dict[Kind, int]:
     """The first row of each ladder with which errors are within an accuracy, by the end of their intervals.
 
-    The sample grows until some row is that has few more rays than the first row whose errors are within it by
+    The sample grows until some row is that costs little more than the first row whose errors are within it by
     their estimates, or all intervals begin beyond the accuracy. If the largest sample does not decide, the
-    last row with at most `_DEAREST` times the rays of that first row is taken, or a cheaper one that is sure.
+    last row of at most `_DEAREST` times the cost of that first row is taken, or a cheaper one that is sure.
     The order of the rows is the same on all machines, and so are the sample and the rows.
 
     Raises InputError, which names the nearest, if there is none.
@@ -171,22 +181,29 @@ def _first_within(
 ) -> int:
     """The first row of a ladder whose errors are within limits, by name; see `find_accurate`."""
     sample, ladder = search.sample(kind), search.ladders[kind]
+    costs = [row.cost for row in ladder.rows]
+    cheap = sum(cost <= max(_CHEAP, costs[0]) for cost in costs)
+    first, last = 0, cheap  # rows that may be the one
     for frames in SAMPLES:
-        sample.grow(frames)
-        every = [sample.figures(row) for row in range(len(sample.settings))]
-        sure = _first(every, limits, end="high")
-        likely = _first(every, limits, end="value")
-        if sure < len(every) and ladder.rays(sure) <= _DEARER * ladder.rays(likely):
+        sample.grow(frames, rows=range(first, last))
+        every = [sample.figures(row) for row in range(first, last)]
+        if last < len(costs) and _first(every, limits, end="value") == len(every):
+            sample.grow(frames, rows=range(last, len(costs)))
+            every += [sample.figures(row) for row in range(last, len(costs))]
+            last = len(costs)
+        sure, likely, least = (first + _first(every, limits, end=end) for end in ("high", "value", "low"))
+        if sure < last and costs[sure] <= _DEARER * costs[likely]:
             return sure
-        if sample.complete or _first(every, limits, end="low") == len(every):
+        if sample.complete or least == last:
             break
-    if likely < len(every):
-        most = _DEAREST * ladder.rays(likely)
-        return max(row for row in range(min(sure + 1, len(every))) if ladder.rays(row) <= most)
+        first, last = least, min(sure + 1, last)
+    if likely < last:
+        most = _DEAREST * costs[likely]
+        return max(row for row in range(likely, min(sure + 1, last)) if costs[row] <= most)
     worst = [_worst(errors, limits, end="value") for errors in every]
     best = min(range(len(worst)), key=lambda row: worst[row][0])
     _, figure, error = worst[best]
-    label = label_of(ladder.values(best))
+    label = label_of(ladder.values(first + best))
     raise InputError(_out_of_reach(accuracy, error, figure=figure, label=label))
 
 

@@ -99,7 +99,7 @@ def test_more_rays_are_cast_where_surfaces_meet_and_nowhere_else(monkeypatch):
     trace = module._Tracer.echoes
 
     def counted(self, sample, *, rows=None, watch=None):
-        counts.append((len(sample.place), len(self.pulses) if rows is None else len(rows)))
+        counts.append((len(sample.place), len(self.pulses.firings) if rows is None else len(rows)))
         return trace(self, sample, rows=rows, watch=watch)
 
     monkeypatch.setattr(module._Tracer, "echoes", counted)

@@ -17,13 +17,23 @@ from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import InputError
 from lidar.options.accuracy import AccuracyOptions, read_accuracy, read_budget
 from lidar.options.drive import DriveOptions
+from lidar.sensors.rig.specs import load_rig
 from lidar.simulation.drive import DriveSummary, drive
-from lidar.simulation.plan import plan_drive
+from lidar.simulation.plan import plan_drive, sensors_of
 from lidar.tools.sweep import sweep
 from lidar.tools.tradeoff import pick, search
 from lidar.tools.tradeoff.accuracy import CheckedDrive, SpotCheck, driven, pick_settings
 from lidar.tools.tradeoff.errors import ErrorEstimate, PulseReturns
-from lidar.tools.tradeoff.pick import Ladder, SensorErrors, settings_of_rows, stated
+from lidar.tools.tradeoff.pick import (
+    Ladder,
+    Pick,
+    Row,
+    SensorErrors,
+    label_of,
+    ladders_of,
+    settings_of_rows,
+    stated,
+)
 from lidar.tools.tradeoff.sample import (
     DriveSample,
     SampledError,
@@ -107,8 +117,9 @@ class FakeSample:
     def __init__(self, rows, *, narrow_from=10**9):
         self.settings, self.frames, self.narrow_from = rows, 0, narrow_from
 
-    def grow(self, frames):
+    def grow(self, frames, rows):
         self.frames = frames
+        assert all(row < len(self.settings) for row in rows)
 
     def figures(self, row):
         factor = 1.0 if self.frames < self.narrow_from else 0.5
@@ -137,8 +148,8 @@ class FakeSearch:
 
 
 SCANNER = SimpleNamespace(spec=SimpleNamespace(images=("rgb", "depth")))
-RAYS = Ladder("scanners", (SCANNER,), ("rays",), ((1,), (7,), (19,)))
-PIXELS = Ladder("cameras", (SCANNER,), ("supersample",), ((1,), (2,), (3,)))
+RAYS = Ladder("scanners", (SCANNER,), tuple(Row((("rays", n),), n) for n in (1, 7, 19)))
+PIXELS = Ladder("cameras", (SCANNER,), tuple(Row((("supersample", n),), n * n) for n in (1, 2, 3)))
 
 
 def scanner_row(*errors):
@@ -243,17 +254,17 @@ def test_the_cheaper_step_is_taken_first(budget, settings):
 
 
 def test_settings_that_are_given_are_not_picked():
-    fixed = replace(PIXELS, names=(), rows=((),))
+    fixed = replace(PIXELS, rows=(Row(),))
     assert accurate("8cm", RAYS, fixed) == {"rays": 7}
     assert affordable("0.1x-realtime", RAYS, fixed) == {"rays": 19}
 
 
 def test_depths_need_no_setting_and_are_refused_beyond_what_files_hold():
-    assert accurate("1cm", replace(PIXELS, names=(), rows=((),))) == {}
+    assert accurate("1cm", replace(PIXELS, rows=(Row(),))) == {}
     with pytest.raises(
         InputError, match=r"no image reaches .* of the depths; it comes nearest .*: give 2 mm"
     ):
-        accurate("1.9mm", replace(PIXELS, names=(), rows=((),)))
+        accurate("1.9mm", replace(PIXELS, rows=(Row(),)))
 
 
 def test_budgets_and_colours_that_none_reaches_are_one_line_with_the_nearest():
@@ -341,7 +352,7 @@ def test_intervals_of_a_drive_that_is_sampled_whole_do_not_depend_on_how_its_fra
 def quick():
     """Smaller samples, so that a search takes a second."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pick, "RAYS", (1, 7, 61))
+        patch.setattr(pick, "SCANNERS", tuple(("rays", n, float(n)) for n in (1, 7, 61)))
         patch.setattr(pick, "SUPERSAMPLES", (1, 3))
         measure_little(patch)
         yield
@@ -412,12 +423,39 @@ def test_a_drive_holds_what_was_asked_picked_expected_and_reached(scene, between
     same_files(tmp_path / "a", tmp_path / "b")
 
 
+def test_tolerances_that_noise_or_steps_hide_are_not_picked(monkeypatch):
+    tolerances = tuple(("footprint", metres, 1 / metres) for metres in (0.1, 0.01, 0.0005))
+    monkeypatch.setattr(pick, "SCANNERS", tolerances)
+    sensors = sensors_of(load_rig("vlp16"), DRIVE)
+    exact, survey = (
+        ladders_of(options, sensors, free=("scanners",))["scanners"]
+        for options in (DRIVE, replace(DRIVE, fidelity="survey"))
+    )
+    labels = [[label_of(of.values(row)) for row in range(len(of.rows))] for of in (exact, survey)]
+    assert labels == [
+        ["rays=1", "footprint=10cm", "footprint=1cm", "footprint=500µm"],
+        ["rays=19", "footprint=10cm", "footprint=1cm"],
+    ]
+
+
+def test_a_picked_tolerance_is_in_the_recipe_and_the_drive_is_resumed_with_it(scene, tmp_path):
+    by = AccuracyOptions("3cm@99")
+    expected = SensorErrors(99.0, ranges={"lidar_top": around(0.01)})
+    picked = Pick(by.request, {"footprint": 0.03}, expected)
+    done = driven(scene, tmp_path / "a", options=DRIVE, wanted=by, pick=picked)
+    manifest = open_dataset(tmp_path / "a").manifest
+    assert manifest["recipe"]["settings"] == [["footprint", "0.03"]]
+    assert 0 < done.reached.reached.ranges["lidar_top"].value < 0.03
+    again = pick_settings(scene, DRIVE, wanted=by, out=tmp_path / "a")
+    assert (again.settings, again.expected, again.label) == (picked.settings, expected, "footprint=3cm")
+
+
 def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, tmp_path):
     words = ["drive", scene.path, "--route", "random", "--duration", "0.5"]
     for more, line in (
         (["--accuracy", "1cm", "--set", "rays=3"], "--set rays=3: --accuracy picks it"),
         (["--budget", "1x-realtime", "--set", "stretch=on"], "--set stretch=on: --budget picks rays"),
-        (["--accuracy", "1cm", "--set", "footprint=1cm"], "footprint=1cm: --accuracy picks a number of rays"),
+        (["--accuracy", "1cm", "--set", "footprint=1cm"], "footprint=1cm: --accuracy picks it"),
         (["--budget", "1x-realtime", "--scheduler", "tcp://a:1"], "--budget is for this machine"),
         (["--accuracy", "1cm@42"], "--accuracy 1cm@42: after the @ give one of 50, 68"),
         (["--budget", "fast"], "--budget fast: give a speed such as 2x-realtime"),
