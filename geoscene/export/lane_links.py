@@ -61,8 +61,8 @@ class Turn:
 def link_lanes(here: Sequence[DrivenLane], turns: Sequence[Turn], *, left_hand: bool) -> None:
     """Join the lanes of an edge, from the middle outwards, with those of the edges that follow.
 
-    Lanes lead where their arrows point (`lanes_by_turn`). One that leads nowhere ends: its traffic merges
-    into the lane beside it.
+    Lanes lead where their arrows point (`lanes_by_turn`). One that leads nowhere goes straight on, into the
+    lane in line with it; where there is none it ends, and its traffic merges into the lane beside it.
     """
     angles = np.array([turn.angle for turn in turns])
     kinds: tuple[LaneKind, ...] = ("driving", "bus")
@@ -83,31 +83,44 @@ def link_lanes(here: Sequence[DrivenLane], turns: Sequence[Turn], *, left_hand: 
             )
         if not own or not turns:
             continue
-        ahead = turns[int(np.abs(angles).argmin())].pairs
+        straight = turns[int(np.abs(angles).argmin())]
+        ahead = straight.pairs.copy()
         linked = {lane.number for turn in turns for lane, _ in turn.pairs}
         for lane in own:
             if lane.number not in linked and ahead:
                 near = min(ahead, key=lambda pair: abs(pair[0].number - lane.number))
-                ahead.append((lane, near[1]))
+                straight.pairs.append(
+                    (lane, near[1] if merges(lane.lane) else _beside(near, lane, turn=straight))
+                )
+
+
+def _beside(near: LanePair, lane: DrivenLane, *, turn: Turn) -> DrivenLane:
+    """The lane into which a lane leads if it stays beside a pair of joined lanes; else that of the pair."""
+    steps = abs(lane.number) - abs(near[0].number)
+    wanted = abs(near[1].number) + steps
+    found = (one for one in turn.there if abs(one.number) == wanted and one.lane.kind == lane.lane.kind)
+    return next(found, near[1])
 
 
 def link_new_lanes(turns: Sequence[Turn]) -> None:
-    """Join lanes that begin at a junction with those that lead most directly into the lane beside them."""
+    """Join lanes that begin at a junction with those that lead most directly into the lane beside them.
+
+    A lane for cars into which only a lane for buses leads begins there, too.
+    """
     into: dict[int, list[Turn]] = defaultdict(list)
     for turn in turns:
         into[turn.after].append(turn)
     for entering in into.values():
-        linked = {lane.number for turn in entering for _, lane in turn.pairs}
-        usable = [turn for turn in entering if turn.pairs]
+        linked = {lane.number for turn in entering for a, lane in turn.pairs if a.lane.kind == "driving"}
+        usable = [turn for turn in entering if any(a.lane.kind == "driving" for a, _ in turn.pairs)]
         if not usable:
             continue
         straight = min(usable, key=lambda turn: (abs(turn.angle), turn.before))
-        pairs = straight.pairs.copy()
+        pairs = [pair for pair in straight.pairs if pair[0].lane.kind == "driving"]
         for lane in straight.there:
             if lane.number not in linked and lane.lane.kind == "driving":
                 near = min(pairs, key=lambda pair: abs(pair[1].number - lane.number))
-                if near[0].lane.kind == "driving":
-                    straight.pairs.append((near[0], lane))
+                straight.pairs.append((near[0], lane))
 
 
 def _aligned(
@@ -146,11 +159,11 @@ def _aligned(
 
 
 def side_by_side(pairs: Sequence[LanePair]) -> list[list[LanePair]]:
-    """Pairs from the middle outwards, in runs of lanes that lie side by side on both roads."""
+    """Pairs from the middle outwards, in runs of lanes that lie side by side, in one order, on both roads."""
     runs: list[list[LanePair]] = []
     for pair in sorted(pairs, key=lambda pair: (abs(pair[0].number), abs(pair[1].number))):
         last = runs[-1][-1] if runs else None
-        if last and all(abs(abs(pair[k].number) - abs(last[k].number)) == 1 for k in (0, 1)):
+        if last and all(abs(pair[k].number) - abs(last[k].number) == 1 for k in (0, 1)):
             runs[-1].append(pair)
         else:
             runs.append([pair])

@@ -333,6 +333,56 @@ def test_lanes_lead_where_their_arrows_point(scene, tmp_path, turns, right_hand,
         _check_links(path)
 
 
+def _lane_pairs(path, incoming):
+    """Lanes joined by the connections from a road: (road after, lane before, lane after)."""
+    document, found = _roads(path)
+    pairs = []
+    for connection in document.iter("connection"):
+        if connection.get("incomingRoad") != incoming:
+            continue
+        road = found[connection.get("connectingRoad")].element
+        after = road.find("link/successor").get("elementId")
+        for lane in road.iter("lane"):
+            if lane.get("id") != "0":
+                ends = [int(lane.find(f"link/{word}").get("id")) for word in ("predecessor", "successor")]
+                pairs.append((after, *ends))
+    return sorted(pairs)
+
+
+@pytest.mark.parametrize(("keeps_left", "side"), [(False, -1), (True, 1)])
+def test_lanes_stay_in_line_past_a_driveway_that_their_arrows_do_not_mean(scene, tmp_path, keeps_left, side):
+    # lanes for the junction ahead; a driveway on the kerb's side between them and it
+    graph = road_graph(
+        [(-200, 0), (0, 0), (200, 0), (0, side * 100)],
+        [(0, 1), (1, 2), (1, 3)],
+        twoway=[False, False, True],
+        width=9.75,
+    )
+    through = graph.twin < 0
+    turns = "left|left|through"
+    turns = "|".join(turns.replace("left", "right").split("|")[::-1]) if keeps_left else turns
+    graph = replace(
+        graph, lanes=np.where(through, 3.0, 1.0), lane_turns=np.where(through, turns, "").astype(str)
+    )
+    path = _write(graph, _keeping(scene, keeps_left), tmp_path)
+    _check_links(path)
+    straight = [(a, b) for after, a, b in _lane_pairs(path, "1") if after == "2"]
+    assert {(side * k, side * k) for k in (1, 2, 3)} <= set(straight)
+
+
+@pytest.mark.parametrize("keeps_left", [False, True])
+def test_cars_enter_every_lane_for_cars_past_the_end_of_a_bus_lane(scene, tmp_path, keeps_left):
+    nodes = [(-200, 0), (0, 0), (200, 20)]
+    graph = road_graph(nodes, [(0, 1), (1, 2)], twoway=False, width=6.5, lanes=2.0)
+    kinds = "bus|driving" if keeps_left else "driving|bus"
+    graph = replace(graph, lane_kinds=np.where(graph.tail == 0, kinds, "").astype(str))
+    path = _write(graph, _keeping(scene, keeps_left), tmp_path)
+    _check_links(path)
+    side = 1 if keeps_left else -1
+    links = _lane_pairs(path, "1")
+    assert {b for _, a, b in links if a == side} == {side, 2 * side}
+
+
 def test_without_arrows_every_lane_leads_somewhere(scene, tmp_path):
     path = _write(_crossing(), _keeping(scene, left_hand=False), tmp_path)
     assert _lanes_by_target(path) == {"2": [-1, -2], "3": [-1], "4": [-3]}
