@@ -35,6 +35,9 @@ _TOGETHER = 0.01
 REACH = 0.1
 """Metres that a reference line may cut a corner of its polyline by."""
 
+_TURNING_BACK = np.radians(75.0)
+"""Of two roads that leave a junction within this angle, turning from one into the other is turning back."""
+
 _SMALLEST_RADIUS = 0.3
 _COLLINEAR = 1e-7  # radians: vertices that turn by less are no corners
 
@@ -100,6 +103,7 @@ class RoadNet:
     junctions   : (n,) bool, by node
     connections : in order of nodes and edges
     joints      : (road, end) to the (road, end) that continues it
+    halved      : (k,) bool, roads that their two junctions do not identify, to be written as two halves
     """
 
     roads: list[Carriageway]
@@ -107,6 +111,7 @@ class RoadNet:
     junctions: Bools
     connections: list[Connection]
     joints: dict[tuple[int, int], tuple[int, int]]
+    halved: Bools
 
 
 def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
@@ -159,7 +164,37 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
         for pairs in side_by_side(turn.pairs)
     ]
     connections.sort(key=lambda c: (c.node, c.before, c.after))
-    return RoadNet(roads, road_of, junctions, connections, joints)
+    halved = _halved(graph, roads, junctions=junctions)
+    return RoadNet(roads, road_of, junctions, connections, joints, halved)
+
+
+def _halved(graph: RoadGraph, roads: list[Carriageway], *, junctions: Bools) -> Bools:
+    """Which roads (k,) readers that know roads by their two junctions take for others.
+
+    These are roads that return to the junction they begin at, and all but the shortest of the roads between
+    the same two junctions if one of them is two-way and turning from one into another is turning back.
+    """
+    halved = np.zeros(len(roads), np.bool_)
+    between: dict[tuple[int, int], list[int]] = defaultdict(list)
+    for k, road in enumerate(roads):
+        a, b = sorted((int(graph.tail[road.edge]), int(graph.head[road.edge])))
+        if junctions[a] and junctions[b]:
+            between[a, b].append(k)
+    for (a, b), same in between.items():
+        if a == b:
+            halved[same] = True
+        elif any(roads[k].twin >= 0 for k in same) and any(
+            _nearest_angle(graph, [roads[k].edge for k in same], node=node) < _TURNING_BACK for node in (a, b)
+        ):
+            by_length = sorted(same, key=lambda k: (roads[k].plan.total, k))
+            halved[by_length[1:]] = True
+    return halved
+
+
+def _nearest_angle(graph: RoadGraph, edges: Sequence[int], *, node: int) -> float:
+    """Least angle (radians) between two of the edges that meet in a node; pi for a single one."""
+    away = [_leaving_heading(graph, k, end=START if graph.tail[k] == node else END) for k in edges]
+    return min((_angle(a, b) for k, a in enumerate(away) for b in away[:k]), default=np.pi)
 
 
 def _leaving_heading(graph: RoadGraph, edge: int, *, end: int) -> float:

@@ -72,8 +72,8 @@ class _Road:
         out = {}
         for side, sign in (("left", 1), ("right", -1)):
             t = _number(offset, "a") if offset is not None else 0.0
-            found = self.element.findall(f"lanes/laneSection/{side}/lane")
-            for lane in sorted(found, key=lambda e: abs(int(e.get("id")))):
+            section = self.element.findall("lanes/laneSection")[-end]
+            for lane in sorted(section.findall(f"{side}/lane"), key=lambda e: abs(int(e.get("id")))):
                 width = lane.find("width")
                 wide = _number(width, "a") + _number(width, "b") * self.length * end
                 edges = [
@@ -144,6 +144,45 @@ def test_lanes_are_continuous_in_a_grid_of_any_lane_count(scene, tmp_path, lanes
     graph = grid(width=9.0)
     graph = replace(graph, lanes=np.broadcast_to(np.asarray(lanes, float), len(graph)).copy())
     assert _check_links(_write(graph, _keeping(scene, left_hand), tmp_path)) > 100
+
+
+def _sections(road):
+    """Of each lane section: its start and the lanes with the lanes before and after them."""
+    found = []
+    for section in road.element.iter("laneSection"):
+        lanes = {}
+        for lane in section.iter("lane"):
+            links = [lane.find(f"link/{word}") for word in ("predecessor", "successor")]
+            if lane.get("id") != "0":
+                lanes[lane.get("id")] = [None if e is None else e.get("id") for e in links]
+        found.append((_number(section, "s"), lanes))
+    return found
+
+
+def test_roads_that_their_junctions_do_not_identify_have_two_sections(scene, tmp_path):
+    # a loop at a dead end, two streets side by side around a narrow block, and a dual carriageway
+    nodes = [(0, 0), (100, 0), (200, 0), (300, 0), (400, 0), (500, 0)]
+    pairs = [(0, 1), (1, 2), (1, 2), (2, 3), (3, 4), (4, 3), (4, 5), (5, 5)]
+    graph = road_graph(nodes, pairs, twoway=[True] * 4 + [False] * 2 + [True] * 2)
+    lines = graph.geometry.copy()
+    for edge, bend in {4: (150, 30), 8: (350, 15), 9: (350, -15)}.items():
+        lines[edge] = np.array([lines[edge][0], (*bend, 0), lines[edge][-1]], float)
+    lines[5] = lines[4][::-1]
+    lines[12] = np.array([(500, 0, 0), (540, 20, 0), (540, -20, 0), (500, 0, 0)], float)
+    lines[13] = lines[12][::-1]
+    path = _write(replace(graph, geometry=lines), scene, tmp_path)
+    _, found = _roads(path)
+    roads = {k: road for k, road in found.items() if road.element.get("junction") == "-1"}
+    halved = {
+        road.element.find("userData").get("value") for road in roads.values() if len(_sections(road)) == 2
+    }
+    assert halved == {"way/4", "way/12"}  # the longer one of those side by side, and the loop
+    for road in roads.values():
+        for start, lanes in _sections(road)[1:]:
+            assert start == pytest.approx(road.length / 2)
+            assert [links[0] for links in lanes.values()] == list(lanes)
+            assert [links[1] for links in _sections(road)[0][1].values()] == list(lanes)
+    assert _check_links(path) > 20
 
 
 def test_restrictions_without_opendrive_equivalent_are_counted(tmp_path):
