@@ -43,6 +43,8 @@ class Turn:
     begin, end    : where it leaves the one and enters the other
     there         : lanes of the edge after it, from the middle outwards
     pairs         : lanes that are joined
+    room          : metres from the one and from the other to the node
+    steepest      : greatest gradient of the two edges between their ends and the node, metres a metre
     """
 
     before: int
@@ -51,6 +53,8 @@ class Turn:
     end: Pose
     there: Sequence[DrivenLane]
     pairs: list[LanePair]
+    room: tuple[float, float]
+    steepest: float
 
     @property
     def angle(self) -> float:

@@ -23,6 +23,7 @@ from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lane_tags import Lane, LaneKind
 from geoscene.roadgraph.lanes import LaneLayout, edge_lanes, graph_lanes
 from geoscene.roadgraph.routing import turn_table
+from geoscene.roadgraph.turn_lanes import STRAIGHT
 from geoscene.typing import Bools, Float, Ints
 
 START, END = 0, 1
@@ -37,6 +38,9 @@ REACH = 0.1
 
 _TURNING_BACK = np.radians(75.0)
 """Of two roads that leave a junction within this angle, turning from one into the other is turning back."""
+
+_LEVEL = 0.02
+"""Metres a metre: connecting roads are not made longer for gradients below this."""
 
 _SMALLEST_RADIUS = 0.3
 _COLLINEAR = 1e-7  # radians: vertices that turn by less are no corners
@@ -155,7 +159,7 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     turns = [
         turn
         for first, then in following.items()
-        for turn in _turns(roads, road_of=road_of, before=first, after=then, left_hand=left_hand)
+        for turn in _turns(graph, roads, road_of=road_of, before=first, after=then, left_hand=left_hand)
     ]
     link_new_lanes(turns)
     connections = [
@@ -333,18 +337,42 @@ def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[Drive
 
 
 def _turns(
-    roads: list[Carriageway], *, road_of: Ints, before: int, after: Sequence[int], left_hand: bool
+    graph: RoadGraph,
+    roads: list[Carriageway],
+    *,
+    road_of: Ints,
+    before: int,
+    after: Sequence[int],
+    left_hand: bool,
 ) -> list[Turn]:
     """The turns from the end of one edge to the starts of others, with the lanes that they join."""
     source = roads[road_of[before]]
     begin = _pose(source, arriving=True, along=before == source.edge)
+    room, steep = _within_junction(graph, source, edge=before, arriving=True)
     turns = []
     for edge in after:
         road = roads[road_of[edge]]
         end = _pose(road, arriving=False, along=edge == road.edge)
-        turns.append(Turn(before, edge, begin, end, driven_lanes(road, edge, left_hand=left_hand), []))
+        beyond, other_steep = _within_junction(graph, road, edge=edge, arriving=False)
+        there = driven_lanes(road, edge, left_hand=left_hand)
+        steepest = max(steep, other_steep, abs(begin[2]), abs(end[2]))
+        turns.append(Turn(before, edge, begin, end, there, [], (room, beyond), steepest))
     link_lanes(driven_lanes(source, before, left_hand=left_hand), turns, left_hand=left_hand)
     return turns
+
+
+def _within_junction(
+    graph: RoadGraph, road: Carriageway, *, edge: int, arriving: bool
+) -> tuple[float, float]:
+    """Metres from a road's end to the node, and the greatest gradient there."""
+    line = graph.geometry[edge]
+    first = road.begins
+    last = road.whole - first - polylines.length(road.line)
+    gap = last if arriving == (edge == road.edge) else first
+    part = polylines.cut(line[::-1] if arriving else line, 0.0, end=gap)
+    run = np.hypot(*np.diff(part[:, :2], axis=0).T)
+    rise = np.abs(np.diff(part[:, 2]))
+    return gap, float(np.max(rise[run > 1e-3] / run[run > 1e-3], initial=0.0))
 
 
 def _connection(turn: Turn, pairs: Sequence[LanePair], *, node: int) -> Connection:
@@ -352,11 +380,11 @@ def _connection(turn: Turn, pairs: Sequence[LanePair], *, node: int) -> Connecti
     (start, heading, slope), (stop, end_heading, end_slope) = turn.begin, turn.end
     first = start[:2] + pairs[0][0].inner * np.array([-np.sin(heading), np.cos(heading)])
     last = stop[:2] + pairs[0][1].inner * np.array([-np.sin(end_heading), np.cos(end_heading)])
-    curve = connecting_curve(first, heading, end=last, end_heading=end_heading)
-    length = max(curve.length, 1e-3)
-    rise = stop[2] - start[2]
-    c = (3 * rise / length - 2 * slope - end_slope) / length
-    d = (slope + end_slope - 2 * rise / length) / length**2
+    gradient = max(turn.steepest, _LEVEL)
+    rise = float(stop[2] - start[2])
+    curve = connecting_curve(
+        first, heading, end=last, end_heading=end_heading, least=abs(rise) / gradient, room=turn.room
+    )
     return Connection(
         node,
         turn.before,
@@ -365,8 +393,27 @@ def _connection(turn: Turn, pairs: Sequence[LanePair], *, node: int) -> Connecti
         np.array([[a.number, b.number] for a, b in pairs], np.int64),
         tuple(a.lane.kind for a, _ in pairs),
         np.array([[a.lane.width, b.lane.width] for a, b in pairs]),
-        np.array([start[2], slope, c, d]),
+        height_profile(start[2], stop[2], slopes=(slope, end_slope), length=curve.length, steepest=gradient),
     )
+
+
+def height_profile(
+    start: float, stop: float, *, slopes: tuple[float, float], length: float, steepest: float
+) -> Float:
+    """Coefficients (4,) of 1, s, s2, s3 of the height between two roads, metres, for s along the connection.
+
+    The profile continues the roads' gradients ``slopes`` if it is nowhere steeper than ``steepest`` (metres a
+    metre) for that; else its gradient is constant.
+    """
+    length = max(length, 1e-3)
+    (slope, end_slope), mean = slopes, (stop - start) / length
+    c = (3 * mean - 2 * slope - end_slope) / length
+    d = (slope + end_slope - 2 * mean) / length**2
+    turning = -c / (3 * d) if d else 0.0  # where the gradient is greatest or least
+    at = np.array([0.0, length, turning if 0.0 < turning < length else 0.0])
+    if np.abs(slope + 2 * c * at + 3 * d * at**2).max() > steepest + 1e-9:
+        return np.array([start, mean, 0.0, 0.0])
+    return np.array([start, slope, c, d])
 
 
 def _pose(road: Carriageway, *, arriving: bool, along: bool) -> Pose:
@@ -466,13 +513,26 @@ class Curve:
     length: float
 
 
+_TO_CORNER = 4 / 3  # a cubic between antiparallel handles goes three quarters of their length
+_LENGTHENINGS = 21
+
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(96)  # cubics that nearly turn on the spot need that many
 
 
-def connecting_curve(start: Float, heading: float, *, end: Float, end_heading: float) -> Curve:
+def connecting_curve(
+    start: Float,
+    heading: float,
+    *,
+    end: Float,
+    end_heading: float,
+    least: float = 0.0,
+    room: tuple[float, float] = (0.0, 0.0),
+) -> Curve:
     """The cubic from a point (2,) with a heading to another, close to an arc where an arc fits.
 
-    For a turn by a with chord c the handles of an arc's cubic are c tan(a / 4) / (1.5 sin(a / 2)) long.
+    For a turn by a with chord c the handles of an arc's cubic are c tan(a / 4) / (1.5 sin(a / 2)) long. In
+    turns, they are lengthened until the curve is ``least`` metres long, but only until it reaches the corner
+    of the roads, which is ``room`` metres ahead of the start and behind the end.
     """
     c, s = np.cos(heading), np.sin(heading)
     to_local = np.array([[c, s], [-s, c]])
@@ -480,11 +540,27 @@ def connecting_curve(start: Float, heading: float, *, end: Float, end_heading: f
     turn = (end_heading - heading + np.pi) % (2 * np.pi) - np.pi
     bend = min(max(abs(turn), 1e-4), 0.95 * np.pi)
     handle = float(np.hypot(*goal) * np.tan(bend / 4) / (1.5 * np.sin(bend / 2)))
-    leave, arrive = 3 * handle * np.array([1.0, 0.0]), 3 * handle * np.array([np.cos(turn), np.sin(turn)])
+    most = np.maximum(handle, _TO_CORNER * np.array(room))
+    for share in np.linspace(0.0, 1.0, _LENGTHENINGS) if abs(turn) > STRAIGHT else (0.0,):
+        u, v, length = _cubic(goal, turn, handles=handle + share * (most - handle))
+        if length >= least:
+            break
+    return Curve(float(start[0]), float(start[1]), heading, u, v, length)
+
+
+def _cubic(goal: Float, turn: float, *, handles: Float) -> tuple[Float, Float, float]:
+    """Coefficients (4,) of both coordinates, and length, of a cubic from 0 ahead to a point (2,) and a turn.
+
+    handles : (2,) metres
+    """
+    leave, arrive = (
+        3 * handles[0] * np.array([1.0, 0.0]),
+        3 * handles[1] * np.array([np.cos(turn), np.sin(turn)]),
+    )
     a, b = leave, 3 * goal - 2 * leave - arrive
     d = leave + arrive - 2 * goal
     p = (_NODES + 1) / 2
     speed = a[:, None] + 2 * b[:, None] * p + 3 * d[:, None] * p**2
     length = float((np.hypot(*speed) * _WEIGHTS).sum() / 2)
     u, v = (np.array([0.0, a[k], b[k], d[k]]) for k in (0, 1))
-    return Curve(float(start[0]), float(start[1]), heading, u, v, length)
+    return u, v, length

@@ -320,6 +320,37 @@ def test_connecting_curve_is_near_an_arc_of_the_stated_length(heading, turn, cho
     np.testing.assert_allclose([c * u[-1] - s * v[-1], s * u[-1] + c * v[-1]], end, atol=1e-9)
 
 
+def _steepest(road):
+    """Greatest gradient of a road of the file, metres a metre."""
+    ends = [_number(e, "s") for e in road.element.find("elevationProfile")] + [road.length]
+    steepest = 0.0
+    for piece, start, stop in zip(road.element.find("elevationProfile"), ends, ends[1:], strict=False):
+        height = np.polynomial.Polynomial([_number(piece, c) for c in "abcd"])
+        steepest = max(steepest, np.abs(height.deriv()(np.linspace(0, stop - start, 50))).max())
+    return steepest
+
+
+@pytest.mark.parametrize("left_hand", [False, True])
+@pytest.mark.parametrize("angle", [15, 30, 50, 80, 110])
+@pytest.mark.parametrize("heights", [(25, -25), (25, 25), (5, -25)])
+def test_connecting_roads_on_a_slope_are_no_steeper_than_the_streets(
+    scene, tmp_path, angle, heights, left_hand
+):
+    # a hairpin on a hillside: the two streets come close to each other at different heights
+    arms = [
+        (100 * np.cos(t), 100 * np.sin(t), z) for t, z in zip((0, np.radians(angle)), heights, strict=True)
+    ]
+    graph = road_graph([(0, 0, 0), *arms], [(0, 1), (0, 2)], width=6.0)
+    path = _write(graph, _keeping(scene, left_hand), tmp_path)
+    assert _check_links(path) >= 2
+    _, found = _roads(path)
+    streets = max(_steepest(road) for road in found.values() if road.element.get("junction") == "-1")
+    turns = [road for road in found.values() if road.element.get("junction") != "-1"]
+    assert len(turns) == 2
+    for road in turns:
+        assert _steepest(road) <= streets * 1.001
+
+
 CROSSING = [(-200, 0), (0, 0), (200, 0), (0, 200), (0, -200)]
 ARMS = [(0, 1), (1, 2), (1, 3), (1, 4)]  # one road in; straight on, to the left, to the right
 
