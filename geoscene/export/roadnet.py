@@ -39,6 +39,9 @@ REACH = 0.1
 _TURNING_BACK = np.radians(75.0)
 """Of two roads that leave a junction within this angle, turning from one into the other is turning back."""
 
+_LEAST_HALVED = 0.5
+"""Metres: shorter roads are not halved."""
+
 _LEVEL = 0.02
 """Metres a metre: connecting roads are not made longer for gradients below this."""
 
@@ -182,7 +185,7 @@ def _halved(graph: RoadGraph, roads: list[Carriageway], *, junctions: Bools) -> 
     between: dict[tuple[int, int], list[int]] = defaultdict(list)
     for k, road in enumerate(roads):
         a, b = sorted((int(graph.tail[road.edge]), int(graph.head[road.edge])))
-        if junctions[a] and junctions[b]:
+        if junctions[a] and junctions[b] and road.plan.total > _LEAST_HALVED:
             between[a, b].append(k)
     for (a, b), same in between.items():
         if a == b:
