@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from geoscene.export.lane_links import (
@@ -46,7 +47,8 @@ _LEVEL = 0.02
 """Metres a metre: connecting roads are not made longer for gradients below this."""
 
 _SMALLEST_RADIUS = 0.3
-_COLLINEAR = 1e-7  # radians: vertices that turn by less are no corners
+_IN_LINE = 1e-4
+"""Metres off a straight by which a vertex is no corner: it is there for its height."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -465,16 +467,14 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     of either side. With turn angle a and tangent t, its radius is t / tan(a / 2) and it passes the corner at
     t tan(a / 4). Corners too sharp for a radius of 0.3 m stay corners.
     """
+    corner = _corners(points)
+    along = polylines.stations(points)
+    points = points[corner]
     step = np.diff(points, axis=0)
     side = np.hypot(*step.T)
     heading = np.arctan2(step[:, 1], step[:, 0])
     turn = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
     bend = np.maximum(np.abs(turn), 1e-12)
-    if (bend < _COLLINEAR).any():
-        corner = np.concatenate([[True], bend >= _COLLINEAR, [True]])
-        along = np.append(0.0, np.cumsum(side))
-        plan = plan_view(points[corner], reach=reach)
-        return replace(plan, at=np.interp(along, along[corner], plan.at))
     tangent = np.minimum(np.minimum(side[:-1], side[1:]) / 2, reach / np.tan(bend / 4))
     radius = tangent / np.tan(bend / 2)
     tangent = np.where(radius < _SMALLEST_RADIUS, 0.0, tangent)
@@ -492,11 +492,31 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     curve = np.divide(np.sign(turn), radius, out=np.zeros_like(turn), where=tangent > 0)
     columns[:, 1::2] = arc_start[:, 0], arc_start[:, 1], heading[:-1], arc, curve
     s = np.cumsum(columns[3]) - columns[3]
-    ends = np.concatenate([[0.0], s[1::2] + arc / 2, [s[-1] + columns[3, -1]]])
+    # Where the line is at each corner, and at both ends of each straight.
+    reached = np.concatenate([[0.0], s[1::2] + arc / 2, [s[-1] + columns[3, -1]]])
+    bases = np.append(0.0, np.cumsum(side))
+    knots = np.concatenate([bases, bases[:-1] + before, bases[1:] - after])
+    order = np.argsort(knots, kind="stable")
+    stations = np.concatenate([reached, s[0::2], s[0::2] + straight])
+    ends = np.interp(np.interp(along, along[corner], bases), knots[order], stations[order])
     keep = columns[3] > 1e-6
     x, y, angle, length, curvature = columns[:, keep]
     # Pieces left out are shorter than a micrometre: lengths are summed again so that s has no gap.
     return PlanView(np.cumsum(length) - length, x, y, angle, length, curvature, ends)
+
+
+def _corners(points: Float) -> Bools:
+    """Which points (n,) of a polyline (n, 2) it needs to keep within `_IN_LINE` of all of them."""
+    corner = np.zeros(len(points), np.bool_)
+    corner[[0, -1]] = True
+    kept = shapely.get_coordinates(
+        shapely.simplify(polylines.flat(points), _IN_LINE, preserve_topology=False)
+    )
+    row = 0
+    for point in kept[1:-1]:
+        row += 1 + int(np.flatnonzero((points[row + 1 :] == point).all(axis=1))[0])
+        corner[row] = True
+    return corner
 
 
 @dataclass(frozen=True, slots=True)

@@ -305,6 +305,14 @@ def test_a_reference_line_is_smooth_and_near_its_polyline(steps):
     assert (np.abs(kinks) > 1e-6).sum() <= sharp
 
 
+def test_vertices_that_only_have_heights_do_not_bend_a_reference_line():
+    along = np.array([0, 10, 20, 50, 60.0])
+    points = np.column_stack([along, [0, 5e-5, -5e-5, 0, 0]])
+    plan = plan_view(np.vstack([points, [80, 20]]))
+    assert (plan.curvature != 0).tolist() == [False, True, False]
+    np.testing.assert_allclose(plan.at[:4], along[:4], atol=1e-4)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-3, 3), st.floats(-2.8, 2.8), st.floats(2, 60))
 def test_connecting_curve_is_near_an_arc_of_the_stated_length(heading, turn, chord):
