@@ -64,9 +64,14 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
 
     Raises SceneFormatError for a scene without drivable roads.
     """
+    return _write(scene, path, split_shared=False, progress=progress)
+
+
+def _write(scene: Scene, path: Path, *, split_shared: bool, progress: Progress) -> Summary:
+    """See `write_opendrive` and, for ``split_shared``, `road_net`."""
     graph = scene.road_graph()
     left_hand = scene.left_hand
-    net = road_net(graph, left_hand=left_hand)
+    net = road_net(graph, left_hand=left_hand, split_shared=split_shared)
     controls: dict[int, list[tuple[float, str]]] = defaultdict(list)
     for edge, offset, kind in graph.controls:
         controls[edge].append((offset / max(float(graph.length[edge]), 1e-9), kind))
@@ -352,8 +357,10 @@ def _junctions(net: RoadNet, junctions: dict[int, int], *, first: int, left_hand
 def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summary:
     """Write the road graph as a SUMO network (``.net.xml``).
 
-    The network is converted by ``netconvert`` of the package eclipse-sumo from the file of `write_opendrive`;
-    its comments contain the time of day and are removed. Its warnings are notes of the summary, one for each
+    The network is converted by ``netconvert`` of the package eclipse-sumo from a file as of
+    `write_opendrive`, in which a single lane for both directions is a lane in each half of it, as
+    netconvert lets traffic drive lanes of the type ``bidirectional`` in one direction only. Comments of
+    the network contain the time of day and are removed. Warnings are notes of the summary, one for each
     kind. Edge -7 is the right side of road 7 of `write_opendrive`.
 
     Raises MissingExtraError without eclipse-sumo, SceneFormatError for a scene without roads, GeosceneError
@@ -362,9 +369,11 @@ def write_sumo(scene: Scene, path: Path, *, progress: Progress = silent) -> Summ
     home = Path(need("sumo", "sumo").SUMO_HOME)
     with temporary_folder(path, "roads") as folder:
         roads, net = folder / "roads.xodr", folder / "roads.net.xml"
-        roads_summary = write_opendrive(scene, roads, progress=progress)
+        roads_summary = _write(scene, roads, split_shared=True, progress=progress)
         files = ("--opendrive-files", roads, "--output-file", net)
-        command = (home / "bin" / "netconvert", *files, "--aggregate-warnings", "-1")  # `_warnings` does so
+        # Halves of narrow lanes stay open to cars; `_warnings` counts the warnings of a kind.
+        options = ("--opendrive.min-width", "0", "--aggregate-warnings", "-1")
+        command = (home / "bin" / "netconvert", *files, *options)
         # no shell; only the folder's name comes from the user
         run = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if run.returncode or not net.exists():

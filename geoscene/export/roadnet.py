@@ -123,8 +123,10 @@ class RoadNet:
     halved: Bools
 
 
-def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
+def road_net(graph: RoadGraph, *, left_hand: bool = False, split_shared: bool = False) -> RoadNet:
     """The road graph as carriageways and junctions.
+
+    split_shared : a single lane for both directions is written as a lane in each half of it
 
     A node where two roads with equal lanes meet within 0.05 degrees is a joint; any other node where roads
     meet is a junction, with a connection for every turn that the graph permits (`routing.turn_table`).
@@ -154,7 +156,7 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False) -> RoadNet:
     gaps = _gaps(graph, firsts, ends=ends, junctions=junctions)
     lanes = graph_lanes(graph, left_hand=left_hand)
     roads = [
-        _carriageway(graph, lanes, edge=edge, gap=gaps[k], left_hand=left_hand)
+        _carriageway(graph, lanes, edge=edge, gap=gaps[k], left_hand=left_hand, split_shared=split_shared)
         for k, edge in enumerate(firsts)
     ]
     following: dict[int, list[int]] = defaultdict(list)
@@ -286,7 +288,7 @@ def _gaps(
 
 
 def _carriageway(
-    graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float, left_hand: bool
+    graph: RoadGraph, lanes: LaneLayout, *, edge: int, gap: Float, left_hand: bool, split_shared: bool
 ) -> Carriageway:
     full = graph.geometry[edge]
     fresh = np.append(True, np.hypot(*np.diff(full[:, :2], axis=0).T) > 1e-3)
@@ -301,7 +303,7 @@ def _carriageway(
     kinds = [sides[::-1] if left_hand else sides for sides in described]
     ahead = kinds[0] or (Lane(),) * own
     back = kinds[1] or (Lane("driving" if twin >= 0 else "bus"),) * other
-    return Carriageway(
+    road = Carriageway(
         edge=edge,
         twin=twin,
         line=line,
@@ -314,6 +316,10 @@ def _carriageway(
         shift=-float(borders[own + shared]),
         shoulder=float(graph.width[edge] - lanes.span[edge]) / 2,
     )
+    if split_shared and shared and not (own or other):
+        half = (Lane(width=road.shared / 2),)
+        return replace(road, ahead=half, back=half, shared=0.0, shift=0.0)
+    return road
 
 
 def driven_lanes(road: Carriageway, edge: int, *, left_hand: bool) -> list[DrivenLane]:

@@ -19,6 +19,8 @@ import pytest
 import rasterio
 import shapely
 from helpers.export_worlds import NAMES, SLOPE, SOLID_VOLUMES, TREES, write_world
+from helpers.roadgrids import road_graph
+from helpers.scenes import restated
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyarrow import parquet
@@ -28,6 +30,8 @@ from geoscene.errors import InputError, MissingExtraError
 from geoscene.export import KINDS, export_scene, kind_of
 from geoscene.export.raster import RasterGrid, _cells_on_disk, draw_triangles
 from geoscene.options import ExportOptions
+from geoscene.roadgraph import write_graphml
+from geoscene.scene import SceneFiles
 from geoscene.support import files
 
 
@@ -325,6 +329,35 @@ def test_warnings_of_netconvert_are_notes_one_of_each_kind(monkeypatch, scene, t
         "netconvert: Edge '-1' has a grade of 16.77%. (2 warnings of this kind)",
         "netconvert: Found sharp turn with radius 8.94 at the start of edge '-108'.",
     )
+
+
+def test_sumo_gets_both_directions_of_streets_of_one_lane(monkeypatch, scene, tmp_path):
+    graph = road_graph([(0, 0), (100, 0), (200, 50)], [(0, 1), (1, 2)], lanes=0.5, width=4.0)
+    path = tmp_path / "scene"
+    write_world(path)
+    write_graphml(graph, scene.frame, path=SceneFiles(path).road_graph)
+    narrow = restated(path)
+    written = []
+
+    def convert(command, **_options):
+        file = command[command.index("--opendrive-files") + 1]
+        written.append(ET.parse(file).getroot())  # noqa: S314  (our own file)
+        Path(command[command.index("--output-file") + 1]).write_text("<net/>")
+        return subprocess.CompletedProcess(command, 0, "", "")
+
+    monkeypatch.setattr("geoscene.export.opendrive.need", lambda *_: SimpleNamespace(SUMO_HOME="/none"))
+    monkeypatch.setattr("geoscene.export.opendrive.subprocess.run", convert)
+    export_scene(narrow, tmp_path / "a.net.xml")
+    for road in written[0].iter("road"):
+        lanes = {
+            e.get("id"): (e.get("type"), e.find("width")) for e in road.iter("lane") if e.get("id") != "0"
+        }
+        assert {kind for kind, _ in lanes.values()} == {"driving"}
+        assert {float(width.get("a")) for _, width in lanes.values()} == {2.0}
+        if road.get("junction") == "-1":
+            assert set(lanes) == {"1", "-1"}
+    turns = {(e.get("incomingRoad"), link.get("from")) for e in written[0].iter("connection") for link in e}
+    assert turns == {("1", "-1"), ("2", "1")}
 
 
 def test_missing_sumo_error_names_the_extra(scene, tmp_path, monkeypatch):
