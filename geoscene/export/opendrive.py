@@ -57,7 +57,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     map's), its elevation profile, its lanes in both directions, speed limit, signals and signs, bridges
     and tunnels. Junctions have a connecting road (paramPoly3) for every permitted turn. ``userData``
     contains the id of the OpenStreetMap way. Roads that return to their junction, and those that are side
-    by side with another between the same junctions, have two equal lane sections (`roadnet.RoadNet`). A
+    by side with another between the same junctions, have several equal lane sections (`roadnet.RoadNet`). A
     lane that both directions share has the type ``bidirectional``; the rest of a wide carriageway is a
     ``shoulder`` on each side. Restrictions via ways cannot be expressed, as junctions link pairs of roads
     only; the summary counts them.
@@ -159,11 +159,10 @@ def _road(
     yield "</elevationProfile>\n<lateralProfile/>\n<lanes>\n"
     shift = road.shift if not left_hand else -road.shift
     yield f'<laneOffset s="0" a="{_n(shift)}" b="0" c="0" d="0"/>\n'
-    sections = [START, END] if net.halved[k] else [None]
-    for half in sections:
-        begin = plan.total / 2 if half == END else 0.0
-        yield f'<laneSection s="{_n(begin)}">\n'
-        yield from _lanes(graph, net, k=k, half=half, left_hand=left_hand)
+    sections = int(net.sections[k])
+    for part in range(sections):
+        yield f'<laneSection s="{_n(plan.total * part / sections)}">\n'
+        yield from _lanes(graph, net, k=k, inner=(part > 0, part < sections - 1), left_hand=left_hand)
         yield "</laneSection>\n"
     yield "</lanes>\n<objects>"
     for kind, there, detail in (
@@ -199,20 +198,21 @@ def _elevations(at: Float, height: Float) -> Iterator[str]:
         yield f'<elevation s="{_n(s)}" a="{_n(z)}" b="{_n(b)}" c="0" d="0"/>\n'
 
 
-def _lanes(graph: RoadGraph, net: RoadNet, *, k: int, half: int | None, left_hand: bool) -> Iterator[str]:
+def _lanes(
+    graph: RoadGraph, net: RoadNet, *, k: int, inner: tuple[bool, bool], left_hand: bool
+) -> Iterator[str]:
     """The lanes of a road, from left to right; at a joint each continues as the lane in the same place.
 
-    half : START or END for one of two lane sections, None for the only one
+    inner : whether another lane section of the road comes before and after
     """
     road = net.roads[k]
     sign = 1 if left_hand else -1  # of the lanes along the reference line
-    flip = {
-        word: -1 if net.joints[k, end][1] == end else 1
-        for end, word in ((START, "predecessor"), (END, "successor"))
-        if (k, end) in net.joints and half in (None, end)
-    }  # sign of the connected lane at each joint, and in the road's other half
-    if half is not None:
-        flip["successor" if half == START else "predecessor"] = 1
+    flip = {}  # sign of the connected lane at each joint and section
+    for end, word in ((START, "predecessor"), (END, "successor")):
+        if inner[end]:
+            flip[word] = 1
+        elif (k, end) in net.joints:
+            flip[word] = -1 if net.joints[k, end][1] == end else 1
     sides: dict[int, list[str]] = {}
     ahead: list[tuple[str, float]] = [(lane.kind, lane.width) for lane in road.ahead]
     if road.shared:

@@ -40,8 +40,8 @@ REACH = 0.1
 _TURNING_BACK = np.radians(75.0)
 """Of two roads that leave a junction within this angle, turning from one into the other is turning back."""
 
-_LEAST_HALVED = 0.5
-"""Metres: shorter roads are not halved."""
+_LEAST_DIVIDED = 0.5
+"""Metres: shorter roads have one lane section."""
 
 _LEVEL = 0.02
 """Metres a metre: connecting roads are not made longer for gradients below this."""
@@ -112,7 +112,7 @@ class RoadNet:
     junctions   : (n,) bool, by node
     connections : in order of nodes and edges
     joints      : (road, end) to the (road, end) that continues it
-    halved      : (k,) bool, roads that their two junctions do not identify, to be written as two halves
+    sections    : (k,) int64, equal lane sections of each road; see `_sections`
     """
 
     roads: list[Carriageway]
@@ -120,7 +120,7 @@ class RoadNet:
     junctions: Bools
     connections: list[Connection]
     joints: dict[tuple[int, int], tuple[int, int]]
-    halved: Bools
+    sections: Ints
 
 
 def road_net(graph: RoadGraph, *, left_hand: bool = False, split_shared: bool = False) -> RoadNet:
@@ -175,31 +175,32 @@ def road_net(graph: RoadGraph, *, left_hand: bool = False, split_shared: bool = 
         for pairs in side_by_side(turn.pairs)
     ]
     connections.sort(key=lambda c: (c.node, c.before, c.after))
-    halved = _halved(graph, roads, junctions=junctions)
-    return RoadNet(roads, road_of, junctions, connections, joints, halved)
+    sections = _sections(graph, roads, junctions=junctions)
+    return RoadNet(roads, road_of, junctions, connections, joints, sections)
 
 
-def _halved(graph: RoadGraph, roads: list[Carriageway], *, junctions: Bools) -> Bools:
-    """Which roads (k,) readers that know roads by their two junctions take for others.
+def _sections(graph: RoadGraph, roads: list[Carriageway], *, junctions: Bools) -> Ints:
+    """Lane sections (k,) that tell each road apart for readers that know roads by their two junctions.
 
-    These are roads that return to the junction they begin at, and all but the shortest of the roads between
-    the same two junctions if one of them is two-way and turning from one into another is turning back.
+    A road that returns to the junction it begins at has three, as two would join the same points. All but the
+    shortest of the roads between the same two junctions have two, if one of them is two-way and turning from
+    one into another is turning back.
     """
-    halved = np.zeros(len(roads), np.bool_)
+    sections = np.ones(len(roads), np.int64)
     between: dict[tuple[int, int], list[int]] = defaultdict(list)
     for k, road in enumerate(roads):
         a, b = sorted((int(graph.tail[road.edge]), int(graph.head[road.edge])))
-        if junctions[a] and junctions[b] and road.plan.total > _LEAST_HALVED:
+        if junctions[a] and junctions[b] and road.plan.total > _LEAST_DIVIDED:
             between[a, b].append(k)
     for (a, b), same in between.items():
         if a == b:
-            halved[same] = True
+            sections[same] = 3
         elif any(roads[k].twin >= 0 for k in same) and any(
             _nearest_angle(graph, [roads[k].edge for k in same], node=node) < _TURNING_BACK for node in (a, b)
         ):
             by_length = sorted(same, key=lambda k: (roads[k].plan.total, k))
-            halved[by_length[1:]] = True
-    return halved
+            sections[by_length[1:]] = 2
+    return sections
 
 
 def _nearest_angle(graph: RoadGraph, edges: Sequence[int], *, node: int) -> float:

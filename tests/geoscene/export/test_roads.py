@@ -159,7 +159,7 @@ def _sections(road):
     return found
 
 
-def test_roads_that_their_junctions_do_not_identify_have_two_sections(scene, tmp_path):
+def test_roads_that_their_junctions_do_not_identify_have_several_sections(scene, tmp_path):
     # a loop at a dead end, two streets side by side around a narrow block, and a dual carriageway
     nodes = [(0, 0), (100, 0), (200, 0), (300, 0), (400, 0), (500, 0)]
     pairs = [(0, 1), (1, 2), (1, 2), (2, 3), (3, 4), (4, 3), (4, 5), (5, 5)]
@@ -173,15 +173,19 @@ def test_roads_that_their_junctions_do_not_identify_have_two_sections(scene, tmp
     path = _write(replace(graph, geometry=lines), scene, tmp_path)
     _, found = _roads(path)
     roads = {k: road for k, road in found.items() if road.element.get("junction") == "-1"}
-    halved = {
-        road.element.find("userData").get("value") for road in roads.values() if len(_sections(road)) == 2
+    parts = {road.element.find("userData").get("value"): _sections(road) for road in roads.values()}
+    # the longer one of those side by side, and the loop, whose halves would be side by side, too
+    assert {way: len(sections) for way, sections in parts.items() if len(sections) > 1} == {
+        "way/4": 2,
+        "way/12": 3,
     }
-    assert halved == {"way/4", "way/12"}  # the longer one of those side by side, and the loop
     for road in roads.values():
-        for start, lanes in _sections(road)[1:]:
-            assert start == pytest.approx(road.length / 2)
-            assert [links[0] for links in lanes.values()] == list(lanes)
-            assert [links[1] for links in _sections(road)[0][1].values()] == list(lanes)
+        sections = _sections(road)
+        for k, (start, lanes) in enumerate(sections):
+            assert start == pytest.approx(road.length * k / len(sections), abs=1e-6)
+            same = list(lanes)
+            assert k == 0 or [links[0] for links in lanes.values()] == same
+            assert k == len(sections) - 1 or [links[1] for links in lanes.values()] == same
     assert _check_links(path) > 20
 
 
