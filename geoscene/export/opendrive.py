@@ -15,7 +15,7 @@ import numpy as np
 from geoscene.errors import GeosceneError, need
 from geoscene.export.kinds import Summary
 from geoscene.export.objects import attribution
-from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net
+from geoscene.export.roadnet import END, START, Carriageway, Connection, RoadNet, road_net, section_starts
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.scene import Scene
 from geoscene.support.files import atomic_file, temporary_folder
@@ -57,7 +57,7 @@ def write_opendrive(scene: Scene, path: Path, *, progress: Progress = silent) ->
     map's), its elevation profile, its lanes in both directions, speed limit, signals and signs, bridges
     and tunnels. Junctions have a connecting road (paramPoly3) for every permitted turn. ``userData``
     contains the id of the OpenStreetMap way. Roads that return to their junction, and those that are side
-    by side with another between the same junctions, have several equal lane sections (`roadnet.RoadNet`). A
+    by side with another between the same junctions, have several lane sections (`roadnet.RoadNet`). A
     lane that both directions share has the type ``bidirectional``; the rest of a wide carriageway is a
     ``shoulder`` on each side. Restrictions via ways cannot be expressed, as junctions link pairs of roads
     only; the summary counts them.
@@ -160,8 +160,8 @@ def _road(
     shift = road.shift if not left_hand else -road.shift
     yield f'<laneOffset s="0" a="{_n(shift)}" b="0" c="0" d="0"/>\n'
     sections = int(net.sections[k])
-    for part in range(sections):
-        yield f'<laneSection s="{_n(plan.total * part / sections)}">\n'
+    for part, begin in enumerate(section_starts(plan, sections)):
+        yield f'<laneSection s="{_n(begin)}">\n'
         yield from _lanes(graph, net, k=k, inner=(part > 0, part < sections - 1), left_hand=left_hand)
         yield "</laneSection>\n"
     yield "</lanes>\n<objects>"

@@ -112,7 +112,7 @@ class RoadNet:
     junctions   : (n,) bool, by node
     connections : in order of nodes and edges
     joints      : (road, end) to the (road, end) that continues it
-    sections    : (k,) int64, equal lane sections of each road; see `_sections`
+    sections    : (k,) int64, lane sections of each road, of the same lanes; see `_sections`
     """
 
     roads: list[Carriageway]
@@ -510,6 +510,22 @@ def plan_view(points: Float, *, reach: float = REACH) -> PlanView:
     x, y, angle, length, curvature = columns[:, keep]
     # Pieces left out are shorter than a micrometre: lengths are summed again so that s has no gap.
     return PlanView(np.cumsum(length) - length, x, y, angle, length, curvature, ends)
+
+
+def section_starts(plan: PlanView, count: int) -> list[float]:
+    """Metres along a line at which each of ``count`` sections begins, away from bends.
+
+    Each is in the middle of the longest straight, within half a section of where equal sections would begin.
+    """
+    ends = plan.s + plan.length
+    part = plan.total / count
+    starts = [0.0]
+    for middle in part * np.arange(1, count):
+        begin, end = np.maximum(plan.s, middle - part / 2), np.minimum(ends, middle + part / 2)
+        straight = np.where(plan.curvature == 0.0, end - begin, -np.inf)
+        best = int(straight.argmax())
+        starts.append(float(begin[best] + end[best]) / 2 if straight[best] > 0.0 else float(middle))
+    return starts
 
 
 def _corners(points: Float) -> Bools:
