@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from geoscene.errors import InputError
 from geoscene.export import export_scene
-from geoscene.export.roadnet import connecting_curve, plan_view
-from geoscene.options import ExportOptions
+from geoscene.export.roadnet import connecting_curve, driven_lanes, plan_view, road_net
+from geoscene.options import BuildOptions, ExportOptions
+from geoscene.pipeline.build import build
 from geoscene.roadgraph import write_graphml
 from geoscene.roadgraph.routing import turn_table
 from geoscene.scene import SceneFiles
+from geoscene.sources import read_osm
 
 
 @pytest.fixture(scope="module")
@@ -523,3 +525,40 @@ def test_lanes_of_their_own_widths_are_continuous(scene, tmp_path, keeps_left):
         float(lane.find("width").get("a")) for lane in sorted(lanes, key=lambda e: abs(int(e.get("id"))))
     ]
     assert widths == ([2.5, 3.5, 3.0] if keeps_left else [3.0, 3.5, 2.5])
+
+
+def _graph_gradient(graph, edge):
+    """Greatest gradient of an edge of the road graph, metres a metre."""
+    step = np.diff(graph.geometry[edge], axis=0)
+    run = np.hypot(step[:, 0], step[:, 1])
+    return np.max(np.abs(step[run > 1e-3, 2]) / run[run > 1e-3])
+
+
+@pytest.mark.shared
+def test_junctions_of_a_real_town_on_a_slope(shared_osm, shared_dem, tmp_path):
+    dem = (str(shared_dem("heidelberg_srtm3_utm32n.tif")),)
+    options = BuildOptions(dem=dem, only=("roads",), use="map")
+    scene = build(read_osm(shared_osm("heidelberg_altstadt.osm.pbf")), tmp_path / "town", options=options)
+    path = export_scene(scene, tmp_path / "a.xodr").path
+    assert _check_links(path) > 500
+    document, found = _roads(path)
+    # a movement that the map permits has a connection, and any lane for cars leads somewhere by it
+    graph = scene.road_graph()
+    leaving = {(e.get("incomingRoad"), link.get("from")) for e in document.iter("connection") for link in e}
+    net = road_net(graph)
+    before, after = turn_table(graph)
+    for edge in np.unique(before[graph.twin[before] != after]).tolist():
+        k = net.road_of[edge]
+        if k < 0 or not net.junctions[graph.head[edge]]:
+            continue
+        for lane in driven_lanes(net.roads[k], edge, left_hand=False):
+            assert lane.lane.kind != "driving" or (str(k + 1), str(lane.number)) in leaving
+    # the inner side of a bend is shorter than its centre line, and steeper by as much
+    for road in found.values():
+        if road.element.get("junction") != "-1":
+            joined = [
+                found[road.element.find(f"link/{word}").get("elementId")]
+                for word in ("predecessor", "successor")
+            ]
+            edges = [net.roads[int(other.id) - 1].edge for other in joined]
+            assert _steepest(road) <= 1.5 * max(0.02, *(_graph_gradient(graph, k) for k in edges))
