@@ -292,10 +292,10 @@ def _trace(
     """Rays and hits of pixels of a camera in one sample of the exposure.
 
     pixels  : numbers of pixels, row by row from the top
-    rows    : rows of the shutter, where the camera is a finer one
+    rows    : rows of the image, where the camera is a finer one
     normals : whether the hits have normals
     """
-    rays = _scaled_rays(camera, pixels)
+    rays = _scaled_rays(camera, pixels, parts=camera.height // (rows or camera.height))
     moments = (rows or camera.height) if camera.row_ns else 1
     if moments == 1:
         row = np.full(len(rays), sample, np.int32)
@@ -324,28 +324,31 @@ def _trace(
     return TracedView(poses.position, row, direction, seen, time, hits)
 
 
-def _scaled_rays(camera: CameraSpec, pixels: _Pixels) -> Float:
-    """Directions of pixels whose ray parameter is the depth as defined in `CameraImage`."""
+def _scaled_rays(camera: CameraSpec, pixels: _Pixels, *, parts: int) -> Float:
+    """Directions of pixels whose ray parameter is the depth as defined in `CameraImage`.
+
+    parts : pixels along each side of one of the image, as of `shade.places_in_pixels`
+    """
     bent = camera.model == "fisheye" or any(camera.distortion)
     if bent and camera.width * camera.height <= _SHARED:
-        return _shared_rays(camera)[pixels]
+        return _shared_rays(camera, parts)[pixels]
     number = np.arange(pixels.start, pixels.stop) if isinstance(pixels, slice) else pixels
     if bent:
-        return _bent_rays(camera, number)
+        return _bent_rays(camera, number, parts=parts)
     rays = np.empty((len(number), 3))
-    shade.straight_rays(number, camera.width, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
+    shade.straight_rays(number, camera.width, parts, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
     return rays
 
 
 @functools.lru_cache(maxsize=16)
-def _shared_rays(camera: CameraSpec) -> Float:
+def _shared_rays(camera: CameraSpec, parts: int) -> Float:
     """Rays of all pixels, kept for the cameras of a rig, each with its finer one."""
-    return _bent_rays(camera, np.arange(camera.width * camera.height))
+    return _bent_rays(camera, np.arange(camera.width * camera.height), parts=parts)
 
 
-def _bent_rays(camera: CameraSpec, number: NDArray[np.int64]) -> Float:
+def _bent_rays(camera: CameraSpec, number: NDArray[np.int64], *, parts: int) -> Float:
     """Rays of pixels of a lens with distortion."""
-    rays = unproject(camera, np.stack([number % camera.width, number // camera.width], axis=-1))
+    rays = unproject(camera, shade.places_in_pixels(number, camera.width, parts=parts))
     return rays if camera.model == "fisheye" else rays / rays[:, 2:]
 
 

@@ -142,19 +142,40 @@ def develop_tone(radiance: Single, exposure: float) -> NDArray[np.uint8]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def straight_rays(
-    pixels: NDArray[np.int64], width: int, lens: tuple[float, float, float, float], out: Float
+    pixels: NDArray[np.int64],
+    width: int,
+    parts: int,
+    lens: tuple[float, float, float, float],
+    out: Float,
 ) -> None:
     """Fill ``out`` (n, 3) with the directions of pixels of a pinhole without distortion, of z = 1.
 
     They are those of `lidar.sensors.rig.camera_model.unproject` divided by their z, without its rounding.
 
     pixels : (n,) numbers, row by row
+    parts  : as of `places_in_pixels`
     lens   : fx, fy, cx, cy
     """
     fx, fy, cx, cy = lens
     for i in range(len(pixels)):
         row = np.floor(float(pixels[i]) / width)  # exact, and faster than a quotient of whole numbers
-        out[i, 0], out[i, 1], out[i, 2] = (pixels[i] - row * width - cx) / fx, (row - cy) / fy, 1.0
+        column = pixels[i] - row * width
+        u, v = column, row
+        if parts > 1:
+            u += (row % parts + 0.5) / parts - 0.5
+            v += 0.5 - (column % parts + 0.5) / parts
+        out[i, 0], out[i, 1], out[i, 2] = (u - cx) / fx, (v - cy) / fy, 1.0
+
+
+def places_in_pixels(pixels: NDArray[np.int64], width: int, *, parts: int) -> Float:
+    """Columns and rows (n, 2) at which rays pass pixels (n,) of ``parts`` by ``parts`` for each of an image.
+
+    No two rays of a pixel of the image are in one column or row, where upright and level edges, the most
+    common ones, would hide or show them together (multi-jittered sampling, Chiu, Shirley and Wang 1994).
+    """
+    row, column = np.divmod(pixels, width)
+    u, v = (row % parts + 0.5) / parts - 0.5, 0.5 - (column % parts + 0.5) / parts
+    return np.stack([column + u, row + v], axis=-1)
 
 
 @compiled

@@ -180,10 +180,10 @@ def _free(options: DriveOptions, wanted: AccuracyOptions) -> tuple[Kind, ...]:
         raise InputError("`budget` is for this machine, and `scheduler` for others; leave one of them out")
     names: dict[Kind, tuple[str, ...]] = {
         "scanners": ("rays", "footprint", "stretch"),
-        "cameras": ("supersample",),
+        "cameras": ("supersample", "edge_rays"),
     }
     if any(isinstance(s, Camera) and s.spec.exposure_ns for s in sensors):
-        names["cameras"] += ("blur",)
+        names["cameras"] = ("supersample", "blur")
     held = {
         kind: [(name, value) for name, value in options.settings if name in of] for kind, of in names.items()
     }

@@ -32,11 +32,14 @@ Costs are CPU time to record over that with one ray, about: medians of a VLP-16 
 precision and the second trace are none of the choice, as they save a few percent at most.
 """
 
-SUPERSAMPLES = (1, 2, 3, 4, 6, 8)
-"""Rays along each side of a pixel to choose from.
+CAMERAS = ((1, 1), (1, 2), (1, 3), (2, 4), (2, 6), (3, 6), (4, 8), (8, 16))
+"""Rays along each side of a pixel, and of one at an edge, to choose from.
 
 Images without shadows or detail are none of the choice, as they save a quarter and err by 9 levels and more.
 """
+
+_AT_EDGES = 0.12
+"""Share of the pixels that are at edges, about, with the cost of finding them."""
 
 EXPOSED = ((1, 5), (2, 9), (3, 17))
 """Rays along each side of a pixel, and moments, to choose from if the exposure of a camera takes time."""
@@ -111,9 +114,17 @@ def _camera_rows(own: CameraSettings, *, blurred: bool) -> tuple[Row, ...]:
             for side, moments in shots
         ]
     else:
-        sides = {*SUPERSAMPLES, own.supersample}
-        rows = [Row((("supersample", side),), float(side**2)) for side in sides]
+        pairs = {*CAMERAS, (own.supersample, own.edge_rays)}
+        rows = [
+            Row((("supersample", side), ("edge_rays", at_edges)), _pixel_cost(side, at_edges))
+            for side, at_edges in pairs
+        ]
     return tuple(sorted(rows, key=lambda row: (row.cost, row.settings)))
+
+
+def _pixel_cost(side: int, at_edges: int) -> float:
+    """CPU time of an image over that of one ray per pixel, about; of rays along sides of pixels."""
+    return side**2 + (_AT_EDGES * at_edges**2 if at_edges > side else 0.0)
 
 
 def settings_of_rows(ladders: Mapping[Kind, Ladder], rows: Mapping[Kind, int]) -> dict[str, float]:

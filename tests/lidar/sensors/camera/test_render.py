@@ -18,7 +18,7 @@ from lidar.raycast import Caster, MeshInstances
 from lidar.sensors.camera.edges import edge_pixels
 from lidar.sensors.camera.render import _shared_rays, optical_flow, render
 from lidar.sensors.camera.settings import CameraSettings
-from lidar.sensors.camera.shade import linear_table, straight_rays
+from lidar.sensors.camera.shade import linear_table, places_in_pixels, straight_rays
 from lidar.sensors.rig.camera_model import exposure_times, pixel_rays, project
 from lidar.sensors.rig.specs import CameraSpec
 from lidar.world.settings import WorldSettings
@@ -586,6 +586,22 @@ def test_rays_of_an_undistorted_pinhole_are_those_of_the_camera_model():
     camera = replace(CAMERA, width=41, height=23, fx=37.3, fy=36.1, cx=19.7, cy=11.2)
     number = np.arange(camera.width * camera.height)
     rays = np.empty((len(number), 3))
-    straight_rays(number, camera.width, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
+    straight_rays(number, camera.width, 1, (camera.fx, camera.fy, camera.cx, camera.cy), rays)
     expected = pixel_rays(camera)
     np.testing.assert_allclose(rays, expected / expected[:, 2:], rtol=1e-15, atol=1e-16)
+
+
+@pytest.mark.parametrize("parts", [2, 3, 4, 7])
+def test_no_two_rays_of_a_pixel_are_in_one_column_or_row(parts):
+    width = 5 * parts
+    number = np.arange(3 * parts * width)
+    place = (places_in_pixels(number, width, parts=parts) + 0.5) / parts
+    pixel, within = np.divmod(place, 1.0)
+    assert (np.bincount((pixel @ [1, 5]).astype(int)) == parts**2).all()
+    for axis in range(2):
+        steps = within[(pixel == [2, 1]).all(axis=1), axis] * parts**2 - 0.5
+        assert np.sort(steps) == pytest.approx(np.arange(parts**2))
+    rays = np.empty((len(number), 3))
+    straight_rays(number, width, parts, (80.0, 70.0, 3.5, 1.5), rays)
+    expected = (places_in_pixels(number, width, parts=parts) - [3.5, 1.5]) / [80.0, 70.0]
+    np.testing.assert_allclose(rays[:, :2], expected, atol=1e-14)

@@ -353,7 +353,7 @@ def quick():
     """Smaller samples, so that a search takes a second."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pick, "SCANNERS", tuple(("rays", n, float(n)) for n in (1, 7, 61)))
-        patch.setattr(pick, "SUPERSAMPLES", (1, 3))
+        patch.setattr(pick, "CAMERAS", ((1, 1), (3, 3)))
         measure_little(patch)
         yield
 
@@ -500,7 +500,10 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
     rig.write_text(EYE.replace("IMAGES", '["rgb", "depth"]'))
     options = replace(DRIVE, rig=str(rig))
     plan = plan_drive(scene, options)
-    images = [replace(options.recording_settings.camera, supersample=side) for side in (3, 1)]
+    images = [
+        replace(options.recording_settings.camera, supersample=side, edge_rays=at_edges)
+        for side, at_edges in ((3, 3), (1, 2))
+    ]
     sampled = DriveSample(plan, plan.sensors, settings=images, progress=silent)
     sampled.grow(3)
     many, one = (sampled.figures(row)["front"]["rgb_rms"] for row in (0, 1))
@@ -510,8 +513,8 @@ def test_a_rig_of_a_camera_drives_to_levels_and_to_depths(scene, tmp_path):
     done = drive_to(scene, tmp_path / "d", options=options, by=by)
     manifest = open_dataset(tmp_path / "d").manifest
     notes = manifest["accuracy"]
-    assert notes["picked"] == {"supersample": 3}
-    assert manifest["recipe"]["settings"] == [["supersample", "3"]]
+    assert notes["picked"] == {"supersample": 3, "edge_rays": 3}
+    assert manifest["recipe"]["settings"] == [["supersample", "3"], ["edge_rays", "3"]]
     for kind in ("expected", "reached"):
         assert 0 < notes[f"{kind}_error_levels"]["front"]["value"] < (low + high) / 2
         assert 0 < notes[f"{kind}_depth_error_m"]["front"]["value"] <= 0.0021
