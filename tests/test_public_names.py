@@ -19,6 +19,7 @@ def test_every_public_name_is_a_function_or_class_with_a_docstring(package):
         assert value.__doc__, name
 
 
+@pytest.mark.full
 def test_paths_may_be_text(scene, tmp_path):
     osm = geoscene.read_osm(str(geoscene.demo_path()), bounds=(24.9430, 60.1669, 24.9440, 60.1674))
     built = geoscene.build(osm, f"{tmp_path}/scene", options=geoscene.BuildOptions(lod=0))

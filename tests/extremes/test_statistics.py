@@ -27,6 +27,7 @@ def test_numbers_of_any_size_give_finite_deviates(number, seed):
     assert np.isfinite(normal_of(numbers, seed)[0])
 
 
+@pytest.mark.full
 @settings(max_examples=50, deadline=None)
 @given(WORDS, WORDS)
 def test_streams_with_other_words_are_uncorrelated(first, second):

@@ -46,6 +46,7 @@ def test_valid_scene_passes_validate(scene):
     assert json.loads(done.stdout)["broken"] == []
 
 
+@pytest.mark.full
 def test_drive_resumes_and_its_map_is_written(scene, tmp_path):
     words = ["--route=random", "--duration=2", "--rig=vlp16", "--format=pcd,laz", "--seed=5", "--json"]
     done = run_program("lidar", "drive", scene, *words, "-o", tmp_path / "drive")
@@ -218,6 +219,7 @@ def test_steep_roads_are_told_only_of_terrain_that_has_some():
     assert "0.1 km steeper" in program._steep_roads(some, terrain=True)
 
 
+@pytest.mark.full
 def test_a_cloud_that_is_cut_off_is_refused_in_one_line(tmp_path):
     rng = np.random.default_rng(0)
     xyz = np.column_stack([rng.uniform((24.940, 60.165), (24.948, 60.170), (60_000, 2)), rng.random(60_000)])

@@ -83,6 +83,7 @@ def test_unknown_settings_are_named_with_similar_ones(level, given, says):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.full
 def test_listings_contain_all_built_in_rigs_and_sensors():
     assert [row["name"] for row in sensor_rows()] == sensor_names()
     assert [row["name"] for row in rig_rows()] == rig_names()

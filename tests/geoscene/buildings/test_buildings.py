@@ -241,6 +241,7 @@ def test_a_relation_assigns_a_part_outside_the_outline():
     assert built(*areas)[0].outline.tolist()[2] == 1
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30, deadline=None)
 def test_any_stack_of_parts_is_one_solid_with_the_volume_of_the_union(seed):

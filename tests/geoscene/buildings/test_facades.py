@@ -91,6 +91,7 @@ def blocks(draw):
     return affinity.rotate(shape, float(rng.uniform(0, 90)))
 
 
+@pytest.mark.full
 @given(
     blocks(),
     st.floats(3, 80),
@@ -337,6 +338,7 @@ def recesses(relief):
     return volume[cells].sum(), 1e-4 * relief.facades.size.prod(axis=1).sum()  # vertices are on a 0.1 mm grid
 
 
+@pytest.mark.full
 @given(
     blocks(),
     st.floats(4, 14),
@@ -357,6 +359,7 @@ def test_modelled_facades_are_closed_solids_less_their_recesses(shape, height, u
     assert lost == pytest.approx(volume, abs=tolerance + 1e-6)
 
 
+@pytest.mark.full
 @given(
     st.floats(-0.2, 0.2),
     st.floats(0.02, 0.5),

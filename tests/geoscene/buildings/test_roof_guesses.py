@@ -197,6 +197,7 @@ def village(tmp_path_factory):
     return build(osm, tmp_path_factory.mktemp("village") / "scene", options=BuildOptions(relief="full"))
 
 
+@pytest.mark.full
 def test_exports_to_be_measured_in_have_no_guessed_roofs_unless_asked(village, tmp_path):
     table = village.features("buildings")
     guessed_roofs = table.columns["feature"][table.columns["roof_height"] > 0]

@@ -74,6 +74,7 @@ def triangle_areas(xy):
     return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2
 
 
+@pytest.mark.full
 @example(footprint(1389), 0.8)
 @example(footprint(5620), 0.8)
 @given(footprints(), st.sampled_from([0.2, 0.5, 0.8]))
@@ -154,6 +155,7 @@ def test_every_shape_over_any_footprint_keeps_its_floor_and_its_heights(
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("shape", SHAPES[1:])
 def test_shells_are_closed_over_all_but_the_oddest_footprints(shape):
     # those that the grid breaks are found and made flat; one in a hundred would be too many

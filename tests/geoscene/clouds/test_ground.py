@@ -1,6 +1,7 @@
 """The ground filter keeps slopes and takes off houses, cars and trees."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,6 +47,7 @@ def test_bare_slopes_are_kept(gradient, azimuth, seed):
     assert kept[inner].mean() > 0.995
 
 
+@pytest.mark.full
 @FEW
 @given(st.floats(0, 0.3), st.floats(0, 6.28), st.integers(0, 99))
 def test_objects_are_taken_off_and_the_ground_is_measured_to_centimetres(gradient, azimuth, seed):

@@ -28,6 +28,7 @@ def terrace(*, cut, low, ridge, turn, seed, noise=0.03):
     return outline, np.column_stack([turned(uv, turn), z])
 
 
+@pytest.mark.full
 @FEW
 @given(
     st.floats(3.0, 6.0),

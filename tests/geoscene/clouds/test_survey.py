@@ -100,6 +100,7 @@ def tags_of(osm):
     return {area.osm_id: area.tags for area in osm.areas}
 
 
+@pytest.mark.full
 def test_heights_roofs_trees_and_ground_of_a_village_are_measured(cloud_file, tmp_path):
     osm, options = measured(village_map(), cloud_file, tmp_path, cloud_licence="CC-BY-4.0")
     tags = tags_of(osm)
@@ -181,6 +182,7 @@ def test_a_shift_between_map_and_cloud_is_reported_and_removed_on_request(tmp_pa
     assert float(tags_of(osm)["way/1"]["height"]) == pytest.approx(9.0, abs=0.15)
 
 
+@pytest.mark.full
 def test_tops_lie_where_the_cloud_saw_them_on_ground_that_a_road_has_moved(cloud_file, tmp_path):
     # the road levels the slope across its width and on its shoulders, where way/1 stands
     lon, lat = FRAME.to_geographic(np.array([-41.0, -41.0]), np.array([-45.0, 45.0]))
@@ -226,6 +228,7 @@ def test_an_outline_over_a_tower_and_a_hall_becomes_two_parts(tmp_path):
     assert scene.manifest["counts"]["watertight"] == scene.manifest["counts"]["closed_objects"]
 
 
+@pytest.mark.full
 def test_points_that_no_roof_explains_give_heights_only_where_tags_give_none(tmp_path):
     osm, points = two_level_village()
     rng = np.random.default_rng(5)

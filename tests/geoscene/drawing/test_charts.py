@@ -49,6 +49,7 @@ def test_gaps_break_lines_and_counts_of_zero_lie_at_the_end_of_a_logarithmic_axi
     assert math.isclose(first[1, 1], bottom, abs_tol=0.5)
 
 
+@pytest.mark.full
 def test_the_same_figure_has_the_same_bytes_and_names_no_date():
     def drawn(suffix):
         return encode(figure([Panel(TEXTS, [Series("a", [0, 1], [0, 1], dots=True)])], size=SIZE), suffix)

@@ -98,6 +98,7 @@ triangles = st.lists(
 )
 
 
+@pytest.mark.full
 @settings(max_examples=60, deadline=None)
 @given(triangles)
 def test_cell_has_the_height_of_the_highest_triangle_at_its_centre(corners):
@@ -167,6 +168,7 @@ def test_a_geopackage_is_drawn_in_the_colours_of_its_classes(scene, tmp_path):
     assert by_class == {"road_surfaces"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("crs", ["utm", "local"])
 def test_a_geopackage_has_valid_geometry_and_the_volumes_of_solids_without_geometry(crs, tmp_path):
     scene = write_world(tmp_path / "scene", crs=crs)

@@ -306,6 +306,7 @@ def test_a_glb_node_has_its_name_its_attributes_and_its_row(scene, tmp_path):
     assert root["extras"]["crs"] == "EPSG:32633"
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["glb", "3dtiles"])
 def test_buildings_and_their_pads_have_rows_of_their_own_with_their_class(demo_scene, tmp_path, kind):
     path = export_scene(demo_scene("local"), tmp_path / "out", options=ExportOptions(kind=kind)).path

@@ -226,6 +226,7 @@ def test_every_solid_of_a_real_place_is_still_closed_after_ply(demo_scene, tmp_p
     assert len(verdict) >= scene.manifest["counts"]["solids"] > 20
 
 
+@pytest.mark.full
 def test_an_stl_has_every_tree(demo_scene, tmp_path):
     scene = demo_scene("local")
     summary = export_scene(scene, tmp_path / "a.stl", options=ExportOptions(layers=("trees",)))
@@ -234,6 +235,7 @@ def test_an_stl_has_every_tree(demo_scene, tmp_path):
     assert summary.notes == ()
 
 
+@pytest.mark.full
 def test_every_solid_of_a_real_place_is_still_closed_after_cityjson(demo_scene, tmp_path):
     scene = demo_scene("local")
     document = json.loads(export_scene(scene, tmp_path / "a.city.json").path.read_text())

@@ -29,6 +29,7 @@ def of(lines: list[shapely.LineString]) -> GroundFaces:
     return faces(points, ends, rank=np.arange(ends.size).reshape(-1, 2).T, box=BOX)
 
 
+@pytest.mark.full
 @given(st.lists(outline, max_size=12))
 @settings(max_examples=40)
 def test_faces_are_those_of_the_polygonizer_in_its_order(outlines):

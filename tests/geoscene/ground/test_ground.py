@@ -54,6 +54,7 @@ def layers_of(polygons, rng):
     )
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 4.0, 7.0]), st.sampled_from([16.0, 25.0, 200.0]))
 @settings(max_examples=40, deadline=None)
 def test_the_ground_is_one_surface_across_tiles(seed, lines, size):
@@ -67,6 +68,7 @@ def rolling(x, y):
     return 4 * np.sin(np.asarray(x) / 9) + np.asarray(y) ** 2 / 900
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 3.0, 5.0]))
 @settings(max_examples=15, deadline=None)
 def test_the_ground_is_one_surface_across_joined_tiles_and_the_others_do_not_change(seed, lines):

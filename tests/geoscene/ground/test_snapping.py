@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import shapely
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -24,6 +25,7 @@ def pieces_of(pairs):
     return {frozenset(map(tuple, points[pair].tolist())) for pair in ends.T}
 
 
+@pytest.mark.full
 @given(segments)
 @settings(max_examples=60)
 def test_pieces_are_those_of_geos_where_no_corner_is_touched(pairs):

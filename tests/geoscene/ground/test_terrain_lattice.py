@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import shapely
 from helpers.surfaces import assert_one_surface, welded
 from hypothesis import given, settings
@@ -37,6 +38,7 @@ def bare_plan(extent, terrain, *, houses=(), size=100.0):
     return join_tiles(plan_ground(extent, layers, tile_size=size, terrain=terrain, **lines), {(2, 2)})
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32), st.sampled_from(EXTENTS), st.sampled_from([0.05, 0.5, 5.0]))
 @settings(max_examples=10, deadline=None)
 def test_ground_on_terrain_is_one_surface_across_tiles(seed, extent, tolerance):
@@ -48,6 +50,7 @@ def test_ground_on_terrain_is_one_surface_across_tiles(seed, extent, tolerance):
     assert_one_surface(*welded(concatenate(meshes)), extent)
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32), st.sampled_from(EXTENTS), st.sampled_from([0.05, 0.5, 5.0]))
 @settings(max_examples=10, deadline=None)
 def test_heights_differ_from_the_lattice_by_no_more_than_the_tolerance(seed, extent, tolerance):

@@ -83,6 +83,7 @@ def test_flat_roofs_of_offices_have_parapets_within_their_footprints():
         assert room == pytest.approx((20 - 2 * PARAPET) * (15 - 2 * PARAPET), abs=0.05)
 
 
+@pytest.mark.full
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.floats(2, 30), min_size=4, max_size=9))
 def test_any_building_with_parapets_is_a_solid(radius):

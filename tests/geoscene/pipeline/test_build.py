@@ -195,6 +195,7 @@ def test_spawned_workers_give_the_same_bytes(tmp_path, monkeypatch):
     same_files(alone.path, build(osm, tmp_path / "both", options=BuildOptions(name="bridge"), workers=2).path)
 
 
+@pytest.mark.full
 def test_interrupted_build_resumes_with_the_same_bytes(osm, scene, tmp_path, monkeypatch):
     made = []
     whole = geoscene.pipeline.tiles.build_tile
@@ -230,6 +231,7 @@ def test_rebuild_reuses_no_tile_of_another_schema(osm, scene, tmp_path, monkeypa
     assert len(made) == len(scene.tile_indices)
 
 
+@pytest.mark.full
 def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, scene, tmp_path):
     along = ("60.1665,24.9420", "60.1668,24.9425")
     part = build(osm, tmp_path / "part", options=BuildOptions(name="demo", along=along, reach=20.0))
@@ -239,6 +241,7 @@ def test_tiles_along_a_route_equal_those_of_the_whole_scene(osm, scene, tmp_path
         assert (part.path / name).read_bytes() == (scene.path / name).read_bytes()
 
 
+@pytest.mark.full
 def test_scene_for_gis_has_the_tables_and_no_tiles(osm, scene, tmp_path):
     part = build(osm, tmp_path / "gis", options=BuildOptions(name="demo", use="gis"))
     assert part.files.road_graph.read_bytes() == scene.files.road_graph.read_bytes()
@@ -314,6 +317,7 @@ def test_scene_is_replaced_only_with_overwrite(osm, scene, tmp_path):
     assert (tmp_path / "letters" / "a.txt").exists()
 
 
+@pytest.mark.full
 def test_failed_build_leaves_no_files(osm, tmp_path, monkeypatch):
     monkeypatch.setattr("geoscene.pipeline.tiles.ground_tile", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):

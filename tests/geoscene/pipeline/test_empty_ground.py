@@ -76,6 +76,7 @@ def test_rays_roads_and_heights_meet_the_ground_of_joined_tiles(scene):
     assert edges_on_tiles(scene.road_graph(), scene).all()
 
 
+@pytest.mark.full
 def test_exports_and_views_have_the_ground_of_joined_tiles(scene, tmp_path):
     faces = scene.manifest["counts"]["faces"]
     assert export_scene(scene, tmp_path / "a.city.json", options=ExportOptions(roofs="guess")).faces == faces

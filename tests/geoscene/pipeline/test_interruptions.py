@@ -144,7 +144,6 @@ def test_elevation_file_with_other_heights_is_noticed(osm, raster, tmp_path):
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
-@pytest.mark.gate
 @pytest.mark.parametrize("lod", [1, 2])
 def test_damaged_tile_is_built_again(lod, osm, whole, tmp_path):
     shutil.copytree(whole.path, tmp_path / "scene")
@@ -155,7 +154,6 @@ def test_damaged_tile_is_built_again(lod, osm, whole, tmp_path):
     same_files(build(osm, tmp_path / "fresh", options=options).path, again.path)
 
 
-@pytest.mark.gate
 @pytest.mark.parametrize(
     "text", ["", "{", "[]", "{}", '{"keys": 1, "tiles": 2}', '{"keys": {}, "tiles": [1]}']
 )

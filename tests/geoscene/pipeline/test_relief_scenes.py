@@ -104,6 +104,7 @@ def test_a_building_whose_facade_fails_is_reported_and_keeps_plane_walls(osm, re
     assert "odd wall" in (made.path / "problems.csv").read_text()
 
 
+@pytest.mark.full
 def test_modelled_tiles_are_watertight(relief):
     tiles = list(relief.with_relief_mesh().tiles())
     smallest = min((t for t in tiles if (t.mesh.surface == WINDOW).any()), key=lambda t: len(t.mesh))

@@ -125,6 +125,7 @@ def test_layers_without_a_structure_have_no_effect(upper, lower, bench, tmp_path
     assert sum(",layer-without-structure," in row for row in problems(scene)) == len(odd)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("layer", ["-1", "-5", "0", "1", "0.5", None])
 def test_a_bridge_passes_over_a_street_whatever_its_layer(layer, bench, tmp_path):
     tags = {"bridge": "yes"} | ({} if layer is None else {"layer": layer})
@@ -135,6 +136,7 @@ def test_a_bridge_passes_over_a_street_whatever_its_layer(layer, bench, tmp_path
     assert any(",odd-layer," in row for row in problems(scene)) == (layer in ("-1", "-5"))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("layer", ["1", "-1", "0", None])
 def test_a_tunnel_passes_under_a_street_whatever_its_layer(layer, bench, tmp_path):
     tags = {"tunnel": "yes"} | ({} if layer is None else {"layer": layer})
@@ -202,11 +204,13 @@ GRID_WAYS = [(STREET, [10 * i + j for j in range(6)]) for i in range(6)]
 GRID_WAYS += [(ROAD, [10 * i + j for i in range(6)]) for j in range(6)]
 
 
+@pytest.mark.full
 def test_streets_on_steep_terrain_lie_on_the_ground(bench, tmp_path):
     scene = built(tmp_path, GRID, GRID_WAYS, terrain=HILLS)
     assert not faults(bench, scene)
 
 
+@pytest.mark.full
 def test_streets_that_leave_the_extent_end_there(bench, tmp_path):
     """Through the whole scene, along its border, into it, and out of it and in again."""
     places = {
@@ -235,6 +239,7 @@ def SLOPE(x, y):  # noqa: N802 - a constant
     return 100.0 + 0.25 * y + 0.05 * x
 
 
+@pytest.mark.full
 def test_a_street_beside_a_bridge_on_a_slope_keeps_its_ground(bench, tmp_path):
     """The bridge's edge reaches over the street, and their heights differ by a metre or two."""
     places = {1: (-200, 0), 2: (-60, 0), 3: (60, 0), 4: (200, 0), 5: (-200, 6), 6: (200, 6)}
@@ -253,6 +258,7 @@ def test_a_structure_that_forks_from_a_street_blocks_neither(tags, angle, bench,
     assert not faults(bench, built(tmp_path, places, ways, terrain=SLOPE))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("tags", [{"bridge": "yes"}, {"tunnel": "yes"}])
 def test_a_structure_that_ends_nowhere_is_free_up_to_its_end(tags, bench, tmp_path):
     scene = built(tmp_path, {1: (-200, 0), 2: (-80, 0), 3: (80, 0)}, [(ROAD, [1, 2]), (ROAD | tags, [2, 3])])
@@ -262,6 +268,7 @@ def test_a_structure_that_ends_nowhere_is_free_up_to_its_end(tags, bench, tmp_pa
 FOOT = {"highway": "footway"}
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "path",
     [

@@ -246,6 +246,7 @@ _TWO_NODES_AT_ONE_PLACE = {0: (1, 1), 3: (1, 0), 5: (1, 1), 6: (-1, 0)}
 _SHARP_LOOP = {0: (0, 1), 1: (1, 0), 3: (2, 0), 4: (2, 0), 5: (-2, 2)}
 
 
+@pytest.mark.full
 @example((_ROAD_AND_BACK, [({"highway": "primary", "lanes": "3"}, [0, 3, 0, 5])], []))
 @example(({0: (0, 9), 3: (-6, 10), 5: (12, -16)}, [({"highway": "primary"}, [0, 3, 5, 3])], []))
 @example(
@@ -299,6 +300,7 @@ def test_road_surfaces_of_real_places_are_valid_and_reproducible(shared_osm, nam
     assert outside < 1e-3 * shapely.length(np.array(lines)).sum()
 
 
+@pytest.mark.full
 def test_surfaces_near_an_area_have_the_shapes_and_numbers_of_all_surfaces():
     osm = read_osm(DEMO)
     west, south, east, north = osm.bounds
@@ -316,6 +318,7 @@ def test_surfaces_near_an_area_have_the_shapes_and_numbers_of_all_surfaces():
     assert shapely.equals_identical(whole.raised.polygon, some.raised.polygon).all()
 
 
+@pytest.mark.full
 def test_boxes_cover_the_surfaces_of_carriageways_and_junctions():
     osm = read_osm(DEMO)
     west, south, east, north = osm.bounds

@@ -435,6 +435,7 @@ def obeys(edges, graph, pairs):
     return all(edges[at + k] in onward for (at, k), onward in only.items())
 
 
+@pytest.mark.full
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_turn_states_allow_exactly_the_legal_drives(data):

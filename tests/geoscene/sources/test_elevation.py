@@ -174,6 +174,7 @@ def test_hills_have_the_accuracy_of_ten_metre_posts(serve, tmp_path):
     assert np.abs(z - hills(*mercator(places))).max() < bound
 
 
+@pytest.mark.full
 def test_tiles_cover_the_rectangle_of_a_scene_with_another_grid_north(serve, tmp_path):
     server = serve(hills)
     osm = replace(area(0.05), bounds=(11.90, 43.70, 12.00, 43.80))  # 3 degrees off the meridian of UTM 32
@@ -307,6 +308,7 @@ def test_program_without_a_network_fails_with_one_line(tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.full
 def test_a_scene_of_tiles_of_a_server_with_a_key_does_not_record_the_key(serve, tmp_path):
     url = serve(hills).template.replace("//", "//me:pa55word@") + "?key=pa55word"
     words = ["build", "--demo", "--bbox", "24.942,60.166,24.945,60.168", "--lod", "0", "--only", "buildings"]

@@ -206,6 +206,7 @@ def test_order_and_sign_of_ids_do_not_change_the_features(tmp_path_factory, seed
     assert len(data.ways) == len(data.points) == 1
 
 
+@pytest.mark.full
 def test_every_format_gives_the_same_features_under_any_file_name(tmp_path):
     demo = demo_path()
     xml = tmp_path / "a.osm"

@@ -381,6 +381,7 @@ def test_a_place_without_a_box_is_refused(server, tmp_path, found):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_empty_answers_are_not_kept_and_asked_for_again(server, tmp_path):
     servers = servers_at(server)
     server.body = b"[]"
@@ -410,6 +411,7 @@ def test_refresh_asks_again_and_replaces_what_is_kept(server, tmp_path):
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == kept
 
 
+@pytest.mark.full
 def test_a_wait_for_a_busy_server_is_said_with_its_reason(server):
     server.refuse = [504]
     reports = []

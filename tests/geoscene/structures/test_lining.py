@@ -95,6 +95,7 @@ def test_lined_tunnels_are_closed_solids(lined):
     assert verdict.ok.all(), [verdict.fault(k) for k in np.flatnonzero(~verdict.ok)]
 
 
+@pytest.mark.full
 def test_a_lined_tunnel_keeps_the_clearance_over_its_carriageway(lined):
     points = lined.points()
     for aside in (-2.5, 0.0, 2.5):
@@ -107,6 +108,7 @@ def test_a_lined_tunnel_keeps_the_clearance_over_its_carriageway(lined):
             assert not crosses(lined.mesh, moved(a, 0, aside, up), moved(b, 0, aside, up))
 
 
+@pytest.mark.full
 def test_walls_of_a_lined_tunnel_step_in_and_out_along_the_way(lined):
     smooth = Tube("off")
     for side in (-1.0, 1.0):
@@ -125,6 +127,7 @@ def test_walkways_stand_beside_the_carriageway_and_vehicles_have_its_whole_width
     assert wide > walls_along(Tube("off"), 0.5, 1.0).max() + 0.2
 
 
+@pytest.mark.full
 def test_niches_are_set_back_into_the_wall_below_their_ceiling():
     long = {1: (-400, 0), 2: (-150, 0), 3: (150, 0), 4: (400, 0)}
     tube = Tube("plain", places=long)

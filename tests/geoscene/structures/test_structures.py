@@ -647,6 +647,7 @@ def test_tunnels_that_meet_at_any_angle_leave_no_wall_at_the_bend(arms_deg):
             assert blocked(mesh, lane(meeting, f"way/{100 + 2 * k}", aside, step=1.0, ends=0.05)) == 0
 
 
+@pytest.mark.full
 @settings(max_examples=12, deadline=None)
 @given(st.floats(0, 180), st.sampled_from([120.0, 160.0, 200.0]))
 def test_pieces_of_a_straight_tunnel_cover_all_of_it(angle_deg, length):
@@ -659,6 +660,7 @@ def test_pieces_of_a_straight_tunnel_cover_all_of_it(angle_deg, length):
     assert covered.symmetric_difference(whole).area < 0.5
 
 
+@pytest.mark.full
 def test_adjacent_carriageways_are_divided_midway():
     # On maps they overlap by two metres; the northern one is two metres higher.
     places = dict(enumerate(

@@ -130,6 +130,7 @@ def test_boxes_of_features_hold_their_triangles(scene, folder):
         assert np.allclose([own.min(axis=0), own.max(axis=0)], [low[row], high[row]], atol=0.011)
 
 
+@pytest.mark.full
 def test_the_folder_is_reproducible_and_replaced_only_with_overwrite(scene, folder, tmp_path):
     again = tmp_path / "page"
     view_scene(scene, again)

@@ -422,6 +422,7 @@ def test_second_echoes_are_in_the_second_range_image_and_third_ones_in_none():
     assert pixel.tolist() == [ahead, 360 + ahead + 90, size + ahead]
 
 
+@pytest.mark.full
 def test_waymo_boxes_are_the_recorded_ones_and_hold_their_points(dataset, waymo):
     folder, counts = waymo
     boxes = rows_of(folder, "lidar_box")

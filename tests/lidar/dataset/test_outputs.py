@@ -550,6 +550,7 @@ def test_a_resumed_drive_counts_all_of_its_points(scene, rig, recorded, tmp_path
                 drive(scene, tmp_path / "ply", options=replace(options, formats=("csv",), seed=13))
 
 
+@pytest.mark.full
 def test_camera_settings_change_colours_but_not_ground_truth(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.2, traffic=None, formats=("pcd",), labels=(), deskew="")
     changes = {
@@ -585,6 +586,7 @@ def _resolve(tables, row, key):
     return tables[key.removesuffix("_token")][row[key]]
 
 
+@pytest.mark.full
 def test_nuscenes_tables_link_samples_to_points_boxes_and_pixels(dataset, tmp_path):
     counts = EXPORTERS["nuscenes"].export(dataset, tmp_path / "n").counts
     root = tmp_path / "n"
@@ -786,6 +788,7 @@ def test_kitti_exports_take_clouds_and_labels_of_kitti_as_they_are(dataset, tmp_
         EXPORTERS["kitti"].export(open_dataset(source), tmp_path / "none")
 
 
+@pytest.mark.full
 def test_a_dataset_finds_its_scene_beside_it_from_any_directory(scene, tmp_path, monkeypatch):
     for name in ("work", "elsewhere"):
         (tmp_path / name).mkdir()
@@ -797,6 +800,7 @@ def test_a_dataset_finds_its_scene_beside_it_from_any_directory(scene, tmp_path,
     assert open_dataset("../work/drive").scene_path.samefile(scene.path)
 
 
+@pytest.mark.full
 def test_a_map_reports_missing_frames(scene, rig, tmp_path):
     options = replace(OPTIONS, rig=rig, duration=0.5, traffic=None, formats=("pcd",), labels=(), deskew="")
     drive(scene, tmp_path / "d", options=options)

@@ -155,6 +155,7 @@ def nodes_of(path):
         return file.copc_info, file.header, {key: node.point_count for key, node in entries.items()}
 
 
+@pytest.mark.full
 def test_laspy_and_copclib_read_all_points_of_a_copc_map(town):
     cloud, plain = laspy.read(town[0]), laspy.read(town[1])
     names = [name for name in plain.point_format.dimension_names if name != "scan_angle"]

@@ -17,6 +17,7 @@ FRAME = Frame.at(-76.3, 36.88)
 AREA = shapely.Polygon([(0, 0), (900, 100), (800, 700), (100, 500)])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "spacing", "run_out"), [("drone", 60.0, 20.0), ("drone", 4.0, 20.0), ("aircraft", 250.0, 600.0)]
 )
@@ -51,6 +52,7 @@ def hill(x, y):
     return 30.0 + 120.0 * np.exp(-((np.asarray(x) - 450.0) ** 2 + (np.asarray(y) - 350.0) ** 2) / 200.0**2)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("follow", "lowest", "highest"), [(True, 80.0, 80.0), (False, 80.0, 200.0)])
 def test_surveys_follow_the_ground_or_fly_level_above_its_highest_point(follow, lowest, highest):
     route = survey_flight(AREA, spacing=60.0, height=80.0, radius=4.0, ground=hill, follow=follow)

@@ -68,6 +68,7 @@ def test_drives_on_slippery_roads_keep_to_the_limits_that_the_grip_leaves(road):
     assert speed.max() <= 13.9 * ROADS[road].pace * 1.001
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]), st.sampled_from([None, 60.0]))
 @settings(max_examples=12, deadline=None)
 def test_a_drive_through_town_is_gentle(seed, name, duration):
@@ -82,6 +83,7 @@ def test_a_drive_through_town_is_gentle(seed, name, duration):
         assert trajectory.duration_ns == round(duration * 1e9)
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["car", "van", "robot"]), st.floats(0.5, 40.0))
 @settings(max_examples=12, deadline=None)
 def test_a_drive_that_starts_at_speed_is_gentle_too(seed, name, duration):
@@ -116,6 +118,7 @@ def test_a_drive_that_starts_at_speed_before_a_bend_is_slow_enough_for_it():
     assert np.abs(across[bent]).max() <= 1.02 * CAR.lateral_acceleration
 
 
+@pytest.mark.full
 @given(
     st.lists(st.tuples(st.floats(0.3, 200.0), st.floats(0.5, 40.0)), min_size=1, max_size=6),
     st.floats(-0.12, 0.12),

@@ -55,6 +55,7 @@ PARTS = (
 )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("inside", "parts", "vehicle", "passes"),
     [

@@ -79,6 +79,7 @@ LOOP = [  # tighter than a car can turn: it leaves the line and comes out far fr
 ]  # fmt: skip
 
 
+@pytest.mark.full
 @example(np.column_stack([LOOP, np.zeros(len(LOOP))]), "car")
 @given(crooked_lines(), st.sampled_from(["car", "van", "robot"]))
 @settings(max_examples=30, deadline=None)
@@ -93,6 +94,7 @@ def test_any_line_gives_a_drivable_path_or_an_error(line, name):
     assert end < 3.0 * vehicle.turning_radius
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["right", "left"]))
 @settings(max_examples=5, deadline=None)
 def test_among_city_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, side):

@@ -83,6 +83,7 @@ def test_the_option_names_the_road_and_leaves_the_recipe_of_dry_drives(scene):
         DriveOptions(route="random", road="by-weather")
 
 
+@pytest.mark.full
 def test_slippery_roads_slow_a_drive_down(scene):
     from lidar.simulation.plan import plan_drive  # noqa: PLC0415
 

@@ -51,6 +51,7 @@ def test_other_seeds_give_other_routes():
     assert len(drives) == 10
 
 
+@pytest.mark.full
 def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
     """Starts are uniform by length on all streets that lead on: also on the spur, from its end."""
     nodes = [(0, 0), (100, 0), (100, 100), (0, 100), (100, 200)]
@@ -124,6 +125,7 @@ def test_random_drives_do_not_start_below_roofs():
     assert len(random_edges(graph, seed=1, metres=300.0, roofs=everywhere)[0])
 
 
+@pytest.mark.full
 def test_a_random_drive_starts_where_the_map_is_left_after_it():
     """Two kilometres of one-way street, of which the route needs one."""
     nodes = [(100 * k, 0) for k in range(21)]

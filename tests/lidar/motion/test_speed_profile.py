@@ -44,6 +44,7 @@ def jerks(motion):
     return np.diff(motion.speed, 2) * 1e4
 
 
+@pytest.mark.full
 @settings(max_examples=6, deadline=None)
 @given(stops=st.lists(st.tuples(st.floats(5.0, 280.0), st.floats(3.0, 90.0)), max_size=4))
 def test_any_held_up_drive_is_gentle_and_stays_behind_its_bound(stops):
@@ -76,6 +77,7 @@ def test_without_hold_ups_the_drive_is_about_as_fast_as_on_an_empty_road():
     assert motion.time_ns[-1] < 1.05 * free.time_ns[-1]
 
 
+@pytest.mark.full
 def test_a_long_drive_through_many_bends_is_about_as_fast_as_on_an_empty_road():
     turns = np.cumsum(np.tile([70.0, -70.0, -50.0, 50.0], 6))
     steps = np.column_stack([np.cos(np.radians(turns)), np.sin(np.radians(turns)), np.zeros(len(turns))])

@@ -238,6 +238,7 @@ def test_a_sharp_vertex_hides_no_surface_in_front_of_it():
     assert (hits.face == 6).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("distance", [0.0, 1024.0])
 def test_rays_beside_edges_hit_what_they_hit_in_float64(distance):
     rng = np.random.default_rng(13)
@@ -327,6 +328,7 @@ def test_an_unknown_precision_is_refused():
         Caster(*sheet([0, 0, 1.0], [0, 0, 0])).cast([0, 0, 1], [[0, 0, -1.0]], precision="half")
 
 
+@pytest.mark.full
 def test_hits_do_not_depend_on_the_number_of_threads():
     rng = np.random.default_rng(5)
     vertices, faces = soup(rng, 3000)

@@ -84,6 +84,7 @@ def test_every_seam_is_counted_and_stages_of_one_name_apart(plain, tmp_path):
     assert done.effects["gnss_spoof"] == {"fixes changed": 1}
 
 
+@pytest.mark.full
 def test_a_drive_counts_as_recorded_data_do(scene, options, plain, tmp_path):
     texts = [f"delete:{BOX}", "lost_rows:loss=0.3,rows=4", "gnss_spoof:left=5,start=0"]
     stages = read_stages(texts).stages

@@ -168,6 +168,7 @@ def test_no_return_is_added_while_scanners_are_off(plain, tmp_path):
         assert (added <= 150_000_000).all()
 
 
+@pytest.mark.full
 def test_stages_on_clouds_of_kitti_and_nuscenes(plain, tmp_path):
     for name in ("velodyne", "labels", "nuscenes"):
         target = tmp_path / "in" / name
@@ -323,6 +324,7 @@ class Watched(Stage):
         return cloud
 
 
+@pytest.mark.full
 def test_stages_know_where_and_when_a_frame_is_taken(scene, options, plain, tmp_path):
     """Rays cast from the sensor's poses along the returns meet the world where the returns are from."""
     SEEN.clear()
@@ -421,6 +423,7 @@ class Refusing(Stage):
         return cloud
 
 
+@pytest.mark.full
 def test_a_stage_that_fails_at_a_later_frame_leaves_what_was_there(plain, tmp_path):
     refusing = ApplyOptions(stages=(NamedStage("refusing", Refusing()),))
     for source in (plain, plain / "top"):

@@ -175,6 +175,7 @@ def test_truth_of_attacks_on_weather_goes_back_to_the_surfaces(plain, snowy, tmp
     assert chained > 20
 
 
+@pytest.mark.full
 def test_an_attack_in_a_second_run_is_that_of_one_run_but_for_what_the_detector_did(plain, snowy, tmp_path):
     """Before the detector, echoes that it dropped in the first run are not there in the second."""
     apply_stages(plain, tmp_path / "once", options=ApplyOptions((*SNOW, *stages(WALL))))
@@ -187,6 +188,7 @@ def test_an_attack_in_a_second_run_is_that_of_one_run_but_for_what_the_detector_
         assert np.setxor1d(one["removed"], two["removed"]).size <= 0.03 * len(one["removed"])
 
 
+@pytest.mark.full
 def test_a_drive_in_weather_can_be_attacked(scene, options, tmp_path):
     drive(scene, tmp_path / "drive", options=replace(options, stages=SNOW))
     apply_stages(tmp_path / "drive", tmp_path / "a", options=ApplyOptions(stages(f"insert:{BOX}")))
@@ -219,6 +221,7 @@ def test_replayed_clouds_are_those_without_stages(snowy, tmp_path):
     assert np.count_nonzero(truth["origin"] == Origin.REPLAYED) > 100
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("folder", "name"), [("velodyne", "kitti"), ("nuscenes", "nuscenes")])
 def test_clouds_of_others_twice(plain, tmp_path, folder, name):
     shutil.copytree(plain / "top" / folder, tmp_path / "in" / folder)

@@ -79,6 +79,7 @@ def solids_by_feature(scene):
     return out
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("crs", ["local", "utm"])
 def test_returns_from_buildings_lie_on_those_buildings_after_georeferencing_and_back(
     crs, scene, scene_utm, tmp_path
@@ -105,6 +106,7 @@ def test_returns_from_buildings_lie_on_those_buildings_after_georeferencing_and_
     assert near / count > 0.999
 
 
+@pytest.mark.full
 def test_the_georeferencing_error_budget_is_half_a_millimetre(scene, tmp_path):
     drive(scene, tmp_path / "d", options=replace(PLAIN, duration=0.2))
     drive(scene, tmp_path / "e", options=replace(PLAIN, duration=0.2, exact=True))
@@ -114,6 +116,7 @@ def test_the_georeferencing_error_budget_is_half_a_millimetre(scene, tmp_path):
             assert np.abs(np.asarray(quick[axis]) - np.asarray(exact[axis])).max() <= 0.001 + 1e-9
 
 
+@pytest.mark.full
 def test_any_number_of_workers_gives_the_same_bytes(scene, dataset, tmp_path):
     drive(scene, tmp_path / "b", options=replace(PLAIN, workers=1))
     assert digest(tmp_path / "b") == digest(dataset.path)
@@ -216,6 +219,7 @@ def test_a_written_scene_opens(scene):
     assert again.tile_indices == scene.tile_indices
 
 
+@pytest.mark.full
 def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene, tmp_path):
     options = replace(
         PLAIN, duration=0.5, formats=("pcd",), traffic=TrafficOptions(vehicles=30.0, parked=1.0)
@@ -250,6 +254,7 @@ def test_traffic_is_labelled_boxed_and_the_same_for_any_number_of_workers(scene,
         assert inside.all(axis=1).mean() > 0.98
 
 
+@pytest.mark.full
 def test_a_random_drive_starts_and_ends_at_speed_by_default(scene):
     """Also a record of a few seconds, which would otherwise show a parked car."""
     for seed in (0, 1, 2):
@@ -270,6 +275,7 @@ def test_a_random_drive_starts_and_ends_at_speed_by_default(scene):
         assert options.recipe(scene) != replace(options, from_rest=True).recipe(scene)
 
 
+@pytest.mark.full
 def test_the_number_of_threads_does_not_exceed_the_cores(scene, tmp_path, monkeypatch):
     sizes = []
 
@@ -306,6 +312,7 @@ def test_an_interruption_waits_for_no_frame_and_an_error_for_the_running_ones():
     assert frames[0].done()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("damage", ["cut", "changed", "removed", "journal"])
 def test_a_resumed_drive_makes_damaged_frames_anew(scene, dataset, damage, tmp_path):
     shutil.copytree(dataset.path, tmp_path / "again")

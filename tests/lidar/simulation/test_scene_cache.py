@@ -176,6 +176,7 @@ def test_the_same_drive_again_reads_no_map_and_builds_nothing(town, south, tmp_p
     assert again.scene.path == first.scene.path
 
 
+@pytest.mark.full
 def test_a_scene_grows_by_the_tiles_that_another_drive_needs(town, south, tmp_path, monkeypatch):
     first = opened(town, south, tmp_path / "cache")
     before = {p.name: p.read_bytes() for p in first.scene.files.tiles.iterdir()}
@@ -288,6 +289,7 @@ def test_a_build_that_is_interrupted_is_resumed(town, south, tmp_path, monkeypat
     assert sorted(p.name for p in found.scene.path.parent.iterdir()) == ["drives", "scene"]
 
 
+@pytest.mark.full
 def test_other_options_and_contents_have_scenes_of_their_own(town, south, tmp_path):
     cache = tmp_path / "cache"
     plain = opened(town, south, cache).scene
@@ -315,6 +317,7 @@ def test_point_clouds_are_for_maps(town, south):
         open_scene_or_map(town / "whole", south, clouds=CloudOptions(cloud=("a.laz",)))
 
 
+@pytest.mark.full
 def test_datasets_name_the_map_and_the_options_of_its_scene(town, south, tmp_path):
     found = opened(town, south, tmp_path / "cache", lod=1)
     drive(found.scene, tmp_path / "d", options=south)

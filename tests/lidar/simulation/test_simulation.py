@@ -173,6 +173,7 @@ def test_a_frame_has_one_cloud_and_image_of_each_sensor_with_their_boxes(scene, 
         scan.deskewed("noon")
 
 
+@pytest.mark.full
 def test_frames_are_made_when_they_are_asked_for_and_none_is_kept(scene, monkeypatch):
     begun = []
     measure = lidar.simulation.frames.measure_frame

@@ -64,6 +64,7 @@ def files(folder):
     }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", [name for name in CONVERTED_FORMATS if name != "pcd"])
 def test_converted_clouds_have_the_bytes_of_a_drive_with_that_format(folder, tmp_path, name):
     summary = convert(folder / "plain", tmp_path / "out", to=name)
@@ -90,6 +91,7 @@ def test_las_becomes_laz_and_back(folder, tmp_path):
         assert found == {path: driven[path] for path in found}
 
 
+@pytest.mark.full
 def test_clouds_of_fewer_digits_are_converted_with_a_warning(folder, tmp_path, caplog):
     convert(folder / "plain", tmp_path / "csv", to="csv")
     assert "digits" not in caplog.text

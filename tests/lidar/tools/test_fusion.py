@@ -310,6 +310,7 @@ def test_products_lack_nothing_or_say_what(dataset, tmp_path):
             EXPORTERS[name].export(data, tmp_path / name)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["kitti-depth", "range-images", "bev", "kitti-tracking", "mot"])
 def test_products_have_the_same_bytes_each_time_and_replace_their_own(dataset, tmp_path, name):
     def bytes_of(folder):

@@ -140,6 +140,7 @@ def test_data_are_a_sequence_that_splits_by_time(recorded):
         data.split(1.0)
 
 
+@pytest.mark.full
 def test_a_drive_without_road_users_has_no_boxes(scene, tmp_path):
     options = replace(OPTIONS, traffic=None, rig="vlp16", duration=0.2)
     sample = lidar.training_data(drive(scene, tmp_path / "d", options=options).path)[0]

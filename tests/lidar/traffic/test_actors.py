@@ -104,6 +104,7 @@ def test_vehicles_stand_on_the_ground(actors, scene):
     assert np.abs(off).max() < 0.15
 
 
+@pytest.mark.full
 def test_road_users_are_there_only_while_they_are_on_the_scene(scene, ego, actors):
     """Streets of a part of a map lead beyond it, where there is no ground."""
     part = replace(scene, manifest=scene.manifest | {"bounds": np.divide(scene.bounds, 2).tolist()})
@@ -131,6 +132,7 @@ def test_the_same_seed_gives_the_same_actors_and_another_seed_others(actors, sce
     assert other.position.tobytes() != actors.position.tobytes()
 
 
+@pytest.mark.full
 def test_an_empty_scene_has_no_road_users(scene, ego):
     none = TrafficOptions(vehicles=0.0, cyclists=0.0, pedestrians=0.0, parked=0.0)
     actors = populate(scene, scene.road_graph(), ego=ego, vehicle=CAR, seed=1, options=none)

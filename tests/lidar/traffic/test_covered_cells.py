@@ -3,6 +3,7 @@
 from collections import defaultdict
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -36,6 +37,7 @@ def runs(stations):
     return [(int(part[0]), int(part[-1])) for part in parts]
 
 
+@pytest.mark.full
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),

@@ -70,6 +70,7 @@ def check_enters_on_green(ego, graph, seed, *, until):
         assert any(is_green(int(zone[k]), group, float(times[k] - a), plan.signals) for a in ago)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("at_speed", [False, True])
 @pytest.mark.parametrize("seed", [1, 3, 4])
 def test_the_ego_enters_no_junction_on_red(seed, at_speed):

@@ -120,6 +120,7 @@ def fronts(actors, k, t):
     return at, at.position + rotations(at.angles)[:, :, 0] * actors.size[k, 0] / 2
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", ["net", "named", "geo", "packed"])
 def test_the_front_bumper_has_sumos_position(form, scene, graph, street, tmp_path):
     metres = 20.0 + 7.0 * np.arange(8)
@@ -141,6 +142,7 @@ def test_the_front_bumper_has_sumos_position(form, scene, graph, street, tmp_pat
     assert np.hypot(*at.velocity[1:-1, :2].T) == pytest.approx(np.full(6, 7.0), rel=0.05)
 
 
+@pytest.mark.full
 def test_road_users_exist_for_their_time_in_the_file_shifted_by_begin(scene, graph, street, tmp_path):
     net = net_at(tmp_path / "n.net.xml")
     steps = together(
@@ -158,6 +160,7 @@ def test_road_users_exist_for_their_time_in_the_file_shifted_by_begin(scene, gra
     assert there((0.5, 1.5, 2.5, 4.9, 5.2), begin=54.0) == [1, 0, 1, 1, 0]
 
 
+@pytest.mark.full
 def test_a_vehicle_that_brakes_to_a_stop_neither_overshoots_nor_reverses(scene, graph, street, tmp_path):
     metres = np.array([5.0, 17.0, 27.0, 33.0, 33.0, 33.0, 34.0, 40.0])
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, metres))
@@ -220,6 +223,7 @@ def test_an_instant_lane_change_is_spread_over_three_seconds(scene, graph, stree
     assert np.abs(at.velocity[:, :2] @ left / 3.0).max() < 2.5
 
 
+@pytest.mark.full
 def test_a_teleported_vehicle_becomes_another_road_user(scene, graph, street, tmp_path):
     metres = np.array([5.0, 12.0, 19.0, 80.0, 87.0, 94.0]).clip(max=len(street) - 3)
     path = fcd_at(tmp_path / "fcd.xml", scene, along(street, metres))

@@ -52,6 +52,7 @@ def beside(graph, *, before, aside):
     return end - before * along + aside * right, course + np.pi
 
 
+@pytest.mark.full
 @given(
     st.floats(0.0, 25.0), st.floats(2.0, 8.0), st.floats(-0.4, 0.4), st.floats(0.0, 6.3), st.integers(0, 99)
 )
@@ -119,6 +120,7 @@ def test_a_head_beside_a_road_without_mapped_signals_serves_the_junction_at_hand
     assert zone[1] == -1  # 50 m away
 
 
+@pytest.mark.full
 @given(st.integers(0, 99), st.floats(0.0, 500.0))
 def test_crossing_streets_never_both_show_green_or_amber(seed, time_s):
     graph = signalised(grid(3, 3, 120.0), before=8.0)

@@ -119,6 +119,7 @@ def overlaps(boxes):
     return int((a < b).sum())
 
 
+@pytest.mark.full
 @settings(max_examples=2, deadline=None)
 @given(seed=st.integers(0, 10_000), signalised=st.booleans(), lanes=st.sampled_from([1.0, 2.0]))
 def test_vehicles_do_not_collide_or_jump(seed, signalised, lanes):
@@ -133,6 +134,7 @@ def test_vehicles_do_not_collide_or_jump(seed, signalised, lanes):
     assert np.nanmax(moved) < 13.9 * 1.1 * STEP_S + 0.1
 
 
+@pytest.mark.full
 def test_reckless_drivers_do_not_collide():
     """A driver without gap and headway still stops within the cells it has reserved."""
     graph = city(signalised=False)
@@ -184,6 +186,7 @@ def test_the_simulation_does_not_depend_on_its_windows(monkeypatch, seed, steps)
     assert some < 0.7 * everyone
 
 
+@pytest.mark.full
 def test_traffic_on_snow_is_slower_and_brakes_no_harder_than_the_grip_allows(signalised):
     ego, graph, dry = standing((400.0, 400.0), 30.0), city(signalised=True), signalised[1]
     trips, snow, _ = flow_on(graph, ego, seed=3, radius=600.0, road=ROADS["snow"])
@@ -324,6 +327,7 @@ def test_both_groups_of_signals_have_green_but_never_together():
         assert (green.mean(axis=0) > 0.3).all()
 
 
+@pytest.mark.full
 def test_traffic_keeps_to_its_side_and_inside_the_carriageway():
     graph = city(signalised=False, lanes=2.0, width=14.0, streets=3)
     road = shapely.union_all([shapely.LineString(line[:, :2]).buffer(7.3) for line in graph.geometry])

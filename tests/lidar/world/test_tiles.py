@@ -102,6 +102,7 @@ class _Value:
     pass
 
 
+@pytest.mark.full
 def test_a_tile_is_loaded_again_only_when_no_one_holds_it():
     shared = SharedTiles()
     held = shared.get("a", _Value)

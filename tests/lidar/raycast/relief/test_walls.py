@@ -82,6 +82,7 @@ def assert_alike(found, wanted, material, sure):
     assert np.array_equal(part_of(found)[hit], material[wanted.face[hit]])
 
 
+@pytest.mark.full
 @FEW
 @given(SEEDS, st.booleans())
 def test_a_ray_hits_an_opening_as_if_it_were_built_of_triangles(seed, close):
@@ -110,6 +111,7 @@ def test_a_ray_that_starts_in_an_opening_leaves_it_or_hits_its_sides(seed):
     assert_alike(found, wanted, material, beside_edges(reference, place, away, wanted))
 
 
+@pytest.mark.full
 @FEW
 @given(SEEDS, st.sampled_from([np.inf, 25.0]))
 def test_shadow_rays_agree_with_triangles(seed, far):

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from helpers.facades import plane_mesh, random_relief
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -32,6 +33,7 @@ def painted(relief):
     return seen.RenderedFacades(tables, True, color, material, GLASS), caster
 
 
+@pytest.mark.full
 @settings(max_examples=16, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.1, 0.5, 2.0]), st.booleans())
 def test_shares_of_a_pixel_are_those_of_rays_through_it(seed, size, sills):

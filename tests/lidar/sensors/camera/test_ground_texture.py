@@ -56,6 +56,7 @@ def above(x, y, *, height=4.0, turn=0.0):
     return Poses(np.array([[x, y, height]]), axes[None], np.ones((1, 3)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("width", [0.002, 0.1, 1.0])
 def test_texture_keeps_the_mean_albedo_however_far_the_ground_is(kind, width):

@@ -88,6 +88,7 @@ def test_sun_directions_are_rotated_to_grid_north():
     assert local[2] == pytest.approx(utm[2], abs=1e-6)
 
 
+@pytest.mark.full
 @settings(max_examples=50, deadline=None)
 @given(lon=st.floats(-180, 180), lat=st.floats(-89, 89), hours=st.integers(0, 24 * 365 * 30))
 def test_direction_and_position_agree(lon, lat, hours):

@@ -345,6 +345,7 @@ def _corners(rgb):
     return int(((strength == peak) & (strength > 3000)).sum())
 
 
+@pytest.mark.full
 def test_detail_gives_odometry_features_to_track():
     camera = replace(CAMERA, width=640, height=480, fx=400.0, fy=400.0, cx=319.5, cy=239.5)
     town, poses = street(), looking((-20, 0, 1.5), yaw=0.1)

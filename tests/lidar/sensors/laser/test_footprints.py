@@ -76,6 +76,7 @@ def test_the_share_of_a_disc_beyond_an_edge_errs_as_stated(rays):
     assert np.sqrt(np.mean((few - many) ** 2)) < 0.3 * rays**-0.75
 
 
+@pytest.mark.full
 def test_smooth_ground_has_the_mean_range_of_a_gaussian_beam_down_to_grazing_angles():
     error, missed, extra = compared(world(GROUND), 0.01)
     assert error.max() < 2e-3

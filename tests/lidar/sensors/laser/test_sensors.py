@@ -136,6 +136,7 @@ def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
             assert (np.diff(f.column[f.channel == f.channel[0]]) > 0).all(), name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", sensor_names())
 def test_pulses_are_fired_within_their_frame_and_none_is_lost_between_frames(name):
     """Blocks are longer than the rest of a frame: their pulses after its end are the next frame's."""
@@ -227,6 +228,7 @@ def test_hdl32e_beams_cross_the_axis_at_the_published_heights():
     assert f.origin[:14, 2] * 1000 == pytest.approx(published, abs=0.09)
 
 
+@pytest.mark.full
 def test_hdl64e_beams_start_beside_the_axis():
     """Alternately 2.6 cm to the left and to the right of the axis, looking along the beam."""
     f = firings(load_sensor("hdl64e_s3"), 0)
@@ -356,6 +358,7 @@ def test_a_list_of_directions_repeats(tmp_path):
     assert elevation == pytest.approx([*range(20, 30), *range(10)])
 
 
+@pytest.mark.full
 def test_radial_velocity_is_negative_on_approach():
     """At 10 m/s towards a wall it is -10 m/s times the cosine of the angle to the direction of travel."""
     sensor, mount, drive = load_sensor("fmcw"), Mount((2.0, 0.0, 0.0)), driven((10.0, 0.0, 0.0))

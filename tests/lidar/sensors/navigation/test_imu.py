@@ -130,6 +130,7 @@ def test_allan_deviation_is_that_of_the_parameters(name):
     assert np.diff(noise[:, 0]).std() / np.sqrt(2) == pytest.approx(p.gyro_noise * np.sqrt(20.0), rel=0.02)
 
 
+@pytest.mark.full
 def test_the_bias_has_the_given_instability():
     spec = ImuSpec(
         "imu", Mount(), rate_hz=10.0, **SILENT, gyro_instability=2.18e-6, accel_instability=7.35e-4

@@ -47,6 +47,7 @@ def test_the_detection_range_follows_the_root_of_reflectance():
     assert beyond.any()
 
 
+@pytest.mark.full
 def test_detection_follows_the_data_sheet_in_a_scan():
     """The OS0 detects an 80 % target with probability 0.5 at 50 m and a 10 % one at 20 m; here brick."""
     sensor = load_sensor("os0_128")
@@ -370,6 +371,7 @@ def test_fog_attenuates_distant_surfaces_more():
     assert foggy.range.max() < clear.range.max()
 
 
+@pytest.mark.full
 def test_a_long_footprint_on_level_ground_is_one_echo_with_few_rays():
     """Beams of 3.4 mrad cover 5 to 16 m of ground at 50 to 90 m; rays of two echoes would be 1 m apart."""
     ground = world(box((-200, -200, -3), (200, 200, -1.73)))

@@ -196,6 +196,7 @@ def spray_returns(kmh, *, seed):
     return cloud.xyz[cloud.origin == Origin.WEATHER] + [0, 0, 1.9]
 
 
+@pytest.mark.full
 def test_a_scanner_15_m_behind_a_car_sees_its_spray_on_a_motorway_and_none_in_town():
     fast, slower = ([spray_returns(kmh, seed=k) for k in range(4)] for kmh in (100, 70))
     between = [np.sum((xyz[:, 0] > 1) & (xyz[:, 0] < 15.5) & (np.abs(xyz[:, 1]) < 2.5)) for xyz in fast]

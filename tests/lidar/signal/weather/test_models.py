@@ -204,11 +204,13 @@ def snowed(distance, intensity, *, rate=2.5, n=4000, seed=0):
     )
 
 
+@pytest.mark.full
 def test_snow_scatters_more_dim_and_far_targets():
     share = [np.mean(snowed(*target).state == SCATTERED) for target in ((10, 50), (60, 50), (60, 2))]
     assert 0 <= share[0] < share[1] < share[2] < 0.2
 
 
+@pytest.mark.full
 def test_snow_returns_lie_near_the_sensor_and_before_the_target():
     found = snowed(60.0, 2.0)
     flakes = found.range[found.state == SCATTERED]

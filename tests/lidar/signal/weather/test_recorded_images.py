@@ -40,6 +40,7 @@ def images(folder):
     return np.stack([read_png(path) for path in sorted((folder / "front" / "rgb").iterdir())]).astype(int)
 
 
+@pytest.mark.full
 def test_weather_on_a_record_gives_the_images_of_the_drive(scene, options, tmp_path):
     drive(scene, tmp_path / "plain", options=options)
     drive(scene, tmp_path / "wet", options=replace(options, weather=FOG))

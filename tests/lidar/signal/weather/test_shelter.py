@@ -77,6 +77,7 @@ def image(text, around):
     return found[75:100, 135:185].astype(int)  # 6.7 by 3.3 m of the wall
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("text", ["rain=50mm/h", "snow=5mm/h"])
 def test_nothing_falls_in_a_tunnel(text):
     found = scan(text, LONG)

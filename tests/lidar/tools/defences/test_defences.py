@@ -251,6 +251,7 @@ def followed(speed, frames=9):
     return found
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("speed", [0.0, 9.0])
 def test_earlier_frames_support_genuine_cars_and_no_sudden_ones(speed):
     frames = followed(speed)
@@ -264,6 +265,7 @@ def test_earlier_frames_support_genuine_cars_and_no_sudden_ones(speed):
     assert judged(Temporal(), attacked).frame == 0, "without earlier frames nothing is known"
 
 
+@pytest.mark.full
 def test_a_phantom_that_keeps_pace_is_not_excused_by_motions_through_what_it_hides():
     """Earlier frames cannot see behind the phantom itself; motions that end there prove nothing."""
     frames = followed(0.0, frames=10)
@@ -306,6 +308,7 @@ def bounds(frame, rows, picture):
     return *np.floor(pixels.min(axis=0)).astype(int), *np.ceil(pixels.max(axis=0)).astype(int)
 
 
+@pytest.mark.full
 def test_the_camera_confirms_a_car_that_it_sees_and_rejects_one_that_it_does_not(frame, tmp_path):
     attacked, forged = with_car(frame, (10.0, 1.0, -0.98), points=150)
     genuine = next(rows for rows in attacked.members if len(rows) and not forged[rows].any())

@@ -178,6 +178,7 @@ def test_clouds_without_ring_and_time_are_refused(scene, tmp_path):
         read_scans(open_dataset(driven(scene, tmp_path, BARE, formats=("kitti",))))
 
 
+@pytest.mark.full
 def test_calibration_takes_genuine_data_alone(plain, attacked, tmp_path):
     made = calibrate([open_dataset(plain)], read_defences(["physics", "shadow"]), out=tmp_path / "c.toml")
     read = read_calibration(tmp_path / "c.toml")
@@ -214,6 +215,7 @@ def test_verdicts_are_written_whole_or_not_at_all_and_never_into_the_data(attack
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.full
 def test_new_verdicts_replace_former_ones_whole(attacked, tmp_path):
     dataset, both, out = open_dataset(attacked), read_defences(["physics", "overlay"]), tmp_path / "out"
     defend([dataset], both, calibration=CALIBRATION, out=out)

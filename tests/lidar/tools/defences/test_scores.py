@@ -47,6 +47,7 @@ def test_area_and_detection_are_those_of_two_normal_distributions():
     assert np.trapezoid(y, x) == pytest.approx(found.auc[0], abs=0.01)
 
 
+@pytest.mark.full
 def test_intervals_hold_the_truth_as_often_as_they_say():
     rng, truth, inside = np.random.default_rng(4), norm.cdf(1 / np.sqrt(2)), 0
     for _ in range(30):

@@ -172,6 +172,7 @@ def test_a_filtered_dataset_holds_what_the_filter_keeps(snowy, tmp_path):
     assert again.weather == tally.weather - tally.weather_removed
 
 
+@pytest.mark.full
 def test_a_drive_without_weather_has_none_to_remove(scene, tmp_path):
     drive(scene, tmp_path / "dry", options=DriveOptions(rig="vlp16", duration=0.2, seed=3))
     tally = denoise(tmp_path / "dry", read_methods(["dror"])).scores["dror"]["all"]

@@ -174,6 +174,7 @@ def devkit(frames, kind, measure, limit, at):
     return 100 * sum(best[1:]) / 40, count
 
 
+@pytest.mark.full
 def test_average_precisions_are_those_of_kitti_s_development_kit():
     frames = made(3)
     for one in evaluate_kitti(frames):

@@ -243,6 +243,7 @@ def correlated(rng, count, strength):
     return 3 + series
 
 
+@pytest.mark.full
 def test_intervals_of_correlated_errors_hold_the_true_mean_where_those_of_single_errors_do_not():
     rng = np.random.default_rng(0)
     held = single = 0

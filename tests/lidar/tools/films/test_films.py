@@ -34,6 +34,7 @@ def decoded(path):
         )
 
 
+@pytest.mark.full
 def test_an_mp4_has_every_sweep_at_its_time(town_drive, tmp_path):
     made = film(open_dataset(town_drive), tmp_path / "a.mp4", options=FilmOptions(**SMALL))
     images, times, length = decoded(tmp_path / "a.mp4")

@@ -32,6 +32,7 @@ def driven(scene, tmp_path_factory):
     return out
 
 
+@pytest.mark.full
 def test_signed_drives_in_weather_can_be_attacked(driven, tmp_path):
     fog = read_stages(["false_weather:share=0.2"]).stages
     apply_stages(driven, tmp_path / "foggy", options=ApplyOptions(fog))

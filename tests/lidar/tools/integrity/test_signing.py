@@ -88,6 +88,7 @@ def test_all_formats_have_the_marked_points(signed):
     np.testing.assert_allclose(np.linalg.norm(exact.xyz, axis=1), exact.range, atol=0.06)
 
 
+@pytest.mark.full
 def test_signing_again_gives_the_same_bytes(plain, signed, tmp_path):
     sign_dataset(plain, tmp_path / "b", watermark=MARK, signer=HMAC)
     for path in signed.rglob("*"):
@@ -122,6 +123,7 @@ def test_any_flipped_byte_is_named(copy, data):
     assert name.startswith("integrity/") or {finding.place for finding in found} == {name}
 
 
+@pytest.mark.full
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(row=st.integers(0, 2000), column=st.sampled_from(["x", "z", "intensity", "range", "label"]))
 def test_the_block_of_a_changed_return_is_named(copy, row, column):
@@ -211,6 +213,7 @@ def test_data_with_links_are_not_signed_and_empty_folders_are(plain, tmp_path):
         sign_dataset(tmp_path / "a", None, signer=HMAC, overwrite=True)
 
 
+@pytest.mark.full
 def test_truth_of_stages_is_not_signed(plain, tmp_path):
     out = tmp_path / "lossy"
     run_program("lidar", "apply", plain, "--stage", "dropped_packets:loss=0.1,burst=3", "-o", out)
@@ -237,6 +240,7 @@ def test_a_list_that_was_made_anew_needs_the_key(copy):
     assert finding.what == "signature is not valid"
 
 
+@pytest.mark.full
 def test_lost_returns_are_found_by_the_watermark(signed, tmp_path):
     out = tmp_path / "lossy"
     run_program("lidar", "apply", signed, "--stage", "dropped_packets:loss=0.1,burst=3", "-o", out)

@@ -53,6 +53,7 @@ def test_theory_has_the_published_bit_error_rate():
     assert bit_error_rate(0.05, 10.0) == pytest.approx(0.5, abs=1e-6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sigma", [0.004, 0.006, 0.01])
 def test_bit_errors_under_noise_are_those_of_theory(sigma):
     rng, wrong, bits = np.random.default_rng(1), 0, 0
@@ -105,6 +106,7 @@ def test_half_of_the_bits_are_wrong_with_another(what):
     assert frame_verdict(mark, marked, cells=cells).absent
 
 
+@pytest.mark.full
 def test_false_alarms_of_blocks_are_those_of_theory():
     rng, alarms, expected = np.random.default_rng(2), 0, 0.0
     for frame in range(30):

@@ -38,6 +38,7 @@ def brute_force(points, corners):
     return [np.linalg.norm(n - p, axis=1).min() for n, p in zip(near, points, strict=True)]
 
 
+@pytest.mark.full
 @settings(deadline=None, max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 90), flat=st.booleans())
 def test_distances_to_triangles_are_those_of_all_pairs(seed, count, flat):
@@ -79,6 +80,7 @@ def on_surfaces(scene, count, *, seed=0):
     return np.einsum("nc,ncd->nd", share, corners[rng.integers(len(corners), size=count)]), corners
 
 
+@pytest.mark.full
 def test_points_on_the_surfaces_of_a_scene_are_at_distance_zero(places):
     points, corners = on_surfaces(places, 3000)
     surfaces = TrueSurfaces(places, limit=LIMIT)

@@ -75,6 +75,7 @@ def points_of(path):
     return np.column_stack([las.x, las.y, las.z])
 
 
+@pytest.mark.full
 def test_a_file_of_poses_places_the_points_and_its_error_is_stated(tmp_path):
     data = dataset(tmp_path / "d", kinds=("pcd",))
     aggregate(data, tmp_path / "true.laz")

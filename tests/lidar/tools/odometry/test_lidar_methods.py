@@ -122,6 +122,7 @@ def test_errors_of_heading_grow_to_errors_across_the_way():
     assert sigma[-1, 3] == 0
 
 
+@pytest.mark.full
 def test_sweeps_without_returns_move_on_as_before(tmp_path):
     drive = dataset(tmp_path / "drive", frames=8, points=6000, rest=3)
     found = lidar_odometry(scans_of(drive), "small_gicp", settings=SETTINGS, progress=silent)

@@ -83,6 +83,7 @@ def difference(first, second):
     return Rotation.from_matrix(off[:3, :3]).magnitude(), np.linalg.norm(off[:3, 3])
 
 
+@pytest.mark.full
 @settings(max_examples=12, deadline=None)
 @given(
     st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
@@ -113,6 +114,7 @@ def test_a_pure_turn_moves_nothing():
     assert 1e-6 < np.sqrt(covariance[0, 0]) < 1e-2
 
 
+@pytest.mark.full
 def test_deviations_of_poses_are_those_of_noisy_bearings():
     """Errors over their stated deviations have the mean square one; of 25 poses it scatters by 0.12."""
     rng, squares = np.random.default_rng(5), []

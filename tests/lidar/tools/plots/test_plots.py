@@ -124,6 +124,7 @@ def test_the_range_image_has_each_return_at_its_azimuth_and_ring(town_drive, tmp
     assert (shown == class_codes().color[table["label"][alone]]).all()
 
 
+@pytest.mark.full
 def test_the_range_image_of_lasers_beside_each_other_has_no_empty_rows(scene, tmp_path):
     rig = tmp_path / "rig.toml"
     rig.write_text(
@@ -194,6 +195,7 @@ def test_coverage_is_drawn_in_cells_that_fit(town_drive, tmp_path):
     assert told["returns"] == fine["returns"]
 
 
+@pytest.mark.full
 @given(
     arrays(np.uint32, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 99)),
     st.tuples(st.integers(-50, 50), st.integers(-50, 50)),

@@ -270,6 +270,7 @@ def test_kinds_of_objects_that_a_place_lacks_have_no_effect(scene):
     assert rows["furniture=off"].error["range_max_m"].value > one.rows[0].error["range_max_m"].value
 
 
+@pytest.mark.full
 def test_rows_of_the_world_are_timed_in_their_own_world(scene, monkeypatch):
     bench = bench_of(plan_drive(scene, DRIVE), frames=2)
     (scanner,) = bench.plan.sensors

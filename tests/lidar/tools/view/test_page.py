@@ -92,6 +92,7 @@ def test_a_sweep_of_a_scanner_that_repeats_its_pattern_needs_little_more_than_ra
     assert 8 * size / page.returns < 18  # bits, with snow; its file has 41 bytes
 
 
+@pytest.mark.full
 def test_equal_drives_give_equal_pages(town_drive, page, tmp_path):
     again = view_drive(open_dataset(town_drive), tmp_path / "again.html")
     assert again.path.read_bytes() == page.path.read_bytes()
