@@ -70,7 +70,7 @@ from geoscene.roadgraph import (
     take_heights,
 )
 from geoscene.roadgraph.carriageways import Carriageways, read_carriageways
-from geoscene.roadgraph.clipping import clip_graph
+from geoscene.roadgraph.clipping import clip_graph, leave_out
 from geoscene.roadgraph.creases import crease_lines
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.lanes import Side
@@ -88,7 +88,7 @@ from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.short_structures import lengthen_structures
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.roadgraph.tags import find_unused_inclines
-from geoscene.roadgraph.walls import HEADROOM, Walls
+from geoscene.roadgraph.walls import HEADROOM, Walls, find_closed
 from geoscene.scene.geopackage import Layer
 from geoscene.scene.writer import number_ranges
 from geoscene.sources import AROUND_BOUNDS, OsmData
@@ -371,7 +371,7 @@ class _Roads:
     """Roads of a map and the ground graded to them.
 
     graph  : of the whole map, with heights
-    drivable : the part of it within the extent
+    drivable : the part of it within the extent and not closed by buildings
     height : z of the graded ground, None if it is 0 everywhere
     uneven : the ground or a road has heights other than 0
     """
@@ -433,7 +433,9 @@ def _plan_roads(
     carriageways = read_carriageways(
         mapped, frame, sidewalks=sidewalks, left_hand=side == "left", walls=walls
     )
-    return _Roads(graph, clip_graph(graph, extent), carriageways, side, source, height, uneven)
+    closed = _collect(problems, find_closed(graph, walls))
+    drivable = clip_graph(leave_out(graph, closed), extent)
+    return _Roads(graph, drivable, carriageways, side, source, height, uneven)
 
 
 def _only_roads(osm: OsmData, options: BuildOptions) -> OsmData:

@@ -1,8 +1,8 @@
-"""The part of a road graph within the extent of a scene."""
+"""Parts of a road graph: within the extent of a scene, and without what is closed."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -41,20 +41,42 @@ def clip_graph(graph: RoadGraph, extent: Sequence[float]) -> RoadGraph:
     controls of parts that are left out are left out, too.
     """
     low, high = np.array(extent[:2]) + _INSET, np.array(extent[2:]) - _INSET
-    inside = np.array(
-        [bool(((line[:, :2] >= low) & (line[:, :2] <= high)).all()) for line in graph.geometry], np.bool_
-    )
-    if inside.all():
+    beyond = [
+        edge
+        for edge, line in enumerate(graph.geometry)
+        if graph.once[edge] and ((line[:, :2] < low) | (line[:, :2] > high)).any()
+    ]
+    return _cut(graph, {edge: _within(graph.geometry[edge], low=low, high=high) for edge in beyond})
+
+
+def leave_out(graph: RoadGraph, closed: Mapping[int, Sequence[tuple[float, float]]]) -> RoadGraph:
+    """The graph without stretches of streets, from their rows ``closed``: ascending stations in metres.
+
+    Rows are those of the first of a street's two edges. Cut ends, turns and controls are as in `clip_graph`.
+    """
+    kept = {}
+    for edge, stretches in closed.items():
+        bounds = [
+            0.0,
+            *(at for stretch in stretches for at in stretch),
+            polylines.length(graph.geometry[edge]),
+        ]
+        kept[edge] = list(zip(bounds[::2], bounds[1::2], strict=True))
+    return _cut(graph, kept)
+
+
+def _cut(graph: RoadGraph, kept: Mapping[int, Sequence[tuple[float, float]]]) -> RoadGraph:
+    """The graph with only stretches of some streets, by the first of their two edges: metres along it."""
+    if not kept:
         return graph
     pieces: list[_Piece] = []
     twin_of: dict[int, int] = {}
-    for edge in range(len(graph)):
-        twin = int(graph.twin[edge])
-        if 0 <= twin < edge:
-            continue
-        length = polylines.length(graph.geometry[edge])
-        whole = _Piece(edge, 0.0, length, True, True)
-        for piece in [whole] if inside[edge] else _parts(graph, edge, low=low, high=high):
+    for edge in np.flatnonzero(graph.once).tolist():
+        twin, length = int(graph.twin[edge]), polylines.length(graph.geometry[edge])
+        for start, end in kept.get(edge, [(0.0, length)]):
+            if edge in kept and end - start <= _LEAST:
+                continue
+            piece = _Piece(edge, start, end, start < 1e-6, end > length - 1e-6)
             pieces.append(piece)
             if twin >= 0:
                 twin_of |= {len(pieces) - 1: len(pieces), len(pieces): len(pieces) - 1}
@@ -62,9 +84,9 @@ def clip_graph(graph: RoadGraph, extent: Sequence[float]) -> RoadGraph:
     return _assemble(graph, pieces, twin_of=twin_of)
 
 
-def _parts(graph: RoadGraph, edge: int, *, low: Float, high: Float) -> list[_Piece]:
-    """The parts of an edge within a box."""
-    line = graph.geometry[edge][:, :2]
+def _within(line: Float, *, low: Float, high: Float) -> list[tuple[float, float]]:
+    """The stretches of a line within a box, as metres along it."""
+    line = line[:, :2]
     step, along = np.diff(line, axis=0), polylines.stations(line)
     with np.errstate(divide="ignore", invalid="ignore"):
         near, far = (low - line[:-1]) / step, (high - line[:-1]) / step
@@ -80,12 +102,7 @@ def _parts(graph: RoadGraph, edge: int, *, low: Float, high: Float) -> list[_Pie
             runs[-1][1] = end
         else:
             runs.append([begin, end])
-    total = float(along[-1])
-    return [
-        _Piece(edge, begin, end, bool(begin < 1e-6), bool(end > total - 1e-6))
-        for begin, end in runs
-        if end - begin > _LEAST
-    ]
+    return [(begin, end) for begin, end in runs]
 
 
 def _assemble(graph: RoadGraph, pieces: Sequence[_Piece], *, twin_of: dict[int, int]) -> RoadGraph:

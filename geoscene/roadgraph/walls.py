@@ -1,4 +1,4 @@
-"""Carriageways of assumed width between buildings: they yield to walls that the map has."""
+"""Streets between and in buildings: carriageways yield to walls that the map has, and end at them."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
+from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import Street, is_passage
 from geoscene.roadgraph.values import Remarks
 from geoscene.sources.data import Way
+from geoscene.support.problems import Problem
 from geoscene.typing import Float, Ints
 
 IN_CARRIAGEWAY = "building-in-carriageway"
 """Reason of a problem: a building stands in a carriageway, however narrow that was made."""
+CLOSED = "closed-by-building"
+"""Reason of a problem: a street ends in a building, and so at its wall."""
 HEADROOM = 2.5
 """Metres above the ground from which on a building does not stand in a carriageway."""
 NARROWEST_CAR_LANE = 2.5
@@ -26,6 +31,12 @@ _STEP = 0.25
 """Metres: widths between walls are whole multiples of it, so that few places change them."""
 _LEAST = 0.05
 """Metres by which a building stands in a carriageway at least: maps are no better than that."""
+
+_BEFORE = 0.1
+"""Metres before a wall at which a street ends."""
+
+Stretches = dict[int, list[tuple[float, float]]]
+"""Metres along streets, ascending, by the first of a street's two edges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +97,56 @@ def yield_to_walls(
             made[0].append(piece)
             made[1].append(street if metres is None or metres == street.width else _narrowed(street, metres))
             made[2].append(remark if number == 0 else [])
+    return made
+
+
+def find_closed(graph: RoadGraph, walls: Walls) -> tuple[Stretches, list[Problem]]:
+    """Stretches of streets on the ground in buildings, as `leave_out` takes them, and rows that name these.
+
+    Streets that lead through a building have a passage there; these end in it, as in garages and car parks.
+    """
+    streets = np.flatnonzero(graph.once & ~graph.bridge & ~graph.tunnel)
+    lines = [graph.geometry[street] for street in streets.tolist()]
+    if not lines or not len(walls.footprint):
+        return {}, []
+    street = np.repeat(streets, [len(line) - 1 for line in lines])
+    start = np.concatenate([polylines.stations(line)[:-1] for line in lines])
+    ends = np.concatenate([np.stack([line[:-1, :2], line[1:, :2]], axis=1) for line in lines])
+    segments = shapely.linestrings(ends)
+    segment, wall = shapely.STRtree(walls.footprint).query(segments, predicate="intersects")
+    within = shapely.buffer(walls.footprint, -_LEAST, join_style="mitre")
+    enters = shapely.intersects(segments[segment], within[wall])
+    entered = set(zip(street[segment[enters]].tolist(), wall[enters].tolist(), strict=True))
+    inside, piece = shapely.get_parts(
+        shapely.intersection(segments[segment], walls.footprint[wall]), return_index=True
+    )
+    found: Stretches = {}
+    metres: dict[tuple[str, str], float] = {}
+    for part, k in zip(inside, piece.tolist(), strict=True):
+        edge, building = int(street[segment[k]]), int(wall[k])
+        if (edge, building) in entered:
+            along = np.hypot(*(shapely.get_coordinates(part) - ends[segment[k], 0]).T) + start[segment[k]]
+            found.setdefault(edge, []).append((float(along.min()), float(along.max())))
+            names = str(graph.osm_id[edge]), str(walls.osm_id[building])
+            metres[names] = metres.get(names, 0.0) + float(np.ptp(along))
+    problems = [
+        Problem(name, "road", "dropped", CLOSED, f"{length:.1f} m in {building}, which has no passage")
+        for (name, building), length in sorted(metres.items())
+    ]
+    return {
+        edge: _joined(stretches, length=polylines.length(graph.geometry[edge]))
+        for edge, stretches in found.items()
+    }, problems
+
+
+def _joined(stretches: Sequence[tuple[float, float]], *, length: float) -> list[tuple[float, float]]:
+    """Stretches of a line, a little longer and one where they touch, ascending."""
+    made: list[tuple[float, float]] = []
+    for start, end in sorted(stretches):
+        low, high = max(start - _BEFORE, 0.0), min(end + _BEFORE, length)
+        if made and low <= made[-1][1]:
+            low, high = made[-1][0], max(high, made.pop()[1])
+        made.append((low, high))
     return made
 
 

@@ -137,10 +137,11 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
 
     A way on the ground has one in each building that its line runs through if it is tagged
     ``tunnel=building_passage`` or ``covered``; a public street also without these tags in a building that
-    stands on the ground, unless it ends there. It is as wide as the way, extended through the wall at which
-    the way ends, and as high as ``height``, ``maxheight:physical`` or ``maxheight`` of the way, else 4.5 m
-    over roads, 2.5 m over paths, and the free height of the kind of track. Thin walls that would be left
-    beside it are left out; an arcade is open to the side.
+    stands on the ground, unless it ends there, and a parking aisle if both of its ends are outside. It is as
+    wide as the way, extended through the wall at which the way ends, and as high as ``height``,
+    ``maxheight:physical`` or ``maxheight`` of the way, else 4.5 m over roads, 2.5 m over paths, and the free
+    height of the kind of track. Thin walls that would be left beside it are left out; an arcade is open to
+    the side.
     """
     drawn = np.flatnonzero(buildings.drawn)
     ways, lines = way_lines([w for w in osm.ways if _is_passage(w.tags) or _is_street(w.tags)], frame)
@@ -197,10 +198,13 @@ def find_passages(osm: OsmData, buildings: Buildings, *, frame: Frame) -> tuple[
 
 
 def _loose_ends(ways: list[Way], lines: NDArray[np.object_], *, others: list[Way]) -> NDArray[np.object_]:
-    """Ends of ways (n,) at which none of the others leads on, as MultiPoints."""
+    """Ends of ways (n,) at which none of the others leads on, and all of parking aisles, as MultiPoints."""
     used = Counter(node for way in others if _leads_on(way.tags) for node in way.nodes.tolist())
     ends = shapely.get_point(lines[:, None], [0, -1])
-    loose = np.array([[used[node] < 2 for node in way.nodes[[0, -1]].tolist()] for way in ways], np.bool_)
+    loose = np.array(
+        [[used[node] < 2 or not _leads_on(way.tags) for node in way.nodes[[0, -1]].tolist()] for way in ways],
+        np.bool_,
+    )
     found: NDArray[np.object_] = shapely.multipoints(np.where(loose.reshape(-1, 2), ends, None))
     return found
 
@@ -226,7 +230,7 @@ def _is_passage(tags: Tags) -> bool:
 def _is_street(tags: Tags) -> bool:
     """Whether a way is a public street on the ground that leads through the buildings on it."""
     on_ground = place_and_layer(tags)[0] == 0 and not storey_tag(tags)
-    return drivable(tags) and _leads_on(tags) and on_ground and tags.get("indoor", "no") == "no"
+    return drivable(tags) and on_ground and tags.get("indoor", "no") == "no"
 
 
 def _leads_on(tags: Tags) -> bool:

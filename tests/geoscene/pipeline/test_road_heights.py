@@ -318,3 +318,23 @@ def test_structures_that_end_beside_or_within_the_street_they_cross_pass_it(kind
     caster, _ = bench.mesh_of(scene)
     down = np.broadcast_to([0.0, 0.0, -1.0], at.shape)
     np.testing.assert_allclose(1.0 - caster.cast(at + np.array([0, 0, 1.0]), down).range, 0.0, atol=0.05)
+
+
+def test_drives_end_at_the_walls_of_garages_and_aisles_lead_through_canopies(bench, tmp_path):
+    corners = {11: (-30, -9), 12: (30, -9), 13: (30, 9), 14: (-30, 9)}
+    corners |= {21: (-90, -9), 22: (-70, -9), 23: (-70, 9), 24: (-90, 9)}
+    house = {"building": "yes", "height": "9"}
+    service = {"highway": "service"}
+    ways = [(service | {"service": "parking_aisle"}, [1, 2]), (service, [2, 3]), (STREET, [5, 6])]
+    ways += [(house, [11, 12, 13, 14, 11]), (house, [21, 22, 23, 24, 21])]
+    places = CROSSING | {2: (-50, 0), 3: (20, 0), 5: (-60, -200), 6: (-60, 200)}
+    scene = built(tmp_path, places | corners, ways)
+    assert not faults(bench, scene)
+    rows = [
+        row for row in problems(scene) if row.split(",")[3] in ("street-in-building", "closed-by-building")
+    ]
+    assert [row.split(",")[:4] for row in rows] == [
+        ["way/100", "road", "repaired", "street-in-building"],
+        ["way/101", "road", "dropped", "closed-by-building"],
+    ]
+    assert max(line[:, 0].max() for line in scene.road_graph().geometry) == pytest.approx(-30.1, abs=0.05)

@@ -178,7 +178,6 @@ def test_ways_have_passages_of_their_kind(tags, width, free):
         ({"covered": "yes", "bridge": "yes", "layer": "1"}, "bridge"),
         ({"highway": "footway"}, "corridor"),
         ({"access": "private"}, "private"),
-        ({"highway": "service", "service": "parking_aisle"}, "garage"),
     ],
 )
 def test_other_ways_have_none(tags, why):
@@ -186,7 +185,10 @@ def test_other_ways_have_none(tags, why):
     assert "passages" not in {layer.name for layer in plan.layers}, why
 
 
-@pytest.mark.parametrize("tags", [{}, {"tunnel": "culvert"}, {"covered": "no"}])
+AISLE = {"highway": "service", "service": "parking_aisle"}
+
+
+@pytest.mark.parametrize("tags", [{}, {"tunnel": "culvert"}, {"covered": "no"}, AISLE])
 def test_a_house_across_a_street_is_open_there_and_listed(tags):
     _, mesh, problems = built([house()], street(*STREET, inside=tags))
     assert heights(mesh, 0.7, 0.9) == [4.5, 12]
@@ -198,9 +200,26 @@ def test_a_house_is_open_to_streets_that_go_on_in_it_and_closed_where_one_ends()
     one, two, *_ = street((-60, 0), (0, 0), (60, 0), inside={})
     _, mesh, _ = built([house()], [one, two])
     assert heights(mesh, -3, 0.9) == heights(mesh, 3, 0.9) == [4.5, 12]
-    _, mesh, problems = built([house()], [one])
+    plan, mesh, problems = built([house()], [one])
     assert heights(mesh, -3, 0.9) == [0, 12]
-    assert "street-in-building" not in {p.reason for p in problems}
+    assert ("way/1", "closed-by-building") in {(p.osm_id, p.reason) for p in problems}
+    assert np.concatenate(plan.graph.geometry)[:, 0].max() == pytest.approx(-6.1, abs=0.01)
+
+
+def test_aisles_of_a_car_park_are_closed_and_no_part_of_the_road_graph():
+    """Two aisles that join in the building, and one beyond it that is a street of its own."""
+    where = lonlat([(-60, 0), (-6, 0), (0, 0), (0, 15), (6, 0), (60, 0)])
+    lines = [({"highway": "service"}, [0, 1]), (AISLE, [1, 2, 3]), (AISLE, [2, 4]), (AISLE, [4, 5])]
+    ways = [
+        Way(f"way/{k + 1}", tags, np.array(nodes) + 1, where[nodes]) for k, (tags, nodes) in enumerate(lines)
+    ]
+    plan, mesh, problems = built([house()], ways)
+    assert all(heights(mesh, x, 0.9) == [0, 12] for x in (-3, 3))
+    closed = [p.osm_id for p in problems if p.reason == "closed-by-building"]
+    assert closed == ["way/1;way/2", "way/2", "way/3;way/4"]
+    kept = shapely.union_all([shapely.LineString(line[:, :2]) for line in plan.graph.geometry])
+    assert kept.distance(HOUSE) == pytest.approx(0.1, abs=0.01)
+    assert kept.length == pytest.approx(108 - 0.2, abs=0.1)
 
 
 def test_a_long_tunnel_below_a_house_stays_a_tunnel():
