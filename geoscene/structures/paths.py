@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -17,7 +17,7 @@ from geoscene.roadgraph.layers import rank_ways
 from geoscene.roadgraph.paths import way_lines
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.surface_rows import SurfaceRows
-from geoscene.roadgraph.tags import is_tunnel, read_layer
+from geoscene.roadgraph.tags import drivable, is_tunnel, place_and_layer, read_layer
 from geoscene.sources.data import OsmData, Way
 from geoscene.structures.pieces import Members
 from geoscene.structures.table import StructureOptions, nearest_on_line
@@ -39,11 +39,17 @@ _SPARE = 0.6
 _SLOPE = 0.12
 """Maximum gradient of ramps; one in eight is a steep ramp. Assumed."""
 
+_STEEPEST = 0.35
+"""The same where a tunnel leaves a street that it must not lower."""
+
 _TRACK_SLOPE = 0.025
 """The same for railways (EN 15273 and the TSI for infrastructure have 2.5 % on main lines, 3.5 % at most)."""
 
 _BED = 4.4
 """Metres: width of the deck under one track."""
+
+_UNDERGROUND, _SURFACE, _STREET = 1, 2, 3
+"""What a way joins at an end: only tunnels, ways on the surface, a public street on the ground."""
 
 _HANGING = 0.5
 """Metres between a bridge's end and the ground from which they are reported."""
@@ -91,11 +97,13 @@ class _Paths:
     tunnel : (n,) bool, else on a bridge
     level  : (n,) int8, OSM layer
     body   : (n,) metres from the surface to the underside of the deck
+    free   : (n,) metres of free height over the surface
     """
 
     tunnel: Bools
     level: NDArray[np.int8]
     body: Float
+    free: Float
 
 
 def path_members(
@@ -112,7 +120,9 @@ def path_members(
     Beside a road bridge of the same layer they have its height. Otherwise they run evenly from ground to
     ground, but with the required clearance over (or under) roads, tracks and water, from where they fall
     (rise) with the gradient of a ramp. Tunnels below the ground descend with that gradient from their
-    junctions with ways on the surface until the ground covers them, and stay at that depth.
+    junctions with ways on the surface until the ground covers them, and stay at that depth. Those of private
+    roads and tracks that have no room for it, below or above the streets they cross, are as low as those of
+    footways.
     """
     own = np.flatnonzero(
         (raised.edge < 0)
@@ -139,11 +149,20 @@ def path_members(
     sunk = tunnel & _is_below_ground(osm, ways)
     joined = _find_joined(osm, ways)
     ends = _ends(net, sunk, joined=joined)
-    free = np.where(foot_only, options.passage, options.headroom)
-    depth = _depths(net, sunk, joined=joined, full=free + options.roof + _COVER)
-    paths = _Paths(tunnel, level, np.where(track, options.deck, options.slab))
+    mouth = _find_mouths(net, sunk, joined=joined)
     crossed = _Crossed(osm, frame, graph, height, options)
-    z = _heights(net, paths, ends=ends, depth=depth, crossed=crossed)
+    paths = _Paths(
+        tunnel,
+        level,
+        np.where(track, options.deck, options.slab),
+        np.where(foot_only, options.passage, options.headroom),
+    )
+    low = foot_only | _find_low(net, paths, rows=sunk & ~foot_only, mouth=mouth, crossed=crossed)
+    paths = replace(paths, free=np.where(low, options.passage, options.headroom))
+    depth = _depths(net, sunk, mouth=mouth, full=paths.free + options.roof + _COVER)
+    held = np.zeros(len(net.xy), np.bool_)
+    held[[net.rows[k][-e] for k, e in np.argwhere(sunk[:, None] & (joined == _STREET)).tolist()]] = True
+    z = _heights(net, paths, ends=ends, held=held, depth=depth, crossed=crossed)
 
     count = len(ways)
     line, approach, own_rows = (np.empty(count, object) for _ in range(3))
@@ -166,9 +185,7 @@ def path_members(
             detail = f"an end {worst:.1f} m from the ground"
             problems.append(Problem(str(ids[k]), "structure", "repaired", "no-ramp", detail))
     edge = np.full(count, -1, np.int32)
-    return Members(
-        line, tunnel, foot_only, width, own_rows, approach, landed, ~landed, level, edge, ids
-    ), problems
+    return Members(line, tunnel, low, width, own_rows, approach, landed, ~landed, level, edge, ids), problems
 
 
 def _ground(xy: Float, height: Height | None) -> Float:
@@ -242,13 +259,15 @@ def _is_below_ground(osm: OsmData, ways: list[Way]) -> Bools:
 
 
 def _find_joined(osm: OsmData, ways: list[Way]) -> NDArray[np.int8]:
-    """Other ways at the start and end (n, 2) of ways: 0 none, 1 underground only, 2 on the surface."""
+    """Other ways at the start and end (n, 2) of ways: 0 none, else the greatest of the kinds above."""
     own = {way.osm_id for way in ways}
     kind: dict[int, int] = {}
     for way in osm.ways:
         if way.osm_id in own or not ("highway" in way.tags or "railway" in way.tags):
             continue
-        place = 1 if is_tunnel(way.tags) else 2
+        on_ground = place_and_layer(way.tags)[0] == 0
+        place = _UNDERGROUND if is_tunnel(way.tags) else _SURFACE
+        place = _STREET if on_ground and drivable(way.tags) else place
         for node in way.nodes.tolist():
             kind[node] = max(kind.get(node, 0), place)
     at = [[kind.get(int(node), 0) for node in way.nodes[[0, -1]]] for way in ways]
@@ -264,24 +283,48 @@ def _ends(net: _Net, sunk: Bools, *, joined: NDArray[np.int8]) -> Bools:
     return ends
 
 
-def _depths(net: _Net, sunk: Bools, *, joined: NDArray[np.int8], full: Float) -> Float:
-    """Minimum depth (v,) of stations under the ground: ``full`` (n,) except on ramps; NaN elsewhere."""
-    depth = np.full(len(net.xy), np.nan)
+def _find_mouths(net: _Net, sunk: Bools, *, joined: NDArray[np.int8]) -> Bools:
+    """Whether tunnels below the ground may begin at a station (v,): at and on ways on the surface."""
     mouth = np.zeros(len(net.xy), np.bool_)
     for k, rows in enumerate(net.rows):
-        if sunk[k]:
-            depth[rows] = np.fmax(depth[rows], full[k])
-            mouth[rows[[0, -1]][joined[k] == 2]] = True
-        else:
-            mouth[rows] = True
+        mouth[rows[[0, -1]][joined[k] >= _SURFACE] if sunk[k] else rows] = True
+    return mouth
+
+
+def _depths(net: _Net, sunk: Bools, *, mouth: Bools, full: Float) -> Float:
+    """Minimum depth (v,) of stations under the ground: ``full`` (n,) except on ramps; NaN elsewhere."""
+    depth = np.full(len(net.xy), np.nan)
+    for k in np.flatnonzero(sunk).tolist():
+        depth[net.rows[k]] = np.fmax(depth[net.rows[k]], full[k])
     if np.isnan(depth).all():
         return depth
     ramped: Float = np.minimum(depth, -_cones(net, np.where(mouth, 0.0, -np.inf)))
     return ramped
 
 
-def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _Crossed) -> Float:
-    """Heights (v,) of stations; ``ends`` (v,) lie on the ground, tunnels at least ``depth`` (v,) under it."""
+def _find_low(net: _Net, paths: _Paths, *, rows: Bools, mouth: Bools, crossed: _Crossed) -> Bools:
+    """Which of the tunnels ``rows`` (n,) have no room for their free height at the streets that they cross.
+
+    Those below a street nearer to their mouth than a ramp is long, or over a tunnel but below the ground.
+    """
+    low = np.zeros(len(paths.free), np.bool_)
+    if not rows.any():
+        return low
+    options, ground = crossed.options, _ground(net.xy, crossed.height)
+    least, most = _height_limits(net, paths, rows=rows, crossed=crossed)
+    ramp = ground + _cones(net, np.where(mouth, 0.0, -np.inf))
+    for k in np.flatnonzero(rows).tolist():
+        at = net.rows[k]
+        highest = np.maximum(ramp[at], ground[at] - (paths.free[k] + options.roof + _COVER - _SPARE))
+        low[k] = bool((most[at] < ramp[at]).any() or (least[at] > highest).any())
+    return low
+
+
+def _heights(net: _Net, paths: _Paths, *, ends: Bools, held: Bools, depth: Float, crossed: _Crossed) -> Float:
+    """Heights (v,) of stations; ``ends`` (v,) lie on the ground, tunnels at least ``depth`` (v,) under it.
+
+    held : (v,) stations of tunnels that are on the ground whatever they cross
+    """
     if not len(net.xy):
         return np.empty(0)
     ground = _ground(net.xy, crossed.height)
@@ -289,13 +332,16 @@ def _heights(net: _Net, paths: _Paths, *, ends: Bools, depth: Float, crossed: _C
     on_road = _on_road_bridges(net, paths, graph=crossed.graph, osm=crossed.osm)
     fixed = np.where(np.isnan(on_road), fixed, on_road)
     z = _even(net, fixed, ground=ground)
-    least, most = _height_limits(net, paths, crossed=crossed)
+    every = np.ones(len(net.rows), np.bool_)
+    least, most = _height_limits(net, paths, rows=every, crossed=crossed)
     # Crossings take precedence over cover: below a path a tunnel may have less cover, but stays underground.
     under = np.where(np.isnan(depth), np.inf, ground - np.maximum(depth - _SPARE, 0.0))
     least = np.minimum(least, under)
     for sign, need in ((-1.0, ground - depth), (1.0, least), (-1.0, most)):
         bound = np.where(np.isnan(on_road) & ~np.isnan(need), sign * need, -np.inf)
         z = sign * np.maximum(sign * z, _cones(net, bound))
+    steep = replace(net, slope=np.full(len(net.slope), _STEEPEST))
+    z = np.maximum(z, _cones(steep, np.where(held, ground, -np.inf)))
     return np.where(np.isnan(on_road), z, on_road)
 
 
@@ -347,8 +393,8 @@ def _even(net: _Net, fixed: Float, *, ground: Float) -> Float:
     return z
 
 
-def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Float, Float]:
-    """Lower and upper bounds (v,) on the height of stations at crossings; NaN without a bound."""
+def _height_limits(net: _Net, paths: _Paths, *, rows: Bools, crossed: _Crossed) -> tuple[Float, Float]:
+    """Lower and upper bounds (v,) on the height of stations of paths ``rows`` (n,) at crossings, else NaN."""
     graph, options = crossed.graph, crossed.options
     obstacles = find_obstacles(crossed.osm, crossed.frame)
     roads = edge_lines(graph)
@@ -356,18 +402,20 @@ def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Floa
     lines = np.concatenate([roads, obstacles.line])
     tree = shapely.STRtree(lines)
     least, most = np.full((2, len(net.xy)), np.nan)
-    columns = (paths.tunnel.tolist(), paths.level.tolist(), paths.body.tolist())
-    for rows, below, layer, thick in zip(net.rows, *columns, strict=True):
-        way = shapely.LineString(net.xy[rows])
+    columns = (paths.tunnel, paths.level, paths.body, paths.free)
+    for k in np.flatnonzero(rows).tolist():
+        stations = net.rows[k]
+        below, layer, thick, free = (column[k].item() for column in columns)
+        way = shapely.LineString(net.xy[stations])
         own = int(rank_ways(layer, bridge=not below, tunnel=below))
         for other in tree.query(way, predicate="crosses").tolist():
             is_road = other < len(roads)
             over = own > rank[other] if is_road else not below
             for xy in shapely.get_coordinates(shapely.intersection(way, lines[other])):
-                near = np.hypot(*(net.xy[rows] - xy).T)
+                near = np.hypot(*(net.xy[stations] - xy).T)
                 if is_road and own == rank[other]:
                     continue  # they meet
-                at = rows[near < _STATION]
+                at = stations[near < _STATION]
                 on_road = nearest_on_line(graph.geometry[other], xy[None])[0] if is_road else None
                 z = float((_ground(xy[None], crossed.height) if on_road is None else on_road)[0])
                 if over and is_road:
@@ -376,7 +424,7 @@ def _height_limits(net: _Net, paths: _Paths, *, crossed: _Crossed) -> tuple[Floa
                     need = z + float(obstacles.clear[other - len(roads)]) + thick
                 else:
                     carried = options.deck if is_road and graph.bridge[other] else 2 * options.margin
-                    need = z - options.passage - carried - (options.roof if below else 0.0)
+                    need = z - free - carried - (options.roof if below else 0.0)
                 if over:
                     least[at] = np.fmax(least[at], need)
                 else:

@@ -315,7 +315,7 @@ class Members(Columns):
 
     line     : (n,) object, (k, 3) float64 scene metres
     tunnel   : (n,) bool
-    foot     : (n,) bool, for pedestrians or cyclists
+    foot     : (n,) bool, for pedestrians or cyclists, or as low as for these
     width    : (n,) float64 metres of the carriageway or path
     rows     : (n,) object, (k,) int64 rows of its surfaces among the raised ones
     approach : (n,) object, shapely: the first metres of the roads at its ends that are of another kind:

@@ -1,4 +1,4 @@
-"""Outlines of bridges and tunnels that leave the carriageways of roads on the ground to these."""
+"""Outlines of bridges and tunnels that leave the carriageways of other roads to these."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ def without_ground_roads(
 
     Of bridges and tunnels for vehicles that run beside a road, too near in height to pass over or under it,
     each keeps the area nearer to its own line; those that begin at the side of a road begin at its edge.
-    Footbridges and foot tunnels leave the whole carriageway. Bridges that cross a road pass over it with less
-    free height than others.
+    Footbridges and foot tunnels leave the whole carriageway, also of roads on bridges and in tunnels.
+    Bridges that cross a road pass over it with less free height than others.
 
     ends     : (n,) object, (k, 2) places at which a piece's way begins or ends
     headroom : free height over roads
     """
-    once = np.flatnonzero(graph.once & ~graph.bridge & ~graph.tunnel)
+    once, raised = np.flatnonzero(graph.once), graph.bridge | graph.tunnel
     lines = edge_lines(graph)[once]
     piece, road = shapely.STRtree(lines).query(
         polygon, predicate="dwithin", distance=float(graph.width[once].max(initial=0.0)) / 2
@@ -75,6 +75,8 @@ def without_ground_roads(
     lost: dict[int, list[shapely.Geometry]] = {}
     for k, r in zip(piece.tolist(), road.tolist(), strict=True):
         edge = int(once[r])
+        if raised[edge] and not foot[k]:
+            continue
         half = float(graph.width[edge]) / 2
         line = _near(graph.geometry[edge], lines[r], area=polygon[k].envelope.buffer(half + _AROUND))
         if line is None:

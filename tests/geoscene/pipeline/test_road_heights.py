@@ -338,3 +338,38 @@ def test_drives_end_at_the_walls_of_garages_and_aisles_lead_through_canopies(ben
         ["way/101", "road", "dropped", "closed-by-building"],
     ]
     assert max(line[:, 0].max() for line in scene.road_graph().geometry) == pytest.approx(-30.1, abs=0.05)
+
+
+PRIVATE = {"highway": "service", "access": "private"}
+
+
+@pytest.mark.parametrize("far", [18.0, 60.0, 150.0])
+def test_a_private_tunnel_passes_below_a_street_and_leaves_the_street_at_its_mouth_as_it_is(
+    far, bench, tmp_path
+):
+    """Near its mouths there is no room for a tunnel of full height below a street."""
+    places = {1: (-200, 0), 2: (-far, 0), 3: (far, 0), 4: (200, 0), 5: (0, -120), 8: (0, 120)}
+    tunnel = PRIVATE | {"tunnel": "yes", "layer": "-1"}
+    ways = [(STREET, [1, 2]), (tunnel, [2, 3]), (STREET, [3, 4]), (STREET, [5, 8])]
+    scene = built(tmp_path, places, ways)
+    assert not faults(bench, scene)
+    assert not any(",no-ramp," in row for row in problems(scene))
+
+
+@pytest.mark.parametrize("layer", ["-1", "-3"])
+def test_a_private_tunnel_leaves_a_streets_tunnel_that_it_crosses_free(layer, bench, tmp_path):
+    places = {1: (-300, 0), 2: (-120, 0), 3: (120, 0), 4: (300, 0)}
+    places |= {5: (0, -300), 6: (0, -150), 7: (0, 150), 8: (0, 300)}
+    ways = [(STREET, [1, 2]), (STREET | {"tunnel": "yes", "layer": "-2"}, [2, 3]), (STREET, [3, 4])]
+    ways += [(PRIVATE, [5, 6]), (PRIVATE | {"tunnel": "yes", "layer": layer}, [6, 7]), (PRIVATE, [7, 8])]
+    scene = built(tmp_path, places, ways)
+    assert not faults(bench, scene)
+    assert heights(scene, 101).min() < -5.0
+
+
+@pytest.mark.parametrize("kind", ["bridge", "tunnel"])
+def test_a_footway_that_begins_on_a_bridge_or_in_a_tunnel_leaves_its_carriageway(kind, bench, tmp_path):
+    tags = {kind: "yes", "layer": "1" if kind == "bridge" else "-1"}
+    places = CROSSING | {1: (-200, 0), 2: (-100, 0), 3: (100, 0), 4: (200, 0), 9: (0, 0), 10: (4, 60)}
+    ways = [(ROAD, [1, 2]), (ROAD | tags, [2, 9, 3]), (ROAD, [3, 4]), (FOOT | tags, [9, 10])]
+    assert not faults(bench, built(tmp_path, places, ways))
