@@ -70,7 +70,8 @@ def cut_pieces(
     foot_only = members.foot[member]
     body = np.where(tunnel, options.wall, np.where(foot_only, options.slab, options.deck))
     free = np.where(foot_only, options.passage, options.headroom) + np.where(tunnel, THINNEST, 0.0)
-    polygon = part_outlines(polygon, around, half=half, tunnel=tunnel, free=free, body=body)
+    street = members.edge[member] >= 0
+    polygon = part_outlines(polygon, around, half=half, tunnel=tunnel, street=street, free=free, body=body)
     at_end = _at_member_ends(members, member, line=line)
     polygon = without_ground_roads(
         polygon,
@@ -149,8 +150,11 @@ def _outlines(
             part = _without_near_vertices(polylines.cut(line, start, end=end))
             outline = whole[m]
             if count > 1:
-                reach = polylines.flat(part).buffer(2 * half[m] + 5.0, cap_style="flat", join_style="mitre")
-                ends = [p for p, last in ((part[0], k == 0), (part[-1], k == count - 1)) if last]
+                ring = np.hypot(*(line[0] - line[-1])[:2]) < _MET  # where its end is beside its start
+                wide = half[m] + 1.0 if ring else 2 * half[m] + 5.0
+                reach = polylines.flat(part).buffer(wide, cap_style="flat", join_style="mitre")
+                lasts = (part[0], k == 0 and not ring), (part[-1], k == count - 1 and not ring)
+                ends = [p for p, last in lasts if last]
                 discs = [shapely.Point(p[:2]).buffer(_SIDE / 2) for p in ends]
                 wedges = [shapely.Point(p[:2]).buffer(half[m] + 1.0) for p in (part[0], part[-1])]
                 outline = outline.intersection(shapely.union_all([reach, *discs, *wedges]))

@@ -100,15 +100,18 @@ def part_outlines(
     *,
     half: Float,
     tunnel: Bools,
+    street: Bools,
     free: Float,
     body: Float,
 ) -> NDArray[np.object_]:
     """Outlines (n,) reduced by the clearance of adjacent pieces.
 
     Mapped widths are rough: carriageways side by side overlap by a metre or two. Where they do, and one is
-    higher but not enough for the other to pass below, each keeps the area nearer to its own line.
+    higher but not enough for the other to pass below, each keeps the area nearer to its own line; a tunnel of
+    a street keeps all of it beside one of another way.
 
     half : (n,) metres from centre lines to the outside
+    street : (n,) whether a piece is of the road graph
     free : (n,) metres of clearance over a carriageway
     body : (n,) metres of structure below it
     """
@@ -134,6 +137,9 @@ def part_outlines(
         ]
         where = areal(shapely.union_all(strips).intersection(shared))
         if where.area < _SCANT:
+            continue
+        if tunnel[p] and tunnel[q] and street[p] != street[q]:
+            lost.setdefault(q if street[p] else p, []).append(where)
             continue
         theirs = nearer_part(
             where, around[q], half=float(half[q]), other=around[p], other_half=float(half[p])

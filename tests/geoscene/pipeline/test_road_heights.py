@@ -373,3 +373,38 @@ def test_a_footway_that_begins_on_a_bridge_or_in_a_tunnel_leaves_its_carriageway
     places = CROSSING | {1: (-200, 0), 2: (-100, 0), 3: (100, 0), 4: (200, 0), 9: (0, 0), 10: (4, 60)}
     ways = [(ROAD, [1, 2]), (ROAD | tags, [2, 9, 3]), (ROAD, [3, 4]), (FOOT | tags, [9, 10])]
     assert not faults(bench, built(tmp_path, places, ways))
+
+
+SERVICE = {"highway": "service"}
+
+
+def test_a_tunnel_that_is_a_ring_has_one_height_where_it_closes(bench, tmp_path):
+    places = {1: (-150, 0), 2: (-60, 0), 3: (0, 0), 4: (22, 6), 5: (13, 36), 6: (-14, 28), 7: (-6, 3)}
+    inside = SERVICE | {"tunnel": "yes", "layer": "-1"}
+    ways = [(STREET, [1, 2]), (inside, [2, 3]), (inside | {"oneway": "yes"}, [3, 4, 5, 6, 7, 3])]
+    ways.append((STREET, [8, 9]))
+    places |= {8: (-150, -100), 9: (150, -100)}
+    assert not faults(bench, built(tmp_path, places, ways))
+
+
+def test_a_subway_over_a_streets_tunnel_at_a_small_angle_leaves_it_whole(bench, tmp_path):
+    places = {1: (-300, 0), 2: (-120, 0), 3: (120, 0), 4: (300, 0)}
+    places |= {5: (-110, -18), 6: (-60, -10), 7: (60, 10), 8: (110, 18)}
+    ways = [(STREET, [1, 2]), (STREET | {"tunnel": "yes", "layer": "-2"}, [2, 3]), (STREET, [3, 4])]
+    ways += [(FOOT, [5, 6]), (FOOT | {"tunnel": "yes", "layer": "-1"}, [6, 7]), (FOOT, [7, 8])]
+    assert not faults(bench, built(tmp_path, places, ways))
+
+
+def test_storeys_of_a_garage_drawn_upon_one_another_are_left_out_of_the_graph(bench, tmp_path):
+    """Two ramps from one place to storeys of their own, the second one along the first."""
+    places = {1: (-200, 0), 2: (-100, 0), 3: (0, 0), 4: (0.2, 0.3), 5: (60, 60), 6: (60, -60), 7: (-60, 0.1)}
+    inside = SERVICE | {"tunnel": "yes"}
+    ways = [(STREET, [1, 2]), (inside | {"layer": "-1"}, [2, 7, 3, 5])]
+    ways.append((inside | {"layer": "-3"}, [2, 4, 6]))
+    ways.append((STREET, [8, 9]))
+    places |= {8: (-150, -100), 9: (150, -100)}
+    scene = built(tmp_path, places, ways)
+    assert not faults(bench, scene)
+    rows = [row.split(",")[:4] for row in problems(scene) if ",tunnel-in-tunnel," in row]
+    assert rows == [[f"way/{way}", "road", "dropped", "tunnel-in-tunnel"] for way in (101, 102)]
+    assert {"way/100", "way/103"} <= set(scene.road_graph().osm_id)
