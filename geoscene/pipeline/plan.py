@@ -86,6 +86,7 @@ from geoscene.roadgraph.relief import (
 )
 from geoscene.roadgraph.routing import edge_lines
 from geoscene.roadgraph.short_structures import lengthen_structures
+from geoscene.roadgraph.stacked import find_stacked
 from geoscene.roadgraph.surfaces import RoadSurfaces, SurfaceOptions, carriageway_boxes, road_surfaces
 from geoscene.roadgraph.tags import find_unused_inclines
 from geoscene.roadgraph.walls import HEADROOM, Walls, find_closed
@@ -371,7 +372,7 @@ class _Roads:
     """Roads of a map and the ground graded to them.
 
     graph  : of the whole map, with heights
-    drivable : the part of it within the extent and not closed by buildings
+    drivable : the part of it within the extent that vehicles can drive on
     height : z of the graded ground, None if it is 0 everywhere
     uneven : the ground or a road has heights other than 0
     """
@@ -433,7 +434,7 @@ def _plan_roads(
     carriageways = read_carriageways(
         mapped, frame, sidewalks=sidewalks, left_hand=side == "left", walls=walls
     )
-    closed = _collect(problems, find_closed(graph, walls))
+    closed = _collect(problems, find_closed(graph, walls)) | _collect(problems, find_stacked(graph))
     drivable = clip_graph(leave_out(graph, closed), extent)
     return _Roads(graph, drivable, carriageways, side, source, height, uneven)
 

@@ -18,6 +18,9 @@ _INSET = 0.01
 _LEAST = 0.5
 """Metres of an edge, at least."""
 
+Stretches = dict[int, list[tuple[float, float]]]
+"""Metres along streets, from and to, by the first of a street's two edges."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
@@ -49,13 +52,16 @@ def clip_graph(graph: RoadGraph, extent: Sequence[float]) -> RoadGraph:
     return _cut(graph, {edge: _within(graph.geometry[edge], low=low, high=high) for edge in beyond})
 
 
-def leave_out(graph: RoadGraph, closed: Mapping[int, Sequence[tuple[float, float]]]) -> RoadGraph:
-    """The graph without stretches of streets, from their rows ``closed``: ascending stations in metres.
-
-    Rows are those of the first of a street's two edges. Cut ends, turns and controls are as in `clip_graph`.
-    """
+def leave_out(graph: RoadGraph, closed: Stretches) -> RoadGraph:
+    """The graph without stretches of streets; cut ends, turns and controls are as in `clip_graph`."""
     kept = {}
-    for edge, stretches in closed.items():
+    for edge, found in closed.items():
+        stretches: list[tuple[float, float]] = []
+        for start, end in sorted(found):
+            if stretches and start <= stretches[-1][1]:
+                stretches[-1] = stretches[-1][0], max(end, stretches[-1][1])
+            else:
+                stretches.append((start, end))
         bounds = [
             0.0,
             *(at for stretch in stretches for at in stretch),

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from geoscene.geometry import polylines
 from geoscene.geometry.frames import Frame
+from geoscene.roadgraph.clipping import Stretches
 from geoscene.roadgraph.graph import RoadGraph
 from geoscene.roadgraph.tags import Street, is_passage
 from geoscene.roadgraph.values import Remarks
@@ -34,9 +35,6 @@ _LEAST = 0.05
 
 _BEFORE = 0.1
 """Metres before a wall at which a street ends."""
-
-Stretches = dict[int, list[tuple[float, float]]]
-"""Metres along streets, ascending, by the first of a street's two edges."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +108,7 @@ def find_closed(graph: RoadGraph, walls: Walls) -> tuple[Stretches, list[Problem
     if not lines or not len(walls.footprint):
         return {}, []
     street = np.repeat(streets, [len(line) - 1 for line in lines])
-    start = np.concatenate([polylines.stations(line)[:-1] for line in lines])
+    first = np.concatenate([polylines.stations(line)[:-1] for line in lines])
     ends = np.concatenate([np.stack([line[:-1, :2], line[1:, :2]], axis=1) for line in lines])
     segments = shapely.linestrings(ends)
     segment, wall = shapely.STRtree(walls.footprint).query(segments, predicate="intersects")
@@ -125,29 +123,17 @@ def find_closed(graph: RoadGraph, walls: Walls) -> tuple[Stretches, list[Problem
     for part, k in zip(inside, piece.tolist(), strict=True):
         edge, building = int(street[segment[k]]), int(wall[k])
         if (edge, building) in entered:
-            along = np.hypot(*(shapely.get_coordinates(part) - ends[segment[k], 0]).T) + start[segment[k]]
-            found.setdefault(edge, []).append((float(along.min()), float(along.max())))
+            along = np.hypot(*(shapely.get_coordinates(part) - ends[segment[k], 0]).T) + first[segment[k]]
+            start, end = float(along.min()) - _BEFORE, float(along.max()) + _BEFORE
+            last = polylines.length(graph.geometry[edge])
+            found.setdefault(edge, []).append((max(start, 0.0), min(end, last)))
             names = str(graph.osm_id[edge]), str(walls.osm_id[building])
             metres[names] = metres.get(names, 0.0) + float(np.ptp(along))
     problems = [
         Problem(name, "road", "dropped", CLOSED, f"{length:.1f} m in {building}, which has no passage")
         for (name, building), length in sorted(metres.items())
     ]
-    return {
-        edge: _joined(stretches, length=polylines.length(graph.geometry[edge]))
-        for edge, stretches in found.items()
-    }, problems
-
-
-def _joined(stretches: Sequence[tuple[float, float]], *, length: float) -> list[tuple[float, float]]:
-    """Stretches of a line, a little longer and one where they touch, ascending."""
-    made: list[tuple[float, float]] = []
-    for start, end in sorted(stretches):
-        low, high = max(start - _BEFORE, 0.0), min(end + _BEFORE, length)
-        if made and low <= made[-1][1]:
-            low, high = made[-1][0], max(high, made.pop()[1])
-        made.append((low, high))
-    return made
+    return found, problems
 
 
 def _may_meet_walls(way: Way, street: Street) -> bool:
