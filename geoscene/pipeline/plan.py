@@ -34,6 +34,7 @@ from geoscene.ground.kerbs import kerb_ends, lowered_kerbs
 from geoscene.ground.land import Land, parcels
 from geoscene.ground.landcover import paved_fabric
 from geoscene.ground.partition import PRECISION
+from geoscene.ground.quays import quay_walls
 from geoscene.ground.relief import Kerbs, Raised
 from geoscene.ground.standing import foundation_heights, standing_height
 from geoscene.ground.terrain import Terrain, base_heights, open_terrain
@@ -132,6 +133,7 @@ _COVERS: dict[str, Literal["none", "mapped", "guessed"]] = {
 }
 _POLAR = 67.0  # degrees of latitude beyond which open ground is tundra; assumed
 _MOVED = 40.0  # metres, more than trees and furniture are moved by and keep from other features
+_FLUSH = 0.05  # metres up to which streets on level ground meet water without a wall
 _RAISED = 1.0  # metres, minimum height of an underside for a building to have no pad
 
 
@@ -573,6 +575,15 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
     if len(wires):
         wires = replace(wires, feature=np.arange(*ranges["wires"], dtype=np.int32))
     low = opening_layers(structures, openings)
+    graph, hilly = roads.graph, bool(terrain.grids)
+    high = np.array([hilly or np.abs(line[:, 2]).max() > _FLUSH for line in graph.geometry], np.bool_)
+    street = np.flatnonzero(graph.once & ~graph.bridge & ~graph.tunnel & high)
+    quays = quay_walls(
+        cover.polygon[cover.body != ""],
+        surfaces.polygon,
+        lines=edge_lines(graph)[street],
+        width=graph.width[street],
+    )
     raised, kerbs, extra = None, None, []
     if options.relief != "off":
         ends = sidewalk_ends(roads.carriageways)
@@ -588,7 +599,7 @@ def _plan_within(place: _Place, reach: Reach | None, *, area: Any | None) -> tup
             bed_rows,
             crown_rows(roads.carriageways, crowns, surfaces=surfaces, first=first),
         ]
-    covers = Layers.concatenate([cover, surfaces, pads, low, *extra])
+    covers = Layers.concatenate([cover, surfaces, pads, low, quays, *extra])
     levels = water_levels(covers, osm.ways, frame=frame, height=terrain.height)
     ground = _plan_ground(
         covers,

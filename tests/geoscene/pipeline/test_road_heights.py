@@ -408,3 +408,18 @@ def test_storeys_of_a_garage_drawn_upon_one_another_are_left_out_of_the_graph(be
     rows = [row.split(",")[:4] for row in problems(scene) if ",tunnel-in-tunnel," in row]
     assert rows == [[f"way/{way}", "road", "dropped", "tunnel-in-tunnel"] for way in (101, 102)]
     assert {"way/100", "way/103"} <= set(scene.road_graph().osm_id)
+
+
+def VALLEY(x, y):  # noqa: N802 - a constant
+    return 20.0 + 0.02 * x - 0.1 * np.abs(y)
+
+
+@pytest.mark.parametrize("terrain", [None, VALLEY])
+def test_a_street_keeps_its_height_where_it_ends_above_water(terrain, bench, tmp_path):
+    """At a bridge over a canal between shores nearer than its ramps, and at a quay."""
+    places = {1: (-120, 0), 2: (-12, 0), 3: (12, 0), 4: (120, 0), 5: (0, -120), 6: (0, 120), 7: (-120, 60)}
+    places |= {11: (-12, -60), 12: (12, -60), 13: (12, 70), 14: (-12, 70), 8: (-12.1, 60)}
+    ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4]), (STREET, [7, 8])]
+    ways.append(({"natural": "water", "water": "canal"}, [11, 12, 13, 14, 11]))
+    ways.append(({"waterway": "canal"}, [5, 6]))
+    assert not faults(bench, built(tmp_path, places, ways, terrain=terrain))
