@@ -75,7 +75,8 @@ def cut_pieces(
     at_end = _at_member_ends(members, member, line=line)
     polygon = without_ground_roads(
         polygon,
-        around,
+        line,
+        around=around,
         foot=foot_only,
         ends=np.fromiter((part[[0, -1], :2][own] for part, own in zip(line, at_end, strict=True)), object),
         sizes=Clearances(half, free, body),

@@ -22,6 +22,9 @@ _LEVEL = 0.05
 _STEP = 0.5
 """Metres of difference in height up to which a road begins a bridge or a tunnel at its side."""
 
+_MET = 0.1
+"""Metres between an end and a line that are joined there."""
+
 _SCANT = 0.1
 """Square metres of overlap of no account."""
 
@@ -48,8 +51,9 @@ class Clearances:
 
 def without_ground_roads(
     polygon: NDArray[np.object_],
-    around: NDArray[np.object_],
+    middle: NDArray[np.object_],
     *,
+    around: NDArray[np.object_],
     foot: Bools,
     ends: NDArray[np.object_],
     sizes: Clearances,
@@ -59,10 +63,13 @@ def without_ground_roads(
     """Outlines (n,) without the carriageways of roads on the ground at their height.
 
     Of bridges and tunnels for vehicles that run beside a road, too near in height to pass over or under it,
-    each keeps the area nearer to its own line; those that begin at the side of a road begin at its edge.
+    each keeps the area nearer to its own line; those that begin at the side of a road begin at its edge, and
+    where a road goes on from a fork at their end they end there.
     Footbridges and foot tunnels leave the whole carriageway, also of roads on bridges and in tunnels.
     Bridges that cross a road pass over it with less free height than others.
 
+    middle   : (n,) object, (k, 3) centre lines of pieces
+    around   : the same lines some metres further at both ends
     ends     : (n,) object, (k, 2) places at which a piece's way begins or ends
     headroom : free height over roads
     """
@@ -101,6 +108,9 @@ def without_ground_roads(
             taken = shapely.MultiPolygon()
             if where.area > _SCANT:
                 taken = nearer_part(where, line, half=half, other=around[k], other_half=half)
+            if _goes_on(line, middle[k], within=shared):
+                beyond = nearer_part(shared, line, half=half, other=middle[k], other_half=half)
+                taken = areal(shapely.union_all([taken, beyond]))
             begun = _begun(line, around[k], ends=ends[k], half=half)
             taken = shapely.union_all([taken, *(shared.intersection(disc) for disc in begun)])
         if taken.area > _SCANT:
@@ -122,6 +132,16 @@ def _near(line: Float, flat: shapely.LineString, *, area: shapely.Geometry) -> F
     if np.ptp(at) < 0.1:
         return None
     return polylines.cut(line, float(at.min()), end=float(at.max()))
+
+
+def _goes_on(line: Float, piece: Float, *, within: shapely.Geometry) -> bool:
+    """Whether a road begins where a piece ends, and has another height somewhere within an area."""
+    ends, starts = piece[[0, -1], None], line[None, [0, -1]]
+    end, start = np.nonzero(np.hypot(*(ends - starts)[..., :2].transpose(2, 0, 1)) < _MET)
+    if not len(end) or abs(ends[end[0], 0, 2] - starts[0, start[0], 2]) > _LEVEL:
+        return False
+    z, _, _ = nearest_on_line(line, shapely.get_coordinates(within))
+    return bool(np.abs(z - ends[end[0], 0, 2]).max() > _LEVEL)
 
 
 def _begun(line: Float, piece: Float, *, ends: Float, half: float) -> list[shapely.Geometry]:

@@ -423,3 +423,23 @@ def test_a_street_keeps_its_height_where_it_ends_above_water(terrain, bench, tmp
     ways.append(({"natural": "water", "water": "canal"}, [11, 12, 13, 14, 11]))
     ways.append(({"waterway": "canal"}, [5, 6]))
     assert not faults(bench, built(tmp_path, places, ways, terrain=terrain))
+
+
+def test_a_ramp_that_leaves_a_fork_of_bridges_keeps_its_carriageway(bench, tmp_path):
+    places = {
+        1: (150, -200),
+        2: (60, -120),
+        3: (0, 0),
+        4: (-60, -30),
+        5: (-7, 11),
+        6: (-10, 30),
+        7: (-200, -100),
+    }
+    places |= {8: (-60, -150), 9: (90, 0), 10: (-100, 30), 11: (100, 30)}
+    wide, narrow = {"width": "8"}, {"width": "3.5"}
+    ways = [(ROAD, [1, 2]), (BRIDGE | wide, [2, 3]), (BRIDGE | wide, [3, 4]), (ROAD, [4, 7])]
+    ways.append((ROAD | narrow, [3, 5, 6]))
+    ways += [(STREET, [8, 9]), (STREET, [10, 6, 11])]
+    scene = built(tmp_path, places, ways)
+    assert heights(scene, 104).max() > 1.5
+    assert not {key for key in faults(bench, scene) if key[0] == "ground" and key[1] != "road"}

@@ -689,6 +689,7 @@ def test_a_deck_is_whole_across_a_road_if_a_car_passes_below(z, whole):
     (left,) = without_ground_roads(
         np.array([deck], object),
         np.fromiter([line], object),
+        around=np.fromiter([line], object),
         foot=np.array([False]),
         ends=np.fromiter([line[:, :2]], object),
         sizes=Clearances(np.array([4.0]), np.array([SIZES.headroom]), np.array([SIZES.deck])),
