@@ -34,9 +34,10 @@ FUZZ_FACTOR = 10
 
 
 FULL = (
-    "extremes/test_footprints", "extremes/test_places", "extremes/test_rays", "extremes/test_scale",
-    "geoscene/pipeline/test_interruptions", "geoscene/pipeline/test_scale", "lidar/simulation/test_killed",
-    "test_benchmarks", "test_documented_commands", "test_examples", "test_site",
+    "extremes/test_footprints", "extremes/test_places", "extremes/test_pulses", "extremes/test_rays",
+    "extremes/test_scale", "geoscene/pipeline/test_interruptions", "geoscene/pipeline/test_scale",
+    "lidar/simulation/test_killed", "test_benchmarks", "test_documented_commands", "test_examples",
+    "test_site",
 )  # fmt: skip
 """Modules of which `make test` runs nothing but tests marked ``gate``."""
 

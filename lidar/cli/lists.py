@@ -165,8 +165,9 @@ def selftest(
 ) -> int:
     """Check on this machine that errors stay within documented bounds in extreme cases.
 
-    Such as grazing rays, ranges of 100 km, places near the poles and zone borders, long drives and large
-    scenes; docs/measurements/extremes.md lists them. Takes about 10 s. Exits with 1 if a bound does not hold.
+    Such as grazing rays, ranges of 100 km, wires and fences within a footprint, places near the poles and
+    zone borders, long drives and large scenes; docs/measurements/extremes.md lists them. Takes about 20 s.
+    Exits with 1 if a bound does not hold.
 
     For example:
 
@@ -175,7 +176,7 @@ def selftest(
     Parameters
     ----------
     only
-        Groups of cases: rays, places, footprints, time, statistics, scale. All by default.
+        Groups of cases: rays, pulses, places, footprints, time, statistics, scale. All by default.
     full
         Measure as many samples as in the documentation, up to 100 million a case; takes tens of minutes.
     json

@@ -18,7 +18,7 @@ class ExtremeCase:
     name    : the case in words
     measure : the largest value found in a number of samples; the same number gives the same value
     limit   : what limits the case
-    group   : rays, places, footprints, time, statistics or scale
+    group   : rays, pulses, places, footprints, time, statistics or scale
     bound   : the largest value that may be measured
     unit    : of bound and measurement; what is counted if the bound is 0
     of      : what the samples are

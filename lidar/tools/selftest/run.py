@@ -16,11 +16,12 @@ from geoscene.support.progress import Progress, silent
 from geoscene.support.registry import unknown_name
 from lidar.errors import BackendError, InputError
 from lidar.raycast.library import library
-from lidar.tools.selftest import footprints, places, rays, scale, statistics, times
+from lidar.tools.selftest import footprints, places, pulses, rays, scale, statistics, times
 from lidar.tools.selftest.case import ExtremeCase
 
 CASES: tuple[ExtremeCase, ...] = (
     *rays.CASES,
+    *pulses.CASES,
     *places.CASES,
     *footprints.CASES,
     *times.CASES,
