@@ -35,7 +35,8 @@ def snap_rounded(
     """
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
-    n = len(start)
+    # Compiled functions have machine code for rows in one piece.
+    n, start, end = len(start), np.ascontiguousarray(start), np.ascontiguousarray(end)
     cells = _cells(np.concatenate([start, end]), box)
     offset, found = kernels.cells_of_segments(start, end, cells)
     crossings = kernels.crossings(start, end, cells, offset, found)
@@ -137,7 +138,8 @@ def faces(points: Float, ends: Ints, *, rank: Ints, box: tuple[float, float, flo
     """
     from geoscene.ground import kernels  # noqa: PLC0415 - slow to import
 
-    *columns, covered = kernels.rings(points, ends, np.ascontiguousarray(rank), np.array(box, float))
+    ends, rank = np.ascontiguousarray(ends), np.ascontiguousarray(rank)
+    *columns, covered = kernels.rings(points, ends, rank, np.array(box, float))
     whole = (box[2] - box[0]) * (box[3] - box[1])
     if abs(covered - whole) > 1e-7 * whole:
         raise GeosceneError(f"ground cells of the tile at {box} cover {covered:.6f} m2 of {whole:.6f}")
