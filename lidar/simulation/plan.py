@@ -21,6 +21,7 @@ from geoscene.scene import Scene
 from geoscene.support.progress import Progress, silent
 from geoscene.typing import Float, Ints
 from lidar.dataset.derived import scene_provenance, versions
+from lidar.dataset.formats import FORMATS
 from lidar.errors import InputError, RouteError
 from lidar.geometry.georeference import Georeference, export_crs
 from lidar.geometry.poses import Trajectory
@@ -29,7 +30,6 @@ from lidar.motion.road_drive import RoadDriveOptions, RoadPlan, plan_road_drive
 from lidar.motion.vehicle import Vehicle, load_vehicle, vehicle_on
 from lidar.options.drive import DriveOptions
 from lidar.raycast.device import check_device
-from lidar.sensors.physics.settings import ScannerSettings
 from lidar.sensors.rig.devices import Camera, Scanner, cameras, scanners, sensor_kinds
 from lidar.sensors.rig.specs import Rig, load_rig
 from lidar.signal.attacks.placed_object import with_objects
@@ -173,7 +173,7 @@ def plan_drive(scene: Scene, options: DriveOptions, *, progress: Progress = sile
     check_start(start, 0)
     rig = load_rig(options.rig)
     sensors = sensors_of(rig, options)
-    _check_tolerance(sensors, options.recording_settings.scanner)
+    _check_tolerance(sensors, options)
     if any(isinstance(sensor, Camera) for sensor in sensors):
         scene.require("colors")
     road = options.road_conditions()
@@ -211,24 +211,44 @@ _HIDDEN = 0.1
 """Part of the deviation of range noise below which errors are hidden by it: they add 0.5 % to it."""
 
 
-def least_tolerance(scanner: Scanner, settings: ScannerSettings) -> float:
-    """Metres below which errors of ranges are hidden by the noise or the steps of a scanner; 0 without."""
-    noise = _HIDDEN * scanner.sensor.range_sigma if settings.range_noise != "none" else 0.0
-    step = 0.5 * scanner.sensor.range_quantum if settings.quantise else 0.0
-    return max(noise, step)
+@dataclass(frozen=True, slots=True)
+class Tolerable:
+    """The smallest tolerance of a scanner's ranges whose errors show in its files.
+
+    metres : 0 if ranges have neither noise nor steps
+    reason : what hides smaller errors, such as "has range noise of 3 cm"
+    """
+
+    metres: float
+    reason: str = ""
 
 
-def _check_tolerance(sensors: Sequence[Scanner | Camera], settings: ScannerSettings) -> None:
-    """Raise InputError for a tolerance of ranges below what a scanner's noise or steps leave of it."""
+def least_tolerance(scanner: Scanner, options: DriveOptions) -> Tolerable:
+    """The smallest tolerance that the noise and the steps of a scanner, and those of the files, leave."""
+    settings, sensor = options.recording_settings.scanner, scanner.sensor
+    noise = sensor.range_sigma if settings.range_noise != "none" else 0.0
+    step = sensor.range_quantum if settings.quantise else 0.0
+    # The format that keeps most decides.
+    coarse, name = (
+        min((FORMATS[name].step, name) for name in options.formats) if options.formats else (0.0, "")
+    )
+    limits = (
+        Tolerable(_HIDDEN * noise, f"{scanner.name} has range noise of {metres(noise)}"),
+        Tolerable(step / 2, f"{scanner.name} has steps of {metres(step)}"),
+        Tolerable(coarse / 2, f"files of {name} have steps of {metres(coarse)}"),
+    )
+    return max(limits, key=lambda limit: limit.metres)
+
+
+def _check_tolerance(sensors: Sequence[Scanner | Camera], options: DriveOptions) -> None:
+    """Raise InputError for a tolerance of ranges below what the noise or the steps of ranges leave of it."""
+    asked = options.recording_settings.scanner.footprint
     for scanner in (one for one in sensors if isinstance(one, Scanner)):
-        least = least_tolerance(scanner, settings)
-        if 0 < settings.footprint < least:
-            sigma, step = scanner.sensor.range_sigma, scanner.sensor.range_quantum
-            noisy = settings.range_noise != "none" and least == _HIDDEN * sigma
-            why = f"range noise of {metres(sigma)}" if noisy else f"steps of {metres(step)}"
+        least = least_tolerance(scanner, options)
+        if 0 < asked < least.metres:
             raise InputError(
-                f"`settings` footprint={settings.footprint:g}: {scanner.name} has {why}, in which errors"
-                f" below {metres(least)} do not show; give at least that"
+                f"`settings` footprint={asked:g}: {least.reason}, in which errors below"
+                f" {metres(least.metres)} do not show; give at least that"
             )
 
 

@@ -46,6 +46,7 @@ class Format:
     maps    : its module has ``open_map``, which writes aggregated maps; it may have that and no ``write``
     framed  : its files state the frame that they are of
     exact   : its files keep all digits of a cloud's columns
+    step    : metres between the coordinates that its files can have; 0 for floating-point numbers
     extra   : optional dependency that its module needs: a package and the name of the extra
     """
 
@@ -59,6 +60,7 @@ class Format:
     maps: bool = False
     framed: bool = False
     exact: bool = True
+    step: float = 0.0
     extra: str = ""
 
     def path(self, folder: Path, frame: int) -> Path:
@@ -141,11 +143,11 @@ _FORMATS = (
     Format("pcd", "pcd", ".pcd", maps=True),
     Format("pcd-ascii", "pcd_ascii", ".ascii.pcd"),
     Format("ply", "ply", ".ply", maps=True),
-    Format("csv", "text", ".csv", exact=False),
+    Format("csv", "text", ".csv", exact=False, step=1e-4),
     Format("npz", "npz", ".npz"),
     Format("parquet", "parquet", ".parquet", framed=True, extra="pyarrow gis"),
-    Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True, exact=False),
-    Format("las", "las", ".las", frame="world", columns=_LAS, maps=True, exact=False),
+    Format("laz", "las", ".laz", frame="world", columns=_LAS, maps=True, exact=False, step=1e-3),
+    Format("las", "las", ".las", frame="world", columns=_LAS, maps=True, exact=False, step=1e-3),
     Format(
         "e57",
         "e57",
@@ -172,7 +174,7 @@ FORMATS: Registry[Format] = Registry(
 
 _MAPS = (
     *(row for row in FORMATS.values() if row.maps),
-    Format("copc", "copc", ".copc.laz", frame="world", columns=_LAS, maps=True),
+    Format("copc", "copc", ".copc.laz", frame="world", columns=_LAS, maps=True, step=1e-3),
 )
 
 MAPS: Registry[Format] = Registry(

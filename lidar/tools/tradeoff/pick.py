@@ -87,7 +87,7 @@ def ladders_of(
     settings = options.recording_settings
     found: dict[Kind, Ladder] = {}
     if scanners := tuple(s for s in sensors if isinstance(s, Scanner)):
-        least = max(least_tolerance(scanner, settings.scanner) for scanner in scanners)
+        least = max(least_tolerance(scanner, options).metres for scanner in scanners)
         found["scanners"] = Ladder("scanners", scanners, _scanner_rows(settings.scanner.rays, least=least))
     if cameras := tuple(s for s in sensors if isinstance(s, Camera)):
         blurred = any(s.spec.exposure_ns for s in cameras)

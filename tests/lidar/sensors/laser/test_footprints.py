@@ -129,17 +129,24 @@ def test_a_frame_has_the_same_bytes_for_any_number_of_threads():
         np.testing.assert_array_equal(*(getattr(cloud, f.name) for cloud in clouds))
 
 
+NOISE, STEPS = ("range_noise", "constant"), ("quantise", "on")
+
+
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("footprint", "more", "formats", "message"),
     [
-        ((), ""),
-        ((("range_noise", "constant"),), "lidar_top has range noise of 1 cm, in which errors below 1 mm"),
-        ((("quantise", "on"),), "lidar_top has steps of 2 mm, in which errors below 1 mm"),
+        ("0.5mm", (), "pcd laz", ""),
+        ("0.5mm", (NOISE,), "pcd", "lidar_top has range noise of 1 cm, in which errors below 1 mm"),
+        ("0.5mm", (STEPS,), "pcd", "lidar_top has steps of 2 mm, in which errors below 1 mm"),
+        ("0.2mm", (), "laz", "files of laz have steps of 1 mm, in which errors below 500 µm"),
+        ("0.2mm", (), "laz pcd", ""),
     ],
 )
-def test_a_tolerance_that_noise_or_steps_hide_is_refused(scene, more, message):
-    settings = (("footprint", "0.5mm"), *more)
-    options = DriveOptions(route="random", rig="vlp16", duration=0.2, settings=settings)
+def test_a_tolerance_that_noise_or_steps_hide_is_refused(scene, footprint, more, formats, message):
+    settings = (("footprint", footprint), *more)
+    options = DriveOptions(
+        route="random", rig="vlp16", duration=0.2, settings=settings, formats=tuple(formats.split())
+    )
     with pytest.raises(InputError, match=message) if message else nullcontext():
         plan_drive(scene, options)
 
