@@ -85,6 +85,7 @@ def blocks(draw):
     return affinity.rotate(shape, float(rng.uniform(0, 90)))
 
 
+@pytest.mark.full
 @given(blocks(), st.floats(1, 300), st.floats(-50, 500))
 @settings(max_examples=40, deadline=None)
 def test_a_flat_building_has_the_volume_of_its_footprint_times_its_height(shape, height, base):
@@ -412,6 +413,7 @@ def test_of_duplicates_the_one_with_more_tags_is_kept():
     assert summarise(problems)["dropped"]["building"] == {"duplicate": 2}
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=25, deadline=None)
 def test_overlapping_buildings_share_no_volume_and_leave_no_hole(seed):

@@ -124,6 +124,7 @@ def test_panels_lie_within_their_walls_and_apart(shape, height, use, roof, numbe
     assert set(table.outline[mesh.feature[relief.wall >= 0]].tolist()) <= {0}
 
 
+@pytest.mark.full
 @given(st.integers(1, 10**9), st.integers(1, 12))
 @settings(max_examples=25, deadline=None)
 def test_a_building_has_as_many_rows_of_windows_as_storeys_are_tagged(number, levels):
@@ -433,6 +434,7 @@ def test_a_mesh_without_openings_is_unchanged():
     assert relief_mesh(mesh, layout.relief) is mesh
 
 
+@pytest.mark.full
 @given(
     blocks(),
     st.sampled_from(["apartments", "retail", "hotel", "yes"]),

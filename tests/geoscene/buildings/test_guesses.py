@@ -45,6 +45,7 @@ def houses(count, *, use="house", area=120.0, walls=6.0, levels=np.nan, roof=0.0
     return [(k + 1, use, area, walls, levels, roof) for k in range(count)]
 
 
+@pytest.mark.full
 @settings(max_examples=60, deadline=None)
 @given(BUILDINGS, st.sampled_from(REGIONS), st.randoms(use_true_random=False))
 def test_a_look_depends_on_the_building_and_its_region_alone(buildings, region, random):

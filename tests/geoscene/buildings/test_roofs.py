@@ -93,6 +93,7 @@ def test_the_skeleton_roof_cut_at_a_height_is_the_footprint_moved_in_by_as_much(
     assert above == pytest.approx(moved.area, abs=1e-3 * polygon.length)
 
 
+@pytest.mark.full
 @example(footprint(11373))  # one face is smaller than the distance within which nodes are merged
 @given(footprints())
 @settings(max_examples=40, deadline=None)

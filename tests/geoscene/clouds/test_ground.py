@@ -38,6 +38,7 @@ GRID = CloudGrid(0.0, 0.0, 90, 90, 1.0)
 FEW = settings(max_examples=6, deadline=None)
 
 
+@pytest.mark.full
 @FEW
 @given(st.floats(0, 0.4), st.floats(0, 6.28), st.integers(0, 99))
 def test_bare_slopes_are_kept(gradient, azimuth, seed):
@@ -95,6 +96,7 @@ def test_gaps_in_a_plane_are_bridged_by_the_plane(a, b):
     assert np.abs(bridge(gappy) - plane).max() < 1e-6
 
 
+@pytest.mark.full
 def test_gaps_that_cross_blocks_are_bridged_as_if_there_were_none():
     rows, columns = np.mgrid[:700, :1100].astype(float)
     plane = (0.1 * columns - 0.05 * rows).astype(np.float32)

@@ -34,6 +34,7 @@ def house(shape, *, long, wide, eaves, rise, turn, noise, seed, chimneys=0.06):
 FEW = settings(max_examples=6, deadline=None)
 
 
+@pytest.mark.full
 @FEW
 @given(
     st.sampled_from(["flat", "gabled", "hipped", "skillion", "pyramidal"]),
@@ -56,6 +57,7 @@ def test_eaves_ridge_and_shape_are_recovered(shape, wide, ratio, rise, turn, noi
     assert roof.sigma < 0.15
 
 
+@pytest.mark.full
 @FEW
 @given(st.floats(0, 6.28), st.integers(0, 50))
 def test_a_skillion_slopes_to_the_side_that_was_measured(turn, seed):

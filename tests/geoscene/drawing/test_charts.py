@@ -32,6 +32,7 @@ TEXTS = Axes("a < b & c", "x", "y")
 SIZE = (700, 400)
 
 
+@pytest.mark.full
 def test_gaps_break_lines_and_counts_of_zero_lie_at_the_end_of_a_logarithmic_axis():
     y = np.array([100.0, 0.0, 1.0, math.nan, 10.0, 100.0])
     band = ShadedBand("b", np.arange(6), y, y + 1)
@@ -60,6 +61,7 @@ def test_the_same_figure_has_the_same_bytes_and_names_no_date():
     assert Image.open(io.BytesIO(drawn(".png"))).size == SIZE
 
 
+@pytest.mark.full
 def test_a_raster_has_north_up_and_square_cells():
     image = np.full((2, 4, 3), 255, np.uint8)
     image[0, 3] = RED  # the north-eastern cell

@@ -121,6 +121,7 @@ def test_cell_has_the_height_of_the_highest_triangle_at_its_centre(corners):
     assert ((labels > 0) == drawn).all()
 
 
+@pytest.mark.full
 def test_a_geopackage_has_every_layer_with_its_columns(scene, tmp_path):
     path = export_scene(scene, tmp_path / "a.gpkg").path
     assert pyogrio.list_layers(path)[:, 0].tolist() == [

@@ -140,6 +140,7 @@ def test_lanes_are_continuous_through_junctions(scene, tmp_path, left_hand):
     assert _check_links(path) >= 12
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lanes", [0.5, 1.0, 2.0, [2, 1] * 24])
 @pytest.mark.parametrize("left_hand", [False, True])
 def test_lanes_are_continuous_in_a_grid_of_any_lane_count(scene, tmp_path, lanes, left_hand):
@@ -287,6 +288,7 @@ def test_scene_without_roads_is_refused(scene, tmp_path):
 steps = st.lists(st.tuples(st.floats(0.5, 60), st.floats(-3.0, 3.0)), min_size=1, max_size=8)
 
 
+@pytest.mark.full
 @settings(max_examples=80, deadline=None)
 @given(steps)
 def test_a_reference_line_is_smooth_and_near_its_polyline(steps):

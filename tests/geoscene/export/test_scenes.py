@@ -233,6 +233,7 @@ def test_patches_are_parted_where_they_touch_in_a_vertex():
     assert not manifold_patches(ring).any()
 
 
+@pytest.mark.full
 @given(st.integers(1, 6), st.integers(0, 2**32 - 1))
 @settings(max_examples=60, deadline=None)
 def test_patches_of_any_part_of_a_surface_are_connected_2_manifolds(size, seed):

@@ -184,6 +184,7 @@ def test_building_is_the_same_closed_solid_in_every_format(kind, exported, scene
         np.testing.assert_allclose(verdict.volume, volume, rtol=1e-4)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", [*STEPS, "gpkg", "geoparquet", "geojson"])
 def test_exports_are_reproducible(kind, exported, scene, tmp_path):
     first = exported(kind)

@@ -133,6 +133,7 @@ def test_squares_with_forest_keep_their_size():
     assert sum(span**2 for span in spans.values()) == 16 * 16
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 7.0]))
 @settings(max_examples=15, deadline=None)
 def test_no_two_vertices_of_the_ground_are_within_a_millimetre_and_no_face_is_a_line(seed, lines):
@@ -145,6 +146,7 @@ def test_no_two_vertices_of_the_ground_are_within_a_millimetre_and_no_face_is_a_
     assert not degenerate_faces(points, faces).any()
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32))
 @settings(max_examples=25, deadline=None)
 def test_a_point_belongs_to_the_highest_polygon_over_it(seed):

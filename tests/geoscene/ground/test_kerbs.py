@@ -78,6 +78,7 @@ def test_kerbs_are_lowered_at_crossings():
     assert (kerb[~outside, 2] == 0).all()
 
 
+@pytest.mark.full
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_tiles_meet_on_their_borders_and_have_no_holes(seed):

@@ -121,6 +121,7 @@ def test_regions_have_materials_for_open_ground_and_fields():
         assert {region["open"], *region["fields"]} <= set(materials())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("place", "expected"), [((24.9, 60.2), "grass"), ((46.7, 24.7), "sand"), ((25.0, 70.0), "dry_grass")]
 )

@@ -120,6 +120,7 @@ def test_crowns_fade_before_bridges():
     np.testing.assert_allclose(z, [0.1, 0.05, 0.0], atol=2e-3)
 
 
+@pytest.mark.full
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_tiles_meet_and_carriageways_are_no_steeper_than_their_camber(seed):

@@ -57,6 +57,7 @@ def test_pieces_meet_at_their_ends_only(pairs):
     assert (shapely.disjoint(met, shapely.boundary(pieces[other])) == 0).all()
 
 
+@pytest.mark.full
 @given(segments, st.integers(-(10**7), 10**7), st.integers(-(10**7), 10**7))
 def test_the_pieces_move_with_the_segments(pairs, x, y):
     moved = [tuple((u + x, v + y) for u, v in pair) for pair in pairs]
@@ -64,6 +65,7 @@ def test_the_pieces_move_with_the_segments(pairs, x, y):
     assert back == pieces_of(pairs)
 
 
+@pytest.mark.full
 @given(segments)
 def test_the_pieces_do_not_depend_on_order_and_direction(pairs):
     assert pieces_of([(b, a) for a, b in reversed(pairs)]) == pieces_of(pairs)

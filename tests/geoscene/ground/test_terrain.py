@@ -79,6 +79,7 @@ def test_height_between_four_posts_is_bilinear(tmp_path):
     )
 
 
+@pytest.mark.full
 def test_tiles_of_one_model_equal_one_raster_in_any_order(tmp_path):
     """The strip between the last posts of one tile and the first of the next is interpolated, too."""
     corner = around()
@@ -185,6 +186,7 @@ def test_rasters_on_both_sides_of_180_degrees_meet(crs, tmp_path):
     np.testing.assert_allclose(np.diff(terrain.height(x, 0 * x)), 5 / terrain.spacing, rtol=1e-3)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("unit", "factor"), [("ft", 0.3048), ("us-ft", 1200 / 3937), ("m", 1.0)])
 def test_feet_become_metres(tmp_path, unit, factor):
     path = write_dem(tmp_path / "a.tif", np.full((60, 60), 1000.0), corner=around(), unit=unit)

@@ -128,6 +128,7 @@ def test_a_mapped_crown_is_as_wide_with_relief():
     assert trees_of({"diameter_crown": "3", "genus": "Populus"}).crown.tolist() == [3.0]
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**20))
 def test_the_variant_depends_on_the_place_alone(shift):
     """A tree keeps its shape and heading whatever other trees are read with it."""

@@ -166,6 +166,7 @@ def test_trees_of_forests_are_not_made_where_only_the_ground_is_read(osm, scene,
         next(scene.tiles())
 
 
+@pytest.mark.full
 def test_rays_views_and_exports_meet_the_same_trees(scene, tmp_path):
     crowns = [rows(tile.instances, tile.origin) for tile in scene.tiles()]
     world = World.load(scene)
@@ -196,6 +197,7 @@ def test_an_obj_that_would_be_too_large_is_refused_with_its_size(scene, tmp_path
     assert copies == sum(len(tile.instances) for tile in scene.tiles())
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("trees", [True, False])
 def test_settings_of_worlds_leave_out_forests_and_keep_them_without_single_trees(scene, trees):
     single = sum(len(tile.instances) for tile in scene.tiles(forests=False)) if trees else 0
@@ -208,6 +210,7 @@ def test_settings_of_worlds_leave_out_forests_and_keep_them_without_single_trees
     assert forest > 0
 
 
+@pytest.mark.full
 def test_a_rebuild_with_the_same_ground_places_the_same_trees(osm, scene, tmp_path):
     options = BuildOptions(tile_size=100.0, lod=1)
     build(osm, tmp_path / "a", options=BuildOptions(tile_size=100.0))

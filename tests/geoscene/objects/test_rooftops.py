@@ -167,6 +167,7 @@ def test_dormers_and_the_chimney_of_a_house_keep_clear_of_each_other():
         assert overlap == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.full
 def test_plant_on_a_flat_roof_is_off_its_edges_and_apart():
     hall = {"building": "warehouse", "height": "8", "roof:shape": "flat"}
     solids, copies, names, _ = built(town(shapely.box(0, 0, 50, 40), hall))

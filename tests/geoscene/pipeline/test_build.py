@@ -48,6 +48,7 @@ def test_every_solid_is_closed_oriented_and_of_positive_volume(scene):
     assert report["volume"] > 1e5
 
 
+@pytest.mark.full
 def test_check_scene_reports_a_broken_solid(scene, tmp_path):
     shutil.copytree(scene.path, tmp_path / "broken")
     broken = open_scene(tmp_path / "broken")
@@ -298,6 +299,7 @@ def test_scene_for_sensors_is_not_exported_or_shown(use, osm, tmp_path):
     assert "attributes of features" in done.stdout
 
 
+@pytest.mark.full
 def test_only_selected_kinds_are_built(osm, tmp_path):
     scene = build(osm, tmp_path / "s", options=BuildOptions(only=("buildings",)))
     counts = scene.manifest["counts"]

@@ -378,7 +378,6 @@ def test_tiles_are_kept_when_space_or_memory_ends(error, osm, whole, tmp_path, m
     same_files(whole.path, build(osm, tmp_path / "scene", options=OPTIONS).path)
 
 
-@pytest.mark.gate
 def test_files_of_others_are_kept_and_named(osm, whole, tmp_path, caplog):
     scene = tmp_path / "scene"
     shutil.copytree(whole.path, scene)

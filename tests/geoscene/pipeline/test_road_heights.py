@@ -105,6 +105,7 @@ def crossing(upper, lower):
     ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("upper", "lower"),
     [
@@ -147,11 +148,13 @@ def test_a_tunnel_passes_under_a_street_whatever_its_layer(layer, bench, tmp_pat
     assert any(",odd-layer," in row for row in problems(scene)) == (layer == "1")
 
 
+@pytest.mark.full
 def test_streets_that_cross_on_terrain_without_a_node_have_one_height(bench, tmp_path):
     scene = built(tmp_path, CROSSING, crossing({"layer": "1"}, {}), terrain=HILLS)
     assert not faults(bench, scene)
 
 
+@pytest.mark.full
 def test_a_level_street_beside_the_ramp_of_a_tunnel_stays_level(bench, tmp_path):
     beside = {
         1: (-200, 0),
@@ -169,6 +172,7 @@ def test_a_level_street_beside_the_ramp_of_a_tunnel_stays_level(bench, tmp_path)
     assert not faults(bench, scene)
 
 
+@pytest.mark.full
 def test_a_passage_is_no_fault_if_it_is_as_low_as_its_sign_says(bench, tmp_path):
     corners = {11: (-30, -9), 12: (30, -9), 13: (30, 9), 14: (-30, 9)}
     inside = STREET | {"tunnel": "building_passage", "maxheight": "1.8"}
@@ -177,6 +181,7 @@ def test_a_passage_is_no_fault_if_it_is_as_low_as_its_sign_says(bench, tmp_path)
     assert not faults(bench, built(tmp_path, CROSSING | corners, ways))
 
 
+@pytest.mark.full
 def test_a_ramp_has_its_height_also_where_the_bridge_is_beyond_the_bounds(tmp_path):
     places = {n: (x + 80, y) for n, (x, y) in CROSSING.items()}
     path = write_map(tmp_path / "map.osm", places, crossing({"bridge": "yes"}, {}))
@@ -286,6 +291,7 @@ def test_railings_and_walls_of_footways_do_not_stand_in_streets(path, tags, benc
     assert not faults(bench, built(tmp_path / "steep", places, ways, terrain=SLOPE))
 
 
+@pytest.mark.full
 def test_a_footbridge_passes_over_a_road_bridge_wherever_its_stations_lie(bench, tmp_path):
     places = CROSSING | {1: (-200, 0), 4: (200, 0), 5: (0, -160), 6: (0, -60), 7: (0, 60), 8: (0, 160)}
     ways = [(ROAD, [1, 2]), (BRIDGE, [2, 3]), (ROAD, [3, 4])]
@@ -293,6 +299,7 @@ def test_a_footbridge_passes_over_a_road_bridge_wherever_its_stations_lie(bench,
     assert not faults(bench, built(tmp_path, places, ways))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("level", ["1", "-1", "2", "0"])
 def test_footways_with_a_level_alone_are_no_structures(level, bench, tmp_path):
     places = {1: (-150, 0), 2: (150, 0), 3: (0, -80), 4: (0, 80)}

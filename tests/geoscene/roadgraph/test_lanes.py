@@ -140,6 +140,7 @@ def test_divider_separates_the_directions():
     assert layout(2.0, width=7.0).divider == pytest.approx(-3.5)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("lanes", [[1, 1], [2, 1], [1.5, 1.5], [2, 2], [2, 0.5], [1.25, 1.25]])
 @pytest.mark.parametrize("width", [9.0, 24.0])
 def test_routes_traffic_and_opendrive_agree(tmp_path, lanes, width):

@@ -577,6 +577,7 @@ def maps(draw):
     return town(places, ways, points)
 
 
+@pytest.mark.full
 @settings(max_examples=60, deadline=None)
 @given(maps())
 def test_every_map_segment_is_in_the_graph_once_per_direction(osm):

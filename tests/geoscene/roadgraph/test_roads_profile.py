@@ -296,6 +296,7 @@ def test_both_edges_of_a_street_have_the_same_heights():
         np.testing.assert_array_equal(graph.geometry[edge][0], graph.node_xyz[graph.tail[edge]])
 
 
+@pytest.mark.full
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-0.06, 0.06), st.floats(60, 200), st.floats(30, 150), st.sampled_from([BRIDGE, TUNNEL]))
 def test_the_ground_is_built_up_and_cut_down_to_the_road(slope, half, angle_deg, kind):
@@ -351,6 +352,7 @@ def sloping_street(along, across, *, off=0.0):
     return replace(graph, geometry=raised), ground
 
 
+@pytest.mark.full
 @settings(max_examples=30, deadline=None)
 @given(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-3.0, 3.0))
 def test_surveyed_ground_that_is_graded_again_stays_as_it_is(along, across, off):

@@ -12,6 +12,7 @@ from geoscene.sources import demo_path, read_osm
 DRIVABLE = {"primary", "secondary", "tertiary", "unclassified", "residential", "living_street"}
 
 
+@pytest.mark.full
 def test_the_demo_has_features_of_all_kinds():
     assert demo_path().stat().st_size < 500_000
     data = read_osm(demo_path())
@@ -25,6 +26,7 @@ def test_the_demo_has_features_of_all_kinds():
     assert sum(p.tags.get("natural") == "tree" for p in data.points) > 150
 
 
+@pytest.mark.full
 def test_the_streets_of_the_demo_are_connected():
     data = read_osm(demo_path())
     graph = nx.Graph()

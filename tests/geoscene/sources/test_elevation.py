@@ -126,6 +126,7 @@ def mercator(lonlat):
     return HALF * lonlat[:, 0] / 180, HALF * np.arcsinh(np.tan(np.radians(lonlat[:, 1]))) / np.pi
 
 
+@pytest.mark.full
 def test_tiles_join_without_seams(serve, tmp_path):
     server = serve(slope)
     osm = area()
@@ -164,6 +165,7 @@ def test_tiles_on_both_sides_of_180_degrees_join(serve, tmp_path):
     assert np.abs(z - (4000 - 0.125 * away))[near].max() < 0.1
 
 
+@pytest.mark.full
 def test_hills_have_the_accuracy_of_ten_metre_posts(serve, tmp_path):
     osm = area()
     path = fetch_elevation(osm, cache_dir=tmp_path, server=patient(serve(hills)))

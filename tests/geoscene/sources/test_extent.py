@@ -139,6 +139,7 @@ def test_stated_and_given_bounds_with_empty_margins_stay(tmp_path):
     assert Town().read(tmp_path, bounds=(24.0, 60.0, 25.0, 61.0)).bounds == (24.0, 60.0, 25.0, 61.0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("stated", "bounds"),
     [

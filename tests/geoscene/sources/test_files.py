@@ -185,6 +185,7 @@ def test_points_and_other_relations_have_their_tags(tmp_path):
 # --- order, ids, formats
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**32 - 1), st.booleans())
 @settings(max_examples=20, deadline=None)
 def test_order_and_sign_of_ids_do_not_change_the_features(tmp_path_factory, seed, negative):

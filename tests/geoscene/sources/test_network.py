@@ -241,6 +241,7 @@ def assert_is_the_box(data) -> None:
     assert len(data.relations) > 1
 
 
+@pytest.mark.full
 def test_fetched_place_equals_the_same_map_from_a_file(server, tmp_path):
     data = fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers_at(server))
     assert_is_the_box(data)
@@ -261,6 +262,7 @@ def test_answers_are_cached_and_damaged_ones_fetched_again(server, tmp_path):
     assert len(server.asked) == 2 * asked
 
 
+@pytest.mark.full
 def test_large_area_fetched_in_parts_equals_one_request(server):
     reports = []
     servers = replace(servers_at(server), max_query_km2=0.05)
@@ -295,6 +297,7 @@ def test_a_place_that_is_a_point_is_widened_to_a_scene(server):
     assert west < 24.945 < east
 
 
+@pytest.mark.full
 def test_busy_server_is_retried(server):
     server.refuse = [429, 504]
     data = fetch_bbox(BOX, servers=servers_at(server))
@@ -309,6 +312,7 @@ def test_retries_of_a_busy_server_are_limited(server):
     assert server.asked_for("/api/interpreter") == 3
 
 
+@pytest.mark.full
 def test_next_server_is_used_if_one_fails(start):
     first, second = start(), start()
     first.refuse = [500]
@@ -399,6 +403,7 @@ def test_empty_answers_are_not_kept_and_asked_for_again(server, tmp_path):
     assert_is_the_box(fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers))
 
 
+@pytest.mark.full
 def test_refresh_asks_again_and_replaces_what_is_kept(server, tmp_path):
     servers = servers_at(server)
     fetch_place("Esplanadi, Helsinki", cache_dir=tmp_path, servers=servers)

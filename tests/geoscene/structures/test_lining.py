@@ -117,6 +117,7 @@ def test_walls_of_a_lined_tunnel_step_in_and_out_along_the_way(lined):
         assert (steps > 0.1).sum() >= 2 * 120 / 10 * 0.6  # in and out of ribs every 10 m or less, some hidden
 
 
+@pytest.mark.full
 def test_walkways_stand_beside_the_carriageway_and_vehicles_have_its_whole_width(lined):
     points = lined.points()
     wide = walls_along(lined, 0.5, 1.0).min()
@@ -173,6 +174,7 @@ def test_lining_depends_on_the_osm_id_and_not_on_the_order_of_the_map():
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("relief", RELIEFS)
 def test_a_bent_tunnel_and_a_foot_tunnel_are_closed_solids(relief):
     places = {1: (-200, 0), 2: (-60, 0), 3: (0, 5), 4: (40, 40), 5: (45, 90), 6: (45, 200)}

@@ -93,6 +93,7 @@ def classes(plan, *places):
     ).tolist()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("tags", "free"),
     [
@@ -170,6 +171,7 @@ def test_ways_have_passages_of_their_kind(tags, width, free):
     assert problems == []
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("tags", "why"),
     [
@@ -230,6 +232,7 @@ def test_a_long_tunnel_below_a_house_stays_a_tunnel():
     assert [p.reason for p in problems if "passage" in p.detail] == []
 
 
+@pytest.mark.full
 @given(
     st.floats(-0.9, 0.9),
     st.floats(-0.1, 0.1),
@@ -315,6 +318,7 @@ def test_a_passage_under_low_eaves_is_lower_unless_there_is_no_room(tags, free, 
     assert [p.reason for p in problems] == reasons
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("areas", "tags", "height", "source"),
     [

@@ -545,6 +545,7 @@ def test_a_footway_on_a_road_bridge_is_as_high_as_the_road():
     assert (klass == Class.SIDEWALK).mean() > 0.9
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("angle_deg", [3, 19, 31])
 def test_no_two_vertices_of_a_structure_are_within_a_millimetre(angle_deg):
     turn = np.radians(angle_deg)

@@ -32,6 +32,7 @@ def packed(**columns):
     return out
 
 
+@pytest.mark.full
 @given(arrays.arrays(KINDS, arrays.array_shapes(min_dims=0, max_dims=3, min_side=0)), st.booleans())
 def test_arrays_are_those_that_numpy_wrote(array, by_columns):
     stored = np.asfortranarray(array) if by_columns else array

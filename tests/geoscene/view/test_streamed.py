@@ -113,6 +113,7 @@ def test_coarse_nodes_have_fewer_faces_within_their_error(folder, head):
         assert error > 0
 
 
+@pytest.mark.full
 def test_boxes_of_features_hold_their_triangles(scene, folder):
     parts = re.findall(r'"([A-Za-z0-9+/=]*)"', (folder / "attributes.js").read_text("utf-8"))
     values = np.frombuffer(decompress(b64decode(parts[1]), 31), "<i4").reshape(7, -1)
@@ -207,6 +208,7 @@ def test_vertices_stay_vertices_of_the_surface_within_their_cell(seed, count, ce
         assert {tuple(row) for row in np.floor(coarse.vertices[face] / cell).tolist()} == before
 
 
+@pytest.mark.full
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
@@ -231,6 +233,7 @@ def test_neighbours_keep_their_common_side_without_gaps(seed, count, edge, cell)
     assert ends[0] == ends[1]
 
 
+@pytest.mark.full
 def test_a_coarser_cell_gives_fewer_faces_and_keeps_the_outline():
     mesh = terrain(1, 4000)
     counts = []

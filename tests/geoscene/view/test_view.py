@@ -171,6 +171,7 @@ def test_page_contains_the_attribution(page):
     assert "https://www.openstreetmap.org/copyright" in page.links
 
 
+@pytest.mark.full
 def test_names_from_the_map_are_escaped(scene, tmp_path):
     name = '</script><script>document.title="x"</script>&amp;$title'
     odd = replace(scene, manifest={**scene.manifest, "name": name})
@@ -214,11 +215,13 @@ def test_road_edges_come_with_the_surfaces_of_their_ways(scene, page):
     assert len(tables["roads"]["feature"]) > 20
 
 
+@pytest.mark.full
 def test_page_is_reproducible(scene, path, tmp_path):
     view_scene(scene, tmp_path / "again.html")
     assert (tmp_path / "again.html").read_bytes() == path.read_bytes()
 
 
+@pytest.mark.full
 def test_bounds_select_the_tiles_that_they_intersect(scene, tmp_path):
     x, y = scene.tile_size * 0.25, scene.tile_size * 0.25
     lon, lat = scene.frame.to_geographic([x, x + 10], [y, y + 10])

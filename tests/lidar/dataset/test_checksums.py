@@ -156,6 +156,7 @@ def test_files_of_others_beside_a_drive_are_not_in_its_checksums(scene, driven, 
     assert named(again) == {"notes.txt": "added"}
 
 
+@pytest.mark.full
 def test_what_is_made_from_a_dataset_names_it_and_has_its_sources(driven, signed, tmp_path):
     first = folder_digest(driven)
     assert first == read_checksums(driven / CHECKSUMS).digest

@@ -525,6 +525,7 @@ def test_waymo_columns_have_the_names_and_types_of_the_second_version(waymo):
         assert kinds == columns
 
 
+@pytest.mark.full
 def test_layouts_have_the_same_bytes_each_time(dataset, coco, kitti_360, waymo, tmp_path):
     for name, (folder, _) in (("coco", coco), ("kitti-360", kitti_360), ("waymo", waymo)):
         EXPORTERS[name].export(dataset, tmp_path / name)

@@ -685,6 +685,7 @@ def _calibration(path):
     return {name: np.array(values.split(), float) for name, values in lines if "time" not in name}
 
 
+@pytest.mark.full
 def test_kitti_sequence_has_one_index_for_clouds_labels_images_and_poses(dataset, tmp_path):
     """Read as pykitti's odometry class does; the fisheye camera has no place in it."""
     counts = EXPORTERS["kitti"].export(dataset, tmp_path / "k").counts
@@ -723,6 +724,7 @@ def test_kitti_sequence_has_one_index_for_clouds_labels_images_and_poses(dataset
         assert image == (dataset.path / "front" / "rgb" / f"{name}.png").read_bytes()
 
 
+@pytest.mark.full
 def test_kitti_objects_hold_their_points_and_project_onto_their_2d_boxes(dataset, tmp_path):
     EXPORTERS["kitti"].export(dataset, tmp_path / "k")
     sequence = tmp_path / "k" / "sequences" / "00"

@@ -570,6 +570,7 @@ def test_the_layout_names_topics_of_the_recording(bags):
     assert set(panels) == {word for word in json.dumps(layout["layout"]).split('"') if "!" in word}
 
 
+@pytest.mark.full
 def test_the_same_drive_gives_the_same_bytes(recorded, bags, tmp_path):
     for name in ("ros2", "mcap"):
         EXPORTERS[name].export(recorded, tmp_path / name)

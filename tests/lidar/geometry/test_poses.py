@@ -37,6 +37,7 @@ def rz(g):
     return np.array([[np.cos(g), -np.sin(g), 0], [np.sin(g), np.cos(g), 0], [0, 0, 1]])
 
 
+@pytest.mark.full
 @given(angles, angles, angles)
 @settings(max_examples=200, deadline=None)
 def test_the_rotation_matrix_follows_the_convention(a, b, g):
@@ -48,6 +49,7 @@ def test_the_rotation_matrix_follows_the_convention(a, b, g):
     )
 
 
+@pytest.mark.full
 @given(angles, angles, angles)
 @settings(max_examples=200, deadline=None)
 def test_angles_round_trip_even_at_gimbal_lock(a, b, g):

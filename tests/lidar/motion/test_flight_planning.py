@@ -72,6 +72,7 @@ def test_scanners_are_off_between_survey_lines_by_default(scene, tmp_path):
     assert sizes[-1] > 0
 
 
+@pytest.mark.full
 def test_a_survey_flies_over_every_part_of_its_area(scene):
     trajectory = flight(scene, survey="all", altitude=90.0, overlap=0.2)
     kit = load_rig("drone")
@@ -110,6 +111,7 @@ def test_drones_survey_at_a_height_above_the_ground_below_them_and_aircraft_fly_
     assert 537.0 < level[0] - drone[:, 2].max() < 560.0
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("side", ["west", "south", "east", "north"])
 def test_beyond_the_scene_the_ground_is_that_of_the_nearest_border(hillside, side):
     xmin, ymin, xmax, ymax = hillside.bounds

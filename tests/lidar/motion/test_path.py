@@ -112,6 +112,7 @@ def test_among_city_blocks_the_body_stays_on_the_street_and_in_its_lane(seed, si
     assert np.abs(path.offset[between]).max() < 0.1
 
 
+@pytest.mark.full
 def test_a_corner_house_at_the_kerb_is_driven_round():
     # the inner corner of a right turn is a house; straight through the lanes' rounding the body would hit it
     graph = road_graph([(-60, 0), (0, 0), (0, -60)], [(0, 1), (1, 2)], width=6.0)

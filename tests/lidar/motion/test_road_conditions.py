@@ -33,6 +33,7 @@ def test_desired_speeds_are_within_those_measured_on_motorways():
     assert ROADS["ice"].pace < ROADS["snow"].pace
 
 
+@pytest.mark.full
 def test_weather_makes_roads_slippery_and_the_air_dim():
     assert in_weather("clear") == DRY
     assert in_weather("rain=10mm/h").grip == ROADS["wet"].grip

@@ -73,6 +73,7 @@ def test_seeds_start_anywhere_on_the_streets_and_end_anywhere():
         assert graph.length[edges].sum() - begin - (graph.length[edges[-1]] - end) >= 300.0
 
 
+@pytest.mark.full
 @given(st.integers(0, 2**64 - 1))
 @settings(max_examples=20, deadline=None)
 def test_seeds_that_follow_each_other_start_far_apart(seed):

@@ -93,6 +93,7 @@ def first_hits(corners, origins, way):
     return nearest, np.where(np.isfinite(nearest), face, -1)
 
 
+@pytest.mark.full
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1), FAR_AWAY)
 def test_first_hits_are_those_of_a_float64_intersection_of_all_faces(seed, place):
@@ -153,6 +154,7 @@ def nested_balls():
     return np.concatenate([outer.vertices, inner.vertices]), faces, len(outer.vertices)
 
 
+@pytest.mark.full
 @BACKENDS
 @pytest.mark.parametrize("jitter", [0.0, 1e-5])
 def test_no_ray_passes_through_a_vertex_to_a_front_face_behind_it(backend, jitter):
@@ -184,6 +186,7 @@ def narrow(rng):
     return vertices, np.array([[1, 3, 0], [3, 4, 0], [4, 1, 0], [1, 2, 3]]), vertices - [0, 0, 1.5]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("body", [fan, narrow])
 def test_no_ray_passes_through_the_first_vertex_of_a_body_to_a_face_behind(body):
     rng = np.random.default_rng(17)
@@ -275,6 +278,7 @@ def test_a_ray_that_starts_on_a_face_does_not_hit_it(backend):
     assert (through.range > 0.1).all()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("origin", [0.0, 2000.0, 10_000.0])
 def test_cheap_ranges_are_as_near_to_exact_ones_as_stated(origin):
     rng = np.random.default_rng(7)

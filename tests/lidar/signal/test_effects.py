@@ -54,6 +54,7 @@ def truths(folder):
     return [np.load(path) for path in sorted(folder.glob("top/truth/*.npz"))]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "stage",
     [f"insert:{BOX},replaces=false", f"delete:{BOX}", "perturb:share=0.2", "dropped_packets:loss=0.3"],
@@ -108,6 +109,7 @@ def test_weather_of_another_place_is_said_to_change_nothing(plain, tmp_path):
     assert json.loads(shown.stdout)["effects"]["weather"]["echoes changed"] > 1000
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("stage", ["delete:start=0.35", "camera_blind:start=0.3", "gnss_spoof:start=5"])
 def test_stages_that_start_after_the_last_measurement_are_refused(scene, options, plain, tmp_path, stage):
     """The last cloud is of 0.3 s, the last image of 0.2 s."""

@@ -130,6 +130,7 @@ def test_files_of_receivers_and_inertial_units_read_back(plain):
     assert np.array_equal(samples, numbers(plain / "unit.csv", "accel_x", "accel_y", "accel_z"))
 
 
+@pytest.mark.full
 def test_overwriting_removes_truth_files(scene, options, tmp_path):
     drive(scene, tmp_path / "a", options=replace(options, stages=STAGES))
     drive(scene, tmp_path / "a", options=options, overwrite=True)

@@ -135,6 +135,7 @@ def test_bytes_do_not_depend_on_workers_or_on_a_resumed_drive(scene, options, al
         drive(scene, tmp_path / "a", options=options)
 
 
+@pytest.mark.full
 def test_applied_to_the_record_stages_give_the_files_of_the_drive(plain, altered, tmp_path):
     summary = apply_stages(plain, tmp_path / "a", options=ApplyOptions(STAGES))
     made, expected = files(tmp_path / "a"), files(altered)

@@ -115,6 +115,7 @@ BAD = [
 ]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("flag", "text", "match"), BAD)
 def test_bad_weather_and_attacks_end_in_one_line_with_nothing_written(scene, tmp_path, flag, text, match):
     (tmp_path / "velodyne").mkdir()

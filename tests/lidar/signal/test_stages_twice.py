@@ -142,6 +142,7 @@ def test_two_runs_give_what_one_with_both_gives(plain, tmp_path, first, second):
     assert listed[0] == listed[1]
 
 
+@pytest.mark.full
 def test_truth_of_attacks_on_weather_goes_back_to_the_surfaces(plain, snowy, tmp_path):
     """Injected returns in front of flakes hide the surfaces that the flakes hid."""
     apply_stages(snowy, tmp_path / "a", options=ApplyOptions(stages(WALL, SHIFT)))
@@ -205,6 +206,7 @@ def test_a_drive_in_weather_can_be_attacked(scene, options, tmp_path):
     assert [(table["name"], table["seed"]) for table in recipe["applied_stages"]] == [("insert", 7)]
 
 
+@pytest.mark.full
 def test_stages_without_an_effect_change_nothing_on_top_of_others(snowy, tmp_path):
     idle = stages("cover_glass:transmission=1", "dropped_packets:loss=0")
     apply_stages(snowy, tmp_path / "a", options=ApplyOptions(idle))
@@ -213,6 +215,7 @@ def test_stages_without_an_effect_change_nothing_on_top_of_others(snowy, tmp_pat
         assert_same_truth(truth_of(tmp_path / "a", frame), truth_of(snowy, frame))
 
 
+@pytest.mark.full
 def test_replayed_clouds_are_those_without_stages(snowy, tmp_path):
     """`Situation.earlier` gives the clouds before the first stage."""
     replay = stages("replay:device=any,distance=5,width=360,seconds=0.1")
@@ -249,6 +252,7 @@ def test_clouds_of_others_twice(plain, tmp_path, folder, name):
     ]
 
 
+@pytest.mark.full
 def test_filtered_weather_can_be_attacked(plain, snowy, tmp_path):
     """Rows that the filter removed stay listed; of them no columns are known."""
     denoise(snowy, read_methods(["dror"]), out=tmp_path / "clean")
@@ -261,6 +265,7 @@ def test_filtered_weather_can_be_attacked(plain, snowy, tmp_path):
         assert set(before["removed"]) <= set(truth["removed"])
 
 
+@pytest.mark.full
 def test_a_filtered_clear_drive_keeps_a_whole_truth(plain, tmp_path):
     denoise(plain, read_methods(["dror"]), out=tmp_path / "clean")
     assert truth_of(tmp_path / "clean", 0)["removed_xyz"].shape == (0, 3)

@@ -102,6 +102,7 @@ def test_errors_of_tasks_are_raised_as_they_are(cluster):
         list(connection.run_tasks(int, ["1", "x"]))
 
 
+@pytest.mark.full
 def test_a_scheduler_that_does_not_answer_is_one_line(scene, tmp_path, monkeypatch):
     monkeypatch.setattr(geoscene.support.cluster, "_SECONDS", 0.5)
     words = (

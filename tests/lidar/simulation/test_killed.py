@@ -72,7 +72,6 @@ def test_a_drive_that_is_killed_while_it_is_deleted_counts_as_not_finished(forke
     assert finished == (number == 4)  # the rename of the manifest
 
 
-@pytest.mark.gate
 def test_a_drive_that_fails_before_its_first_frame_keeps_the_files_of_others(scene, copy, monkeypatch):
     (copy.path / "notes.txt").write_text("mine")
 

@@ -167,6 +167,7 @@ def test_flights_of_a_map_have_the_bytes_of_flights_in_its_whole_scene(town, tmp
     same_drives(tmp_path / "a", tmp_path / "b")
 
 
+@pytest.mark.full
 def test_the_same_drive_again_reads_no_map_and_builds_nothing(town, south, tmp_path, monkeypatch):
     first = opened(town, south, tmp_path)
     monkeypatch.delattr(scene_cache, "read_osm")
@@ -266,6 +267,7 @@ def test_a_program_that_is_killed_while_a_scene_grows_leaves_a_cache_that_works(
     assert opened(town, south, tmp_path / "cache").built == 0
 
 
+@pytest.mark.full
 def test_a_build_that_is_interrupted_is_resumed(town, south, tmp_path, monkeypatch):
     build_tile = tiles.build_tile
     made = []

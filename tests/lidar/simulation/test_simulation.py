@@ -200,6 +200,7 @@ def test_frames_are_made_when_they_are_asked_for_and_none_is_kept(scene, monkeyp
     assert len(begun) <= 3 + 2 * 2
 
 
+@pytest.mark.full
 def test_iterating_again_simulates_the_same_frames(scene):
     simulation = lidar.simulate(scene, DriveOptions(route="random", rig="vlp16", duration=0.3, seed=1))
     first, again = (list(simulation) for _ in range(2))

@@ -104,6 +104,7 @@ def pixels(dataset, view, row, kind):
     return np.asarray(Image.open(path))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("camera", ["image_2", "bent", "side"])
 def test_points_that_a_camera_sees_are_on_what_their_pixels_show(dataset, camera):
     """Rolling shutter, distortion and fisheye; edges of half a pixel are the rest."""
@@ -257,6 +258,7 @@ def test_true_tracks_of_kitti_and_of_mot_have_no_errors(dataset, tmp_path):
         assert one.objects > 0
 
 
+@pytest.mark.full
 def test_a_track_is_one_road_user_all_along(dataset, tmp_path):
     EXPORTERS["kitti-tracking"].export(dataset, tmp_path / "k")
     EXPORTERS["kitti"].export(dataset, tmp_path / "o")

@@ -190,6 +190,7 @@ def test_pedestrians_change_pose_as_they_walk(actors):
     assert max(len(seen.get(f, ())) for f in walkers.tolist()) == 4
 
 
+@pytest.mark.full
 def test_points_on_actors_lie_in_their_boxes_and_are_counted(actors, scene, ego):
     """With every firing at its own time, the points of moving actors fall into the boxes of those times."""
     sensor = load_sensor("vlp16")

@@ -273,6 +273,7 @@ def test_no_road_user_stands_for_good(seed):
     assert longest_rests(flow).max() < 100.0
 
 
+@pytest.mark.full
 def test_the_gap_to_a_leader_grows_with_speed():
     """At rest bodies are some 2 m apart; on a free road followers keep a second and more."""
     graph = road_graph([(0.0, 0.0), (2000.0, 0.0)], [(0, 1)], twoway=False, width=4.0, speed=13.9)
@@ -351,6 +352,7 @@ def test_lanes_lie_side_by_side():
     assert [lane_shift(lanes, 0, lane=k, width=1.8) for k in (0, 1)] == pytest.approx([5.25, 1.75])
 
 
+@pytest.mark.full
 def test_the_same_seed_gives_the_same_traffic():
     graph = city(signalised=True)
     ego = driving(graph, 1, 8.0)

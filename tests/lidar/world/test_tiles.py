@@ -134,6 +134,7 @@ def test_threads_load_a_tile_once():
     assert len(made) == 1
 
 
+@pytest.mark.full
 def test_leaves_let_rays_pass_and_limbs_do_not(tmp_path):
     """A crown holds leaf clusters and limbs; only the faces of clusters have leaves behind them."""
     road = Way("way/1", {"highway": "residential"}, np.arange(2), np.array([[11.0, 50.0], [11.001, 50.0]]))

@@ -68,6 +68,7 @@ def density_along_lines(kind, *, lines=400, step=0.02, count=1024):
     return np.fft.rfftfreq(count, step), 2 * step * total / lines / (window**2).sum()
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("kind", "stated"), [("asphalt", 16e-6), ("concrete", 16e-6)])
 def test_roads_have_the_spectrum_of_iso_8608(kind, stated):
     n, density = density_along_lines(kind)

@@ -94,6 +94,7 @@ def test_a_ray_hits_an_opening_as_if_it_were_built_of_triangles(seed, close):
     assert_alike(found, wanted, material, beside_edges(reference, start, way, wanted))
 
 
+@pytest.mark.full
 @FEW
 @given(SEEDS)
 def test_a_ray_that_starts_in_an_opening_leaves_it_or_hits_its_sides(seed):

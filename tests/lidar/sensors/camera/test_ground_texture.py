@@ -101,6 +101,7 @@ def test_asphalt_is_speckled_by_its_stones_and_not_blotchy():
     assert steps > 0.55 * near.std()
 
 
+@pytest.mark.full
 def test_cracks_are_rare_narrow_and_as_wide_from_along_as_from_across():
     x, y = np.random.default_rng(1).uniform(-300, 300, (2, 60_000))
     share = [draw_cracks(a, b, 1.0, 0.0, 0.002, 0.002, ASPHALT) for a, b in zip(x, y, strict=True)]

@@ -246,6 +246,7 @@ def lens(image, k, *, away=10.0):
     return image[row - 1 : row + 2, 98:102].reshape(-1, 3).mean(axis=0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("sun", [NOON, EVENING, NIGHT])
 @pytest.mark.parametrize("state", [0, 1, 2])
 def test_the_lit_lens_has_its_colour_at_any_hour_and_the_others_stay_dark(state, sun):

@@ -574,6 +574,7 @@ def test_depth_and_labels_are_those_of_the_dry_world():
         assert np.array_equal(getattr(dry, name), getattr(wet, name))
 
 
+@pytest.mark.full
 def test_rays_of_six_lenses_with_distortion_are_computed_once():
     lenses = [replace(CAMERA, fx=100.0 + k, distortion=(-0.2, 0.1, 0.0, 0.0, 0.0)) for k in range(6)]
     scene = world(ground())

@@ -122,6 +122,7 @@ def test_a_surface_within_the_minimum_range_still_occludes():
     assert np.abs(cloud.xyz[cloud.feature == 3, 1]).min(initial=99) > 5
 
 
+@pytest.mark.full
 def test_a_frame_scanned_alone_equals_that_of_a_run():
     sensor = load_sensor("vlp16")
     drive = driven((10.0, 0.0, 0.0), start=(-20, -10, 0))

@@ -126,6 +126,7 @@ def test_the_sick_scanner_halves_its_step_at_half_the_rate():
     assert len(firings(load_sensor("lms111", rate_hz=25), 0)) == 1081
 
 
+@pytest.mark.full
 def test_every_preset_fires_unit_vectors_in_time_order_over_its_frame():
     for name in sensor_names():
         sensor = load_sensor(name)

@@ -347,6 +347,7 @@ def test_in_the_open_nothing_blocks_the_sky():
     np.testing.assert_array_equal(fixes[0].lonlath, fixes[1].lonlath)
 
 
+@pytest.mark.full
 def test_a_street_canyon_degrades_fixes():
     s = spec("single", rate=0.02, arm=(0.0, 0.0, 1.6), constellations=("gps",))
     trajectory = standing(200_000.0)
@@ -359,6 +360,7 @@ def test_a_street_canyon_degrades_fixes():
     assert ((walled.satellites[~fixed] < 4) | (walled.dop[~fixed, 2] > 25.0)).all()
 
 
+@pytest.mark.full
 def test_in_a_street_of_five_storeys_four_systems_nearly_always_have_a_fix():
     """Errors are those of receivers in street canyons, 5 to 10 m, where GPS alone has no fix."""
     trajectory = standing(100_000.0)

@@ -111,6 +111,7 @@ def test_dead_reckoning_of_the_true_signals_reproduces_the_drive():
     np.testing.assert_allclose(v, trajectory.velocity[-1], atol=0.01)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["adis16448", "tactical"])
 def test_allan_deviation_is_that_of_the_parameters(name):
     p = PRESETS[name]

@@ -271,6 +271,7 @@ def test_water_mirrors_the_far_bank_and_glints_below():
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("surface", ["glass", "water"])
 def test_rays_of_a_pulse_share_the_power_that_is_mirrored(surface):
     if surface == "glass":
@@ -316,6 +317,7 @@ def test_reflectance_spread_is_constant_for_each_object():
     assert np.std(np.log([r[0] for r in each])) == pytest.approx(0.2, rel=0.4)
 
 
+@pytest.mark.full
 def test_thin_wires_return_their_share_of_the_power_in_many_pulses():
     """Upright wires of 2 mm in beams 73 mm wide: few rays of a pulse lie in line with them."""
     wires = []
@@ -386,6 +388,7 @@ def test_a_long_footprint_on_level_ground_is_one_echo_with_few_rays():
     assert np.abs(few.range[a] - many.range[b])[far].max() < 0.05
 
 
+@pytest.mark.full
 def test_a_wall_at_the_end_of_slanted_ground_keeps_its_echo():
     """Neighbouring rays on the ground are 1 m apart along the beam; a wall 5 m on is an echo of its own."""
     scene = world(box((-60, -60, -3), (25, 60, -1.73), feature=1), box((32, -60, -3), (33, 60, 5), feature=2))

@@ -92,6 +92,7 @@ def test_pixels_run_right_then_down():
     assert (np.diff(rays[:, :, 1] / rays[:, :, 2], axis=0) > 0).all()
 
 
+@pytest.mark.full
 @settings(max_examples=60, deadline=None)
 @given(
     k1=st.floats(-0.4, 0.4),

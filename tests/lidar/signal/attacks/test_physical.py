@@ -192,6 +192,7 @@ def test_prepared_pulses_have_the_code_by_chance(bits):
     assert low <= len(coded) <= high
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("place", "column"), [({}, 20.0), ({"radius": 12.0}, 12.0)], ids=["everywhere", "around"]
 )
@@ -398,6 +399,7 @@ ATTACKS = (
 )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("table", ATTACKS, ids=lambda t: "-".join(str(v) for v in t.values()))
 @pytest.mark.parametrize("on", ["drive", "recording", "rounded recording"])
 def test_no_column_gives_injected_returns_away(table, on):

@@ -87,6 +87,7 @@ def test_depth_is_along_the_axis_but_light_travels_along_the_ray():
     assert np.log(clear[0]) / np.log(clear[1]) == pytest.approx(longer, rel=0.03)
 
 
+@pytest.mark.full
 def test_light_passes_as_much_of_a_bank_of_fog_as_lies_in_its_way():
     """A bank of 20 m around the camera before a wall at 60 m is as 20 m of fog; none lies 2 km away."""
     image, middle = picture(60.0), (90, 160)

@@ -77,6 +77,7 @@ def test_a_bank_of_fog_loses_only_what_is_seen_through_it():
     )
 
 
+@pytest.mark.full
 def test_weather_elsewhere_and_at_other_times_changes_nothing():
     far = dict(zip(("longitude", "latitude"), map(float, GEO.to_geographic(5000, 0)), strict=True))
     setting = weather(kind="rain", amount=100.0, radius=300.0, **far)

@@ -169,6 +169,7 @@ def test_large_drops_send_back_less_at_1550_nm_where_water_absorbs():
     )
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("wavelength", [905, 1550])
 def test_extinction_and_backscatter_grow_with_the_amount(wavelength):
     media = [rain(rate, wavelength) for rate in (0, 0.5, 5, 50)]

@@ -47,6 +47,7 @@ def test_lisas_number_of_drops_in_the_beam():
     np.testing.assert_allclose(found, [6.571, 177.4, 6571], rtol=1e-3)
 
 
+@pytest.mark.full
 def test_lisa_draws_only_particles_that_matter_and_no_others():
     """All particles of each beam, as the paper draws them, give the same share and ranges of returns."""
     lidar, rate, reach, n = Lidar(max_range=150.0), 60.0, 20.0, 20_000

@@ -94,6 +94,7 @@ def test_nothing_falls_in_a_tunnel(text):
     assert image(text, OPEN).max() > 20
 
 
+@pytest.mark.full
 def test_snow_falls_before_and_behind_a_gate_but_not_under_it():
     """The grid of what is covered has cells of 1 m: its edges are within half a metre."""
     found = scan("snow=20mm/h", GATE).cloud
@@ -113,6 +114,7 @@ def test_rain_veils_by_the_length_of_the_open_air():
     assert 0 < covered <= open_air
 
 
+@pytest.mark.full
 def test_fog_fills_a_gate_and_thins_out_in_a_tunnel():
     np.testing.assert_array_equal(image("fog=60m", GATE), image("fog=60m", OPEN))
     assert 0 < np.median(image("fog=60m", LONG)) < 0.8 * np.median(image("fog=60m", OPEN))

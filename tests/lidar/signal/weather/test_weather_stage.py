@@ -73,6 +73,7 @@ def test_without_extinction_the_cloud_is_the_clear_one(text):
         np.testing.assert_array_equal(found.cloud.source, np.arange(len(found.original)))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("text", KINDS)
 def test_the_same_seed_gives_the_same_cloud(text):
     first, again, other = (altered(SURVEY, text, seed=seed) for seed in (3, 3, 4))

@@ -54,6 +54,7 @@ def split(frame, forged, suspicion):
     return suspicion[is_forged].max(), suspicion[~is_forged].max(initial=0)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(("defence", "points"), [(Occlusion(), 60), (Occlusion(), 200), (Shadow(), 60)])
 def test_a_car_of_few_points_lets_rays_pass_and_a_genuine_one_does_not(frame, defence, points):
     attacked, forged = with_car(frame, (9.0, 4.0, -0.98), points=points)
@@ -115,6 +116,7 @@ def test_timing_needs_a_scanner_that_fires_at_random_times(frame):
     assert able([guarded], read_defences(["timing"]))
 
 
+@pytest.mark.full
 def test_a_void_is_where_a_car_was_removed(frame):
     gone = in_box(frame, (GENUINE[0], GENUINE[1], -0.9), size=CAR + 0.3)
     verdict = judged(Void(), without(frame, gone))
@@ -143,6 +145,7 @@ def blinded(frame, width):
     return without(frame, np.abs(frame.azimuth - np.radians(40)) < np.radians(width / 2))
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("width", [10, 20, 45, 80])
 @pytest.mark.parametrize("since", ["the frame", "the drive's start", "two frames"])
 def test_a_sector_without_returns_stands_out_however_long_it_has_been_removed(turning, width, since):
@@ -188,6 +191,7 @@ def test_returns_behind_a_wall_of_the_map_and_lost_walls_stand_out(frame):
     assert np.arctan2(*lost.gaps.xy[0, ::-1]) == pytest.approx(0.95, abs=0.1)
 
 
+@pytest.mark.full
 def test_physics_finds_what_no_pulse_can_give(frame):
     some = np.arange(0, len(frame), 50)
     chosen = np.isin(np.arange(len(frame)), some)
@@ -209,6 +213,7 @@ def test_physics_finds_what_no_pulse_can_give(frame):
         assert np.median(found) == 0, name
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("share", [0.01, 0.5])
 def test_returns_off_the_range_step_stand_out_even_if_half_of_a_frame_are(share):
     """A forger who computes ranges in floating point does not keep to the scanner's steps."""
@@ -221,6 +226,7 @@ def test_returns_off_the_range_step_stand_out_even_if_half_of_a_frame_are(share)
     assert returns[~forged].max() <= 0.2
 
 
+@pytest.mark.full
 def test_returns_too_weak_to_be_detected_are_suspicious_where_the_others_keep_the_threshold():
     noisy = observed(world(*STREET), settings=replace(LEVELS["survey"], false_alarms=False))[0]
     far = np.flatnonzero(noisy.distance > 30)[:100]
@@ -230,6 +236,7 @@ def test_returns_too_weak_to_be_detected_are_suspicious_where_the_others_keep_th
     assert (weak[far] > 0.8).sum() > 0.5 * len(far)
 
 
+@pytest.mark.full
 def test_scattered_returns_are_outliers(frame):
     rng = np.random.default_rng(2)
     some = rng.permutation(len(frame))[:60]
@@ -326,6 +333,7 @@ def test_the_camera_confirms_a_car_that_it_sees_and_rejects_one_that_it_does_not
     assert judged(Overlay(), late).frame == 0, "a picture of another time says nothing"
 
 
+@pytest.mark.full
 def test_a_picture_counts_until_60_ms_after_the_last_pulse_on_an_object(frame, tmp_path):
     attacked, forged = with_car(frame, (10.0, 1.0, -0.98), points=150)
     row = next(k for k, rows in enumerate(attacked.members) if len(rows) and forged[rows].all())
@@ -335,6 +343,7 @@ def test_a_picture_counts_until_60_ms_after_the_last_pulse_on_an_object(frame, t
         assert (judged(Overlay(), shown).objects[row] > 0.45) == counts
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("level", [0, 255])
 def test_a_blinded_camera_or_lost_rows_say_nothing_of_an_object(frame, tmp_path, level):
     attacked, _ = with_car(frame, (10.0, 1.0, -0.98), points=150)
@@ -361,6 +370,7 @@ def with_fixes(frames, *, spoofed=(0.0, 0.0), gyro_z=0.0):
     return [replace(frame, navigation=data) for frame in frames]
 
 
+@pytest.mark.full
 def test_fixes_that_drift_and_wrong_poses_contradict_the_scanner():
     path = driven((6.0, 0.0, 0.0), yaw_rate=0.1)
     frames = [

@@ -194,6 +194,7 @@ def test_calibration_takes_genuine_data_alone(plain, attacked, tmp_path):
     assert not (tmp_path / "d.toml").exists()
 
 
+@pytest.mark.full
 def test_verdicts_are_written_whole_or_not_at_all_and_never_into_the_data(attacked, tmp_path, monkeypatch):
     dataset, chosen = open_dataset(attacked), read_defences(["physics"])
     before = sorted(attacked.rglob("*"))
@@ -337,6 +338,7 @@ def test_thresholds_are_of_the_same_detector(plain, tmp_path):
     assert "--calibrate" in wrong.stderr
 
 
+@pytest.mark.full
 def test_boxes_are_those_of_the_chosen_detector(plain):
     dataset, learned = open_dataset(plain), read_detector("learned")
     (rules,), (other,) = read_scans(dataset), read_scans(dataset, detector=learned)

@@ -135,6 +135,7 @@ def jointly_calibrated(rng):
     return replace(plain, joint=joint)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("names", [NAMES, ("one", "other"), ("third",), ("one", "silent")])
 def test_a_harmonic_fusion_alarms_as_often_as_it_says_whatever_defences_have_in_common(names):
     rng = np.random.default_rng(9)
@@ -160,6 +161,7 @@ def test_more_is_fused_than_the_calibration_has_suspicions_of():
     assert found == pytest.approx(-np.log10(FALSE_ALARMS["objects"]) / 6)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("rule", FUSIONS)
 def test_a_fused_suspicion_grows_with_each(rule):
     calibration = jointly_calibrated(np.random.default_rng(11))

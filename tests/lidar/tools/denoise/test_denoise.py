@@ -147,6 +147,7 @@ def snowy(scene, tmp_path_factory):
     return folder / "drive"
 
 
+@pytest.mark.full
 def test_a_filtered_dataset_holds_what_the_filter_keeps(snowy, tmp_path):
     found = denoise(snowy, read_methods(["ddior"]), out=tmp_path / "clean")
     tally = found.scores["ddior"]["top"]
@@ -228,6 +229,7 @@ def test_what_cannot_be_filtered_is_refused_with_nothing_written(snowy, tmp_path
     assert not (tmp_path.parent / "out").exists()
 
 
+@pytest.mark.full
 def test_a_damaged_later_cloud_leaves_what_was_there(snowy, tmp_path):
     source, out = tmp_path / "snowy", tmp_path / "out"
     shutil.copytree(snowy, source)

@@ -85,6 +85,7 @@ def aligned(estimate, truth, kind):
     return PosePairs(alignment(pairs, kind).of(pairs.estimate), pairs.truth, pairs.left_out)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["none", "origin", "se3", "sim3"])
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_absolute_errors_are_those_of_evo(kind, seed):
@@ -103,6 +104,7 @@ def test_absolute_errors_are_those_of_evo(kind, seed):
         assert found.max == pytest.approx(told["max"], abs=1e-9)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("delta", "unit"), [(1, "frames"), (7, "frames"), (5.0, "meters"), (23.0, "meters"), (120.0, "meters")]
 )

@@ -164,6 +164,7 @@ def test_missing_added_and_exchanged_frames_are_named(copy):
     }
 
 
+@pytest.mark.full
 @pytest.mark.parametrize(
     "place",
     [
@@ -234,6 +235,7 @@ def test_a_frame_that_is_cut_out_of_data_and_list_is_noticed(copy):
     assert any("integrity/top.csv: signed list was changed (from frame 2 on)" in text for text in texts)
 
 
+@pytest.mark.full
 def test_a_list_that_was_made_anew_needs_the_key(copy):
     sign_dataset(copy, None, signer=Hmac(b"the attacker's own"), overwrite=True)
     (finding,) = findings(copy)

@@ -175,6 +175,7 @@ def test_a_gap_of_removed_returns_is_found_even_at_the_seam(middle):
     assert distance(found.places[0], marked[gone]) < 0.25
 
 
+@pytest.mark.full
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
 def test_three_returns_of_a_ring_are_never_missed(data):
@@ -213,6 +214,7 @@ def test_a_step_out_of_bounds_is_refused():
         WatermarkKey(b"0123456789abcdef", 0.0)
 
 
+@pytest.mark.full
 @given(
     npst.arrays(np.int64, st.tuples(st.integers(1, 60), st.just(3)), elements=st.integers(-32, 32)),
     st.sampled_from([2, np.inf]),

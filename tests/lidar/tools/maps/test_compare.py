@@ -51,6 +51,7 @@ def test_distances_to_triangles_are_those_of_all_pairs(seed, count, flat):
     np.testing.assert_allclose(np.sqrt(squared), brute_force(points, corners), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.full
 def test_a_nearer_distance_that_is_known_is_kept():
     corners = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
     squared = np.array([0.25, 0.25])
@@ -94,6 +95,7 @@ def test_points_on_the_surfaces_of_a_scene_are_at_distance_zero(places):
     assert np.isinf(surfaces.distances(far)).all()
 
 
+@pytest.mark.full
 def test_what_rays_hit_of_buildings_is_on_the_surfaces(places):
     """Also in windows, whose panes lie behind the plane of the wall."""
     world = World.load(places)

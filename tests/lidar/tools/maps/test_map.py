@@ -59,6 +59,7 @@ def test_ply_and_pcd_maps_hold_the_same_points(tmp_path):
     assert np.abs(found - expected()).max() < 0.001
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("voxel", [0.5003, 2.0007, 100.0001])  # no border on the millimetres of LAZ
 def test_a_voxel_keeps_the_one_return_nearest_to_its_centre(tmp_path, voxel):
     data = dataset(tmp_path / "d")

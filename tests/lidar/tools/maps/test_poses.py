@@ -93,6 +93,7 @@ def test_a_file_of_poses_places_the_points_and_its_error_is_stated(tmp_path):
     np.testing.assert_allclose(points_of(tmp_path / "again.laz"), points_of(tmp_path / "m.laz"), atol=0.0011)
 
 
+@pytest.mark.full
 def test_returns_of_times_without_poses_are_left_out_and_counted(tmp_path):
     data = dataset(tmp_path / "d", kinds=("pcd",))
     given_poses = str(tum_of(tmp_path / "t.tum", until=0.25))

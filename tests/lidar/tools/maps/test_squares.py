@@ -50,6 +50,7 @@ def tables_of(points, pieces):
         yield {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], "frame": part}
 
 
+@pytest.mark.full
 @settings(deadline=None, max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -103,6 +104,7 @@ def points_of(path):
     return np.column_stack([las.x, las.y, las.z])
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("form", ["laz", "las", "copc"])
 def test_tiles_hold_the_points_of_their_squares_and_together_those_of_the_map(tmp_path, form):
     data = dataset(tmp_path / "d")
@@ -143,6 +145,7 @@ def test_tiles_of_rasters_and_provenance_are_one_folder(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["d", "tiles"]
 
 
+@pytest.mark.full
 def test_the_same_map_in_tiles_has_the_same_bytes(tmp_path):
     data = dataset(tmp_path / "d")
     for name in ("one", "two"):

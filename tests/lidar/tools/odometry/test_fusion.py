@@ -90,6 +90,7 @@ def run(given, **words):
     return fuse_measurements(KNOTS, given, settings=SETTINGS, **words)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("how", ["imu", "odometry", "both"])
 def test_exact_measurements_give_the_true_poses(how):
     """Lever arms, a unit that is mounted turned, and its biases are taken into account."""

@@ -293,6 +293,7 @@ def test_a_window_is_refined_to_the_true_poses(measured):
         assert metres < 5e-3
 
 
+@pytest.mark.full
 def test_ranges_of_two_cameras_do_not_shorten_the_way():
     """Ranges from a base have symmetric errors as inverse ranges; weighed as ranges, they are too short."""
     shares = []

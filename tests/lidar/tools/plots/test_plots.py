@@ -86,6 +86,7 @@ def test_the_speed_is_that_of_the_trajectory(town_drive, tmp_path):
     assert told["length_m"] == pytest.approx(manifest["length_m"], rel=0.01)
 
 
+@pytest.mark.full
 def test_returns_by_range_are_those_of_the_clouds(town_drive, tmp_path):
     svg, told = drawn(town_drive, tmp_path, "returns", "--frames", "1:4")
     tables = clouds(town_drive)[1:4]
@@ -99,6 +100,7 @@ def test_returns_by_range_are_those_of_the_clouds(town_drive, tmp_path):
     assert b'id="injected"' in svg, "the attack's returns are shown by their origin"
 
 
+@pytest.mark.full
 def test_intensities_are_those_of_each_class(town_drive, tmp_path):
     _, told = drawn(town_drive, tmp_path, "intensity")
     label = np.concatenate([t["label"] for t in clouds(town_drive)])
@@ -109,6 +111,7 @@ def test_intensities_are_those_of_each_class(town_drive, tmp_path):
     assert len(told["mean_intensity"]) == len(np.unique(label))
 
 
+@pytest.mark.full
 def test_the_range_image_has_each_return_at_its_azimuth_and_ring(town_drive, tmp_path):
     svg, told = drawn(town_drive, tmp_path, "range-image", "--frames", "2:")
     table = clouds(town_drive)[2]
@@ -161,6 +164,7 @@ def test_rows_of_scanners_that_look_down_are_times():
     assert rows.ends == (0, 10)
 
 
+@pytest.mark.full
 def test_coverage_counts_every_true_return(town_drive, tmp_path):
     svg, told = drawn(town_drive, tmp_path, "coverage", "--sensor", SCANNER, "--resolution", "0.5")
     dataset = open_dataset(town_drive)
@@ -184,6 +188,7 @@ def test_coverage_counts_every_true_return(town_drive, tmp_path):
     assert set(shown) == cells
 
 
+@pytest.mark.full
 def test_coverage_is_drawn_in_cells_that_fit(town_drive, tmp_path):
     svg, told = drawn(town_drive, tmp_path, "coverage", "--sensor", SCANNER)
     (plan,) = images(svg)
@@ -212,6 +217,7 @@ def test_larger_cells_hold_the_counts_of_the_smaller_ones_in_them(grid, first, f
     assert {cell: count for cell, count in found.items() if count} == +expected
 
 
+@pytest.mark.full
 def test_errors_of_fixes_are_geodesic_differences(town_drive, tmp_path):
     svg, told = drawn(town_drive, tmp_path, "gnss")
     with (town_drive / "gnss.csv").open() as file:

@@ -54,6 +54,7 @@ def test_frames_of_one_block_are_one_trial() -> None:
     assert math.isnan(rate(0, 0, blocks=0).share)
 
 
+@pytest.mark.full
 def test_each_drive_has_one_without_attack(written: Callable[..., Path]) -> None:
     plan = read_plan(written(PHANTOM + DAZZLE, grid='seed = [1, 2]\nweather = ["", "fog=50m"]'))
     assert len(plan.runs) == 12
@@ -132,6 +133,7 @@ def _frame(second: float, *, suspicion: float, forged: int = 0, targets: int = 0
     }
 
 
+@pytest.mark.full
 def test_known_figures_give_known_rates(written: Callable[..., Path]) -> None:
     drives = read_grid(written("", grid="seed = [1, 2]"))
     attack = Attack("phantom", "inject", "forge")

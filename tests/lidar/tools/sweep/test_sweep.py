@@ -160,6 +160,7 @@ def test_a_folder_of_other_files_is_refused(scene, tmp_path):
     assert not (tmp_path / "sweep.json").exists()
 
 
+@pytest.mark.full
 def test_names_are_readable_stable_and_differ(scene, tmp_path):
     grid = 'route = ["random", ["60.1662,24.9413", "60.1655,24.9405"]]\ntraffic = [false, true]'
     names = [drive.name for drive in read_grid(written(tmp_path / "grid.toml", scene, grid=grid))]

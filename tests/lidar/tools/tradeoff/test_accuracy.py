@@ -333,6 +333,7 @@ def test_a_stratified_sample_has_the_quantiles_of_all():
         assert one.low <= one.value <= one.high
 
 
+@pytest.mark.full
 def test_intervals_of_a_drive_that_is_sampled_whole_do_not_depend_on_how_its_frames_differ():
     rng = np.random.default_rng(1)
     quiet, busy = 0.001 * rng.random(2000), 0.001 * rng.random(2000)

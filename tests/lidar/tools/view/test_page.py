@@ -51,6 +51,7 @@ def head_of(sweep):
     return json.loads(data[4 : 4 + length])
 
 
+@pytest.mark.full
 @given(st.lists(st.integers(-(2**47), 2**47)))
 def test_whole_numbers_survive_as_planes_of_bytes(numbers):
     values = np.array(numbers, np.int64)
@@ -117,6 +118,7 @@ def test_without_the_scene_the_plan_has_no_roads_and_says_so(town_drive, tmp_pat
     assert any("no roads" in note for note in summary.notes)
 
 
+@pytest.mark.full
 def test_a_selection_of_frames_and_sensors_is_shown(town_drive, tmp_path):
     options = PlaybackOptions(sensors=("lidar_front",), frames="1:20", every=4)
     summary = view_drive(open_dataset(town_drive), tmp_path / "page.html", options=options)
