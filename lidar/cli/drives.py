@@ -91,6 +91,10 @@ def drive(
 
     options = options or DriveOptions()
     options.check_course()
+    if wanted.resume and report.overwrite:
+        raise InputError(
+            "`resume` keeps files of the drive and `overwrite` deletes them; leave one of them out"
+        )
     shows: AbstractContextManager[Live | None] = nullcontext()
     if live is not None:
         from lidar.tools.view.live import live_target, opened_live  # noqa: PLC0415

@@ -6,7 +6,7 @@ import csv
 import hashlib
 import threading
 from array import array
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,17 @@ def read_journal(path: Path) -> Entries:
 def write_journal(path: Path, entries: Entries) -> None:
     """Write finished frames in order of sensor and number."""
     write_blocks(path, _blocks(entries))
+
+
+def forget_frames(path: Path, sensors: Collection[str]) -> None:
+    """Take the finished frames of some sensors out of a journal, so that they are recorded again."""
+    old, kept = read_journal(path), Entries()
+    for name in old.sensors:
+        if name not in sensors:
+            table = old.of(name)
+            for frame, points, of_files in zip(table.frame, table.points, table.digest, strict=True):
+                kept.add(name, int(frame), points=int(points), digest=of_files.decode())
+    write_journal(path, kept)
 
 
 def _blocks(entries: Entries) -> Iterator[dict[str, Any]]:

@@ -104,6 +104,10 @@ class AccuracyOptions:
     """Compare a sample of the recorded frames with the exact reference (float64, up to 999 rays a pulse)
     afterwards; always done for an accuracy or a budget."""
 
+    resume: bool = False
+    """Of a finished drive that missed its accuracy, record the sensors that missed it again with the next
+    finer setting; the files of other sensors are kept. Unfinished drives are resumed without this."""
+
     def __post_init__(self) -> None:
         """Validate the options."""
         take_values(self, error=InputError)
@@ -111,6 +115,11 @@ class AccuracyOptions:
             read_accuracy(self.accuracy)
         if self.budget:
             read_budget(self.budget)
+        if self.resume and not self.accuracy:
+            raise InputError(
+                "`resume` is for drives that missed an accuracy: give `accuracy`, too; unfinished drives are"
+                " resumed without it"
+            )
 
     @property
     def picks(self) -> bool:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from geoscene.scene import Scene
+from geoscene.support.files import exclusive, write_json
 from geoscene.support.progress import Progress, silent
+from lidar.dataset.journal import forget_frames
 from lidar.dataset.layout import Paths, open_dataset
 from lidar.errors import DatasetError, InputError
 from lidar.options.accuracy import AccuracyOptions, read_accuracy, read_budget
@@ -16,9 +19,18 @@ from lidar.parameters import value_text
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.sensors.rig.specs import load_rig
 from lidar.simulation import drive as pipeline
-from lidar.simulation.plan import DrivePlan, sensors_of
+from lidar.simulation.plan import DrivePlan, plan_drive, sensors_of
 from lidar.tools.tradeoff.errors import ErrorEstimate
-from lidar.tools.tradeoff.pick import PERCENT, Kind, Pick, SensorErrors, kinds_of, stated
+from lidar.tools.tradeoff.pick import (
+    PERCENT,
+    Kind,
+    Pick,
+    SensorErrors,
+    kinds_of,
+    label_of,
+    ladders_of,
+    stated,
+)
 
 _CHECKED = 10
 """Frames of each sensor that are checked after a drive."""
@@ -98,7 +110,11 @@ class CheckedDrive:
         if self.wanted.accuracy and self.reached is not None:
             asked = read_accuracy(self.wanted.accuracy)
             if worse := self.reached.reached.beyond(asked):
-                lines.append(f"the accuracy of {asked.text} is missed on this drive: {', '.join(worse)}")
+                how = "; the same command with --resume records it again with the next finer setting"
+                lines.append(
+                    f"the accuracy of {asked.text} is missed on this drive: {', '.join(worse.values())}"
+                    + how * bool(self.pick)
+                )
         if self.wanted.budget and self.speed and self.speed < read_budget(self.wanted.budget):
             summary = self.summary
             lines.append(
@@ -127,6 +143,8 @@ def pick_settings(
     if not wanted.picks:
         return None
     free = _free(options, wanted)
+    if wanted.resume:
+        return _finer(options, wanted, out=out, free=free)
     if before := _picked_before(out, wanted) if out else None:
         return before
     from lidar.tools.tradeoff.search import pick_by_sample  # noqa: PLC0415  (0.1 s)
@@ -231,18 +249,21 @@ def driven(
         found.append(spot_check(plan, percent=percent, kinds=kinds, progress=progress))
         return {"accuracy": notes | found[0].to_json()}
 
-    plan = None
+    plan, kept = None, {"accuracy": notes} if notes else {}
     if pick:
         more = tuple((name, value_text(value)) for name, value in pick.settings.items())
         options = replace(options, settings=(*options.settings, *more))
         plan = replace(pick.plan, options=options) if pick.plan else None
+        if pick.again:
+            plan = plan_drive(scene, options, progress=progress)
+            _reopen(Path(out), plan.manifest() | kept, sensors=pick.again)
     summary = pipeline.drive(
         scene,
         out,
         options=options,
         overwrite=overwrite,
         progress=progress,
-        notes={"accuracy": notes} if notes else {},
+        notes=kept,
         check=check if wanted.checks else None,
         plan=plan,
         live=live,
@@ -264,6 +285,55 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
         raise DatasetError(
             f"{Paths(out).manifest}: damaged (accuracy); set `overwrite` to drive again"
         ) from None
+
+
+def _finer(
+    options: DriveOptions, wanted: AccuracyOptions, *, out: Path | None, free: Sequence[Kind]
+) -> Pick | None:
+    """The next finer pick for the sensors of a finished drive that missed its accuracy; else as before.
+
+    Raises InputError without such a drive, and if there is nothing finer.
+    """
+    before = _picked_before(out, wanted) if out else None
+    if out is None or before is None:
+        raise InputError(
+            f"`resume`: there is no drive with `accuracy` {wanted.accuracy} in the output; leave it out"
+        )
+    notes = open_dataset(out).manifest["accuracy"]
+    try:
+        reached = SensorErrors.from_json(notes, "reached")
+    except (KeyError, TypeError, ValueError):
+        raise InputError(f"`resume`: the drive in {out} is not finished; leave it out to go on") from None
+    missed = reached.beyond(read_accuracy(wanted.accuracy))
+    settings, again = dict(before.settings), dict[str, str]()
+    for kind, ladder in ladders_of(options, sensors_of(load_rig(options.rig), options), free=free).items():
+        own = {sensor.name: missed[sensor.name] for sensor in ladder.sensors if sensor.name in missed}
+        if not own or kind not in free:
+            continue
+        labels = [label_of(ladder.values(row)) for row in range(len(ladder.rows))]
+        names = {name for row in ladder.rows for name, _ in row.settings}
+        at = label_of({name: value for name, value in before.settings.items() if name in names})
+        if at not in labels[:-1]:
+            raise InputError(f"`resume`: nothing is finer than {at}, which {', '.join(own)} had")
+        settings = {name: value for name, value in settings.items() if name not in names}
+        settings |= ladder.values(labels.index(at) + 1)
+        again |= {sensor.name: own.get(sensor.name, sensor.name) for sensor in ladder.sensors}
+    if missed and not again:
+        raise InputError(f"`resume`: no setting makes it better: {', '.join(missed.values())}")
+    return Pick(wanted.request, settings, SensorErrors(reached.percent), again=again) if again else before
+
+
+def _reopen(out: Path, manifest: Mapping[str, Any], *, sensors: Collection[str]) -> None:
+    """Make a finished dataset one that is resumed with another recipe, without frames of some sensors.
+
+    If this is killed, the dataset states an unfinished drive of the former or the new recipe, whose frames
+    in the journal are as that one records them.
+    """
+    paths = Paths(out)
+    with exclusive(out):
+        write_json(paths.manifest, open_dataset(out).manifest | {"frames_done": 0})
+        forget_frames(paths.journal, sensors)
+        write_json(paths.manifest, dict(manifest) | {"frames_done": 0})
 
 
 def _number(value: object) -> float:

@@ -189,14 +189,12 @@ class SensorErrors:
         ]
         return ", ".join(filter(None, texts)) or "no errors are known"
 
-    def beyond(self, asked: AccuracyTarget) -> list[str]:
-        """Description of the errors that exceed a target."""
+    def beyond(self, asked: AccuracyTarget) -> dict[str, str]:
+        """Description of the errors that exceed a target, by sensor."""
         lengths = {name: e for name, e in (self.ranges | self.depths).items() if e.value > asked.metres > 0}
         colours = {name: e for name, e in self.colours.items() if e.value > asked.levels > 0}
-        return [
-            *(f"{name} has {error.to_text()}" for name, error in lengths.items()),
-            *(f"{name} has {error.to_text(levels)}" for name, error in colours.items()),
-        ]
+        found = {name: f"{name} has {error.to_text(levels)}" for name, error in colours.items()}
+        return found | {name: f"{name} has {error.to_text()}" for name, error in lengths.items()}
 
 
 _KEYS = {"ranges": "error_m", "depths": "depth_error_m", "colours": "error_levels", "lost": "lost"}
@@ -260,6 +258,7 @@ class Pick:
     expected : errors of the drive, by a sample of its frames
     plan     : of the drive, with its own settings; None where an earlier run had picked
     cost     : None likewise
+    again    : sensors of a finished drive that are recorded again, with why; the others keep their files
     """
 
     asked: dict[str, str]
@@ -267,6 +266,7 @@ class Pick:
     expected: SensorErrors
     plan: DrivePlan | None = None
     cost: PickCost | None = None
+    again: dict[str, str] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """The entry ``accuracy`` of ``dataset.json``, without figures of this machine."""
@@ -279,8 +279,11 @@ class Pick:
 
     def to_text(self) -> str:
         """The settings, and the errors and costs to expect, in one line."""
+        if self.again:
+            return f"picked {self.label}, the next finer; recorded again: {', '.join(self.again.values())}"
         words = self.label or "nothing, as no setting changes depths"
-        text = f"picked {words}: {self.expected.to_text('should be')}"
+        known = any(getattr(self.expected, kind) for kind in _KEYS)
+        text = f"picked {words}" + f": {self.expected.to_text('should be')}" * known
         if self.cost is None:
             return f"{text}; as picked before for this dataset"
         cost = self.cost

@@ -451,6 +451,48 @@ def test_a_picked_tolerance_is_in_the_recipe_and_the_drive_is_resumed_with_it(sc
     assert (again.settings, again.expected, again.label) == (picked.settings, expected, "footprint=3cm")
 
 
+EYE_AND_LASER = """
+name = "both"
+vehicle = "car"
+[[lidar]]
+name = "lidar_top"
+preset = "vlp16"
+translation = [0.0, 0.0, 1.9]
+[[camera]]
+name = "front"
+translation = [1.0, 0.0, 1.6]
+width = 64
+height = 48
+fx = 60.0
+images = ["rgb"]
+"""
+
+
+def test_a_drive_that_missed_is_resumed_with_the_next_finer_setting_of_the_sensors_that_did(scene, tmp_path):
+    rig, out = tmp_path / "both.toml", tmp_path / "a"
+    rig.write_text(EYE_AND_LASER)
+    options, by = replace(DRIVE, rig=str(rig)), AccuracyOptions("1mm@99")
+    with pytest.raises(InputError, match="there is no drive with `accuracy` 1mm@99"):
+        pick_settings(scene, options, wanted=replace(by, resume=True), out=out)
+    coarse = Pick(by.request, {"rays": 1}, SensorErrors(99.0))
+    first = driven(scene, out, options=options, wanted=by, pick=coarse)
+    assert "the same command with --resume" in first.missed()[0]
+    images = {path: path.stat().st_mtime_ns for path in (out / "front").glob("*/*.png")}
+    finer = pick_settings(scene, options, wanted=replace(by, resume=True), out=out)
+    assert finer.settings == {"rays": 7}
+    assert finer.to_text().startswith("picked rays=7, the next finer; recorded again: lidar_top has")
+    second = driven(scene, out, options=options, wanted=replace(by, resume=True), pick=finer)
+    assert images == {path: path.stat().st_mtime_ns for path in (out / "front").glob("*/*.png")}
+    assert second.summary.resumed == len(images)
+    fresh = replace(finer, again={})
+    driven(scene, tmp_path / "b", options=options, wanted=by, pick=fresh)
+    same_files(out, tmp_path / "b")
+    error = [done.reached.reached.ranges["lidar_top"].value for done in (first, second)]
+    assert error[1] < error[0]
+    again = pick_settings(scene, options, wanted=by, out=out)  # without the flag: as it was recorded
+    assert (again.settings, again.again) == (finer.settings, {})
+
+
 def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, tmp_path):
     words = ["drive", scene.path, "--route", "random", "--duration", "0.5"]
     for more, line in (
@@ -459,6 +501,8 @@ def test_settings_that_contradict_and_rigs_without_scanners_are_one_line(scene, 
         (["--accuracy", "1cm", "--set", "footprint=1cm"], "footprint=1cm: --accuracy picks it"),
         (["--budget", "1x-realtime", "--scheduler", "tcp://a:1"], "--budget is for this machine"),
         (["--accuracy", "1cm@42"], "--accuracy 1cm@42: after the @ give one of 50, 68"),
+        (["--accuracy", "1cm", "--resume", "--overwrite"], "--resume keeps files of the drive"),
+        (["--resume"], "--resume is for drives that missed an accuracy"),
         (["--budget", "fast"], "--budget fast: give a speed such as 2x-realtime"),
     ):
         ended = run_program("lidar", *words, *more, "--rig", "vlp16", "-o", tmp_path / "d")
