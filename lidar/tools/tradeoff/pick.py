@@ -13,6 +13,7 @@ from lidar.sensors.camera.settings import CameraSettings
 from lidar.sensors.rig.devices import Camera, Scanner
 from lidar.simulation.plan import DrivePlan, least_tolerance
 from lidar.tools.tradeoff.errors import LOST, ErrorEstimate
+from lidar.tools.tradeoff.variants import setting_text
 
 Kind = Literal["scanners", "cameras"]
 
@@ -134,11 +135,7 @@ def settings_of_rows(ladders: Mapping[Kind, Ladder], rows: Mapping[Kind, int]) -
 
 def label_of(settings: Mapping[str, float]) -> str:
     """Settings as text, as in ``rays=7`` or ``footprint=3cm``."""
-    texts = {
-        name: metres(value).replace(" ", "") if name == "footprint" else f"{value:g}"
-        for name, value in settings.items()
-    }
-    return " ".join(f"{name}={text}" for name, text in texts.items())
+    return " ".join(setting_text(*one) for one in settings.items())
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
 
+from geoscene.drawing.report import metres
 from geoscene.uses import RELIEFS
 from lidar.parameters import value_text
 from lidar.raycast import PRECISIONS
@@ -15,12 +16,19 @@ from lidar.sensors.physics.settings import MOST_RAYS, POSES, ScannerSettings
 from lidar.world.settings import ORIGINS, WorldSettings
 from lidar.world.settings import PLAIN as WHOLE
 
+
+def setting_text(name: str, value: Any) -> str:
+    """A setting as users write it, as in ``rays=7`` or ``footprint=3cm``."""
+    is_length = name == "footprint" and value
+    return f"{name}={metres(value).replace(' ', '') if is_length else value_text(value)}"
+
+
 RAYS = 217
 """Rays per pulse of the reference, unless more are asked for."""
 
 SCANNER_VALUES: dict[str, tuple[Any, ...]] = {
     "rays": (1, 7, 19, 37, 61, 127),
-    "footprint": (0.03, 0.01),
+    "footprint": (0.1, 0.03, 0.01, 0.003),
     "poses": POSES,
     "precision": PRECISIONS,
     "retrace": (True, False),
@@ -97,7 +105,7 @@ class SettingVariant:
     @property
     def label(self) -> str:
         """Names and values of the changed settings; empty for the user's own."""
-        return " ".join(f"{name}={value_text(value)}" for name, value in self.changes)
+        return " ".join(setting_text(*change) for change in self.changes)
 
     @property
     def names(self) -> frozenset[str]:
@@ -171,7 +179,7 @@ class Basis:
         """The user's values: of the sensor's settings all, of the world's those that leave something out."""
         shown = [n for n in self.values if hasattr(self.used, n)]
         shown += [n for n in WORLD_VALUES if getattr(self.world, n) != getattr(WHOLE, n)]
-        return ", ".join(f"{name}={value_text(self.value(name))}" for name in shown)
+        return ", ".join(setting_text(name, self.value(name)) for name in shown)
 
 
 def _change(settings: Any, values: Mapping[str, Any]) -> Any:
@@ -271,7 +279,7 @@ def without_each(basis: Basis, variant: SettingVariant) -> Iterator[tuple[str, S
         rest = variant.changes[:k] + variant.changes[k + 1 :]
         left = {n for n, _ in rest}
         yield (
-            f"{name}={value_text(value)}",
+            setting_text(name, value),
             basis.variant(
                 rest,
                 scene=variant.scene if "scene" in left else 0,
