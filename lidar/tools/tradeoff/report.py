@@ -75,12 +75,15 @@ def pareto(comparison: SensorComparison) -> list[VariantRow]:
 
     Settings that miss or add more than `LOST` of the returns are left out.
     """
+    return _front(comparison, lambda row: ranked_error(comparison, row))
+
+
+def _front(comparison: SensorComparison, error_of: Callable[[VariantRow], float]) -> list[VariantRow]:
+    """Choices with finite errors of which no other is both cheaper and errs as little, the cheapest first."""
     best: list[VariantRow] = []
-    ranked = [
-        (row.cost["cpu_s"].value, ranked_error(comparison, row), row) for row in comparison.rows if row.choice
-    ]
+    ranked = [(row.cost["cpu_s"].value, error_of(row), row) for row in comparison.rows if row.choice]
     for _, error, row in sorted(ranked, key=lambda r: r[:2]):
-        if error < (ranked_error(comparison, best[-1]) if best else inf):
+        if error < (error_of(best[-1]) if best else inf):
             best.append(row)
     return best
 
@@ -246,11 +249,17 @@ def write_report(found: DriveTradeoff, out: Path) -> None:
 def pareto_plot(comparison: SensorComparison) -> bytes:
     """A PNG: error against CPU time.
 
-    Settings that miss or add too many returns are not drawn, see `ranked_error`.
+    Settings that miss or add too many returns are not drawn, see `ranked_error`. The line joins the best by
+    the estimates that are drawn.
     """
-    kind, best = comparison.kind, pareto(comparison)
+
+    def drawn_error(row: VariantRow) -> float:
+        kept = isfinite(ranked_error(comparison, row))
+        return row.error[comparison.tail].value if kept else inf
+
+    kind, best = comparison.kind, _front(comparison, drawn_error)
     choices = [row for row in comparison.rows if row.choice]
-    drawn = [row for row in choices if isfinite(ranked_error(comparison, row))]
+    drawn = [row for row in choices if isfinite(drawn_error(row))]
     points = []
     for row in drawn:
         cost, error = row.cost["cpu_s"], row.error[comparison.tail]
@@ -258,7 +267,7 @@ def pareto_plot(comparison: SensorComparison) -> bytes:
         cpu, interval = (cost.low, cost.high), (error.low, error.high)
         points.append(ChartPoint(name, cost.value, error.value, row in best, cpu, interval))
     hidden = len(choices) - len(drawn)
-    left_out = f"; {hidden} settings that miss or add returns are not drawn" if hidden else ""
+    left_out = f"; not drawn, as they miss or add returns: {hidden}" if hidden else ""
     axes = Axes(
         headline(comparison) + left_out,
         "CPU s per simulated second",
