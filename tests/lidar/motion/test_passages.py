@@ -64,7 +64,7 @@ PARTS = (
         ({"tunnel": "building_passage", "maxheight": "2.2"}, (), "car", True),
         ({"tunnel": "building_passage", "maxheight": "2.2"}, (), "van", False),
         ({}, (), "car", True),
-        ({"highway": "service", "service": "parking_aisle"}, (), "car", False),
+        ({"highway": "service", "service": "parking_aisle"}, (), "car", True),
         ({}, PARTS, "car", True),
         ({"tunnel": "yes"}, PARTS, "van", True),
     ],
