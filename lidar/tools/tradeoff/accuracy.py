@@ -143,10 +143,15 @@ def pick_settings(
     if not wanted.picks:
         return None
     free = _free(options, wanted)
+    before = _picked_before(out, wanted) if out else None
     if wanted.resume:
-        return _finer(options, wanted, out=out, free=free)
-    if before := _picked_before(out, wanted) if out else None:
-        return before
+        if before is None:
+            raise InputError(
+                f"`resume`: there is no drive with `accuracy` {wanted.accuracy} in the output; leave it out"
+            )
+        return _finer(*before, options=options, wanted=wanted, free=free)
+    if before:
+        return before[0]
     from lidar.tools.tradeoff.search import pick_by_sample  # noqa: PLC0415  (0.1 s)
 
     return pick_by_sample(scene, options, wanted=wanted, free=free, progress=progress)
@@ -271,8 +276,11 @@ def driven(
     return CheckedDrive(summary, wanted, pick, found[0] if found else None)
 
 
-def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
-    """The pick for a dataset that was begun for the same accuracy and budget."""
+def _picked_before(out: Path, wanted: AccuracyOptions) -> tuple[Pick, SensorErrors] | None:
+    """The pick for a dataset that was begun for the same accuracy and budget, and the errors it reached.
+
+    The errors are none until the drive is finished and checked.
+    """
     if not Paths(out).manifest.exists():
         return None
     notes = open_dataset(out).manifest.get("accuracy", {})
@@ -280,7 +288,8 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
         return None
     try:
         settings = {str(name): _number(value) for name, value in notes["picked"].items()}
-        return Pick(notes["asked"], settings, SensorErrors.from_json(notes, "expected"))
+        picked = Pick(notes["asked"], settings, SensorErrors.from_json(notes, "expected"))
+        return picked, SensorErrors.from_json(notes, "reached")
     except (AttributeError, KeyError, TypeError, ValueError):
         raise DatasetError(
             f"{Paths(out).manifest}: damaged (accuracy); set `overwrite` to drive again"
@@ -288,36 +297,31 @@ def _picked_before(out: Path, wanted: AccuracyOptions) -> Pick | None:
 
 
 def _finer(
-    options: DriveOptions, wanted: AccuracyOptions, *, out: Path | None, free: Sequence[Kind]
-) -> Pick | None:
-    """The next finer pick for the sensors of a finished drive that missed its accuracy; else as before.
+    before: Pick,
+    reached: SensorErrors,
+    *,
+    options: DriveOptions,
+    wanted: AccuracyOptions,
+    free: Sequence[Kind],
+) -> Pick:
+    """The next finer pick for the sensors of a drive that missed its accuracy; the one before if none did.
 
-    Raises InputError without such a drive, and if there is nothing finer.
+    Raises InputError if there is nothing finer.
     """
-    before = _picked_before(out, wanted) if out else None
-    if out is None or before is None:
-        raise InputError(
-            f"`resume`: there is no drive with `accuracy` {wanted.accuracy} in the output; leave it out"
-        )
-    notes = open_dataset(out).manifest["accuracy"]
-    try:
-        reached = SensorErrors.from_json(notes, "reached")
-    except (KeyError, TypeError, ValueError):
-        raise InputError(f"`resume`: the drive in {out} is not finished; leave it out to go on") from None
     missed = reached.beyond(read_accuracy(wanted.accuracy))
     settings, again = dict(before.settings), dict[str, str]()
     for kind, ladder in ladders_of(options, sensors_of(load_rig(options.rig), options), free=free).items():
-        own = {sensor.name: missed[sensor.name] for sensor in ladder.sensors if sensor.name in missed}
+        own = [sensor.name for sensor in ladder.sensors if sensor.name in missed]
         if not own or kind not in free:
             continue
-        labels = [label_of(ladder.values(row)) for row in range(len(ladder.rows))]
-        names = {name for row in ladder.rows for name, _ in row.settings}
-        at = label_of({name: value for name, value in before.settings.items() if name in names})
-        if at not in labels[:-1]:
-            raise InputError(f"`resume`: nothing is finer than {at}, which {', '.join(own)} had")
+        rows = list(map(ladder.values, range(len(ladder.rows))))
+        names = {name for row in rows for name in row}
+        at = {name: value for name, value in before.settings.items() if name in names}
+        if at not in rows[:-1]:
+            raise InputError(f"`resume`: nothing is finer than {label_of(at)}, which {', '.join(own)} had")
         settings = {name: value for name, value in settings.items() if name not in names}
-        settings |= ladder.values(labels.index(at) + 1)
-        again |= {sensor.name: own.get(sensor.name, sensor.name) for sensor in ladder.sensors}
+        settings |= rows[rows.index(at) + 1]
+        again |= {sensor.name: missed.get(sensor.name, sensor.name) for sensor in ladder.sensors}
     if missed and not again:
         raise InputError(f"`resume`: no setting makes it better: {', '.join(missed.values())}")
     return Pick(wanted.request, settings, SensorErrors(reached.percent), again=again) if again else before
