@@ -23,10 +23,11 @@ from geoscene.classes import class_codes
 from geoscene.support import las_files
 from geoscene.support.compiled import njit
 from geoscene.support.files import atomic_path
+from lidar.dataset.formats import FORMATS
 from lidar.dataset.formats.table import Table, rows
 from lidar.errors import DamagedFileError, FormatError
 
-SCALE = 0.001
+SCALE = FORMATS["las"].step
 """Metres per count of a coordinate by default; the rounding error is at most half of it along each axis."""
 
 SCAN_ANGLE_STEP = 0.006

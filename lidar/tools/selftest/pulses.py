@@ -33,6 +33,9 @@ _SIGNAL = ScannerSettings(link=True, foliage=True)
 """What decides on echoes, without chance."""
 
 _SENSOR = "vlp16"
+_LOWEST = -15.0
+"""Elevation of the sensor's lowest laser, degrees."""
+
 _AHEAD = np.radians(8.0)
 """Azimuth to each side within which pulses are sent."""
 
@@ -109,10 +112,6 @@ def ground(*, degrees: float, away: float) -> list[Body]:
     vertices, faces = cuboid(np.array([-half, -half, -thick]), np.array([half, half, 0.0]))
     frame = np.stack([along, [0.0, 1.0, 0.0], normal])
     return [(met + vertices @ frame, faces)]
-
-
-_LOWEST = -15.0
-"""Elevation of the sensor's lowest laser, degrees."""
 
 
 def _meshes(bodies: Sequence[Body], klass: Class, *, material: str, first: int = 1) -> list[Mesh]:
